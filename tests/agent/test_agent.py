@@ -61,11 +61,11 @@ class Cable:
     hosts: tuple[TestHost, TestHost]
     program: Path
 
-    def arguments(self, over: str, host: TestHost, **network: object) -> dict[str, Any]:
+    def arguments(self, middleware_name: str, host: TestHost, **network: object) -> dict[str, Any]:
         node = f"fieldkit_{host.pid}"
         topic = topics.describe(shipped(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
         taking_part = {"address": host.address, "domain": 3, "node": node, **network}
-        return {"network": taking_part, "topic": topic, "stream": {"over": over, **STREAM}}
+        return {"network": taking_part, "topic": topic, "stream": {"over": middleware_name, **STREAM}}
 
     @contextmanager
     def running(
@@ -91,13 +91,13 @@ def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
         yield Cable(hosts, program)
 
 
-def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> None:
+def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> None:
     """Stream from one host to the other, and check that all samples arrive unchanged."""
     near, far = cable.hosts
     sent, received = tmp_path / "sent", tmp_path / "came"
-    subscriber_arguments = cable.arguments(over, far, peers=(near.address,), **network)
+    subscriber_arguments = cable.arguments(middleware_name, far, peers=(near.address,), **network)
     with cable.running(far, "subscribe", subscriber_arguments, str(received)) as subscriber:
-        publisher_arguments = cable.arguments(over, near, peers=(far.address,), **network)
+        publisher_arguments = cable.arguments(middleware_name, near, peers=(far.address,), **network)
         with cable.running(near, "publish", publisher_arguments, str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
     assert subscriber.returncode == 0
@@ -113,9 +113,9 @@ def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> Non
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("discovery", ["multicast", "peers"])
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_samples_arrive_without_a_master(cable: Cable, tmp_path: Path, over: str, discovery: str) -> None:
-    exchanged(cable, tmp_path, over, discovery=discovery)
+@pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
+def test_samples_arrive_without_a_master(cable: Cable, tmp_path: Path, middleware_name: str, discovery: str) -> None:
+    exchanged(cable, tmp_path, middleware_name, discovery=discovery)
 
 
 @pytest.mark.emulated
@@ -221,15 +221,15 @@ def attacked(host: TestHost, *words: str) -> None:
 
 
 @contextmanager
-def unharmed(cable: Cable, tmp_path: Path, over: str, **network: object) -> Iterator[Path]:
+def unharmed(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> Iterator[Path]:
     """Stream from one host to the other while the body runs; both programs must survive and stop cleanly after it.
 
     Yields the log of the received samples.
     """
     near, far = cable.hosts
     received, sent = tmp_path / "came", tmp_path / "sent"
-    subscriber_arguments = cable.arguments(over, near, peers=(far.address,), **network)
-    publisher_arguments = cable.arguments(over, far, peers=(near.address,), **network)
+    subscriber_arguments = cable.arguments(middleware_name, near, peers=(far.address,), **network)
+    publisher_arguments = cable.arguments(middleware_name, far, peers=(near.address,), **network)
     endless = {**publisher_arguments, "stream": {**publisher_arguments["stream"], "duration_s": 600.0}}
     with cable.running(near, "subscribe", subscriber_arguments, str(received)) as subscriber:
         with cable.running(far, "publish", endless, str(sent)) as publisher:

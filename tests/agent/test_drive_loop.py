@@ -30,7 +30,7 @@ TASK = {
 }
 
 
-def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str = "base_footprint") -> bytes:
+def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame: str = "base_footprint") -> bytes:
     """Serialize a message with rosbags."""
     store = STORES[cdr]
     kinds = store.types
@@ -43,7 +43,7 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str =
     vector = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     message = kinds["nav_msgs/msg/Odometry"](
         header,
-        child,
+        child_frame,
         kinds["geometry_msgs/msg/PoseWithCovariance"](kinds["geometry_msgs/msg/Pose"](point, turned), zeros),
         kinds["geometry_msgs/msg/TwistWithCovariance"](kinds["geometry_msgs/msg/Twist"](vector, vector), zeros),
     )
@@ -55,7 +55,7 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str =
 @pytest.mark.parametrize("names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
 def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> None:
     pose = OdometryPose(3.5, -2.25, 1.25)
-    read = drive.read_odometry(odometry(pose, cdr=cdr, frame=names[0], child=names[1]), cdr=cdr)
+    read = drive.read_odometry(odometry(pose, cdr=cdr, frame=names[0], child_frame=names[1]), cdr=cdr)
     assert read == pytest.approx(pose)
     kinds = STORES[cdr].types
     vector = kinds["geometry_msgs/msg/Vector3"]

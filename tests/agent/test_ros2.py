@@ -30,12 +30,12 @@ LONG_S: Final = 120
 TRIES: Final = 5
 
 
-def arguments(over: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
-    node = f"fieldkit_{over}_{topic}"
+def arguments(middleware_name: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
+    node = f"fieldkit_{middleware_name}_{topic}"
     described = topics.describe(shipped(), f"/{topic}", TYPE, PROFILES["default"], domain=DOMAIN, node=node)
     described["quality"] |= quality
-    stream = {"over": over, "size_bytes": size, "rate_hz": 20.0, "duration_s": 1.0, "patience_s": 15.0}
-    discovery = "environment" if over == "ros2" else "multicast"
+    stream = {"over": middleware_name, "size_bytes": size, "rate_hz": 20.0, "duration_s": 1.0, "patience_s": 15.0}
+    discovery = "environment" if middleware_name == "ros2" else "multicast"
     network = {"address": host.address, "domain": DOMAIN, "node": node, "discovery": discovery}
     return {"network": network, "topic": described, "stream": stream}
 
@@ -71,8 +71,10 @@ def exchange(program: Path, folder: Path) -> bool:
     """Stream in both directions at the same time; return True if all endpoints matched."""
     with two_connected_hosts() as (near, far), ExitStack() as stack:
 
-        def start(host: TestHost, over: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
-            topic_arguments = arguments(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
+        def start(host: TestHost, middleware_name: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
+            topic_arguments = arguments(
+                middleware_name, host, topic, SIZES[topic], durability="transient_local", depth=100
+            )
             return stack.enter_context(running(host, program, verb, topic_arguments, folder / f"{topic}.{verb}"))
 
         subscribers = [start(far, "dds", "subscribe", "there"), start(near, "ros2", "subscribe", "back")]
@@ -145,12 +147,12 @@ def test_network_settings_and_quality_in_rclpy(program: Path) -> None:
         (ROS2, "-c", PRINT_POLICIES, str(program)), capture_output=True, check=False, timeout=LONG_S
     )
     assert done.returncode == 0, done.stderr
-    policies, deadline_ns, lifespan_ns, output, ways = json.loads(done.stdout)
+    policies, deadline_ns, lifespan_ns, output, network_settings = json.loads(done.stdout)
     assert policies == ["BEST_EFFORT", "KEEP_LAST", 7, "TRANSIENT_LOCAL"]
     assert (deadline_ns, lifespan_ns) == (100_000_000, 2_000_000_000)
     assert "this ROS 2 has no lab_msgs/msg/Radio" in output
     domain = {"ROS_DOMAIN_ID": "7"}
-    assert ways == {
+    assert network_settings == {
         "environment": domain,
         "multicast": domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": ""},
         "peers": domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "10.0.0.2;10.0.0.3"},

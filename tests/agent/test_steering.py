@@ -70,8 +70,8 @@ def within_limits(task: DriveTask, driven: list[DriveVelocity]) -> bool:
         abs(velocity.forward_m_s) <= task.speed_m_s and abs(velocity.turn_rad_s) <= task.turn_rad_s + 1e-9
         for velocity in driven
     )
-    most = task.acceleration_m_s2 * TICK_S + 1e-9
-    gentle = all(after.forward_m_s - before.forward_m_s <= most for before, after in pairwise(driven))
+    max_change = task.acceleration_m_s2 * TICK_S + 1e-9
+    gentle = all(after.forward_m_s - before.forward_m_s <= max_change for before, after in pairwise(driven))
     return fast and gentle
 
 

@@ -156,16 +156,16 @@ def test_a_mean_has_the_bootstrap_t_interval() -> None:
 
 @given(values, st.floats(-100, 100), st.floats(0.01, 100))
 def test_a_mean_is_shifted_and_scaled_with_its_values(some: list[float], shift: float, factor: float) -> None:
-    plain, moved = not_none(mean(some)), not_none(mean(shift + factor * np.array(some)))
-    assert plain.low <= plain.value <= plain.high
+    original, moved = not_none(mean(some)), not_none(mean(shift + factor * np.array(some)))
+    assert original.low <= original.value <= original.high
     size = factor * (np.abs(some).max() + abs(shift) + 1)
-    ends = (shift + factor * plain.low, shift + factor * plain.high)
+    ends = (shift + factor * original.low, shift + factor * original.high)
     assert (moved.low, moved.high) == pytest.approx(ends, rel=1e-3, abs=1e-3 * size)
 
 
 def test_the_mean_of_tiny_values_has_a_tiny_interval() -> None:
-    tiny, plain = not_none(mean([0, 1e-170, 3e-170])), not_none(mean([0, 1, 3]))
-    assert (tiny.low, tiny.high) == pytest.approx((1e-170 * plain.low, 1e-170 * plain.high), rel=1e-9, abs=0)
+    tiny, original = not_none(mean([0, 1e-170, 3e-170])), not_none(mean([0, 1, 3]))
+    assert (tiny.low, tiny.high) == pytest.approx((1e-170 * original.low, 1e-170 * original.high), rel=1e-9, abs=0)
 
 
 @pytest.mark.parametrize("n", [6, 7, 20, 21, 400])

@@ -174,7 +174,7 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
 
 
 @pytest.mark.parametrize(
-    ("lost", "every", "most"),
+    ("lost", "every", "share"),
     [
         ([0] * 29, Ruling.HOLDS, Ruling.HOLDS),
         ([0] * 28, Ruling.HOLDS, Ruling.OPEN),
@@ -184,9 +184,9 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
         ([25] * 29, Ruling.FAILS, Ruling.FAILS),
     ],
 )
-def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, most: Ruling) -> None:
+def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, share: Ruling) -> None:
     assert ruling("every ip_loss < 2 %", losses(*lost)) is every
-    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is most
+    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is share
 
 
 def test_the_measured_value_is_shown_for_each_scope() -> None:

@@ -114,8 +114,10 @@ def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
 
 
 def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
-    bare = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
-    assert [line.label for line in table_lines.operator_lines(cells_of([bare]))] == ["transfer time, median"]
+    without_metrics = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
+    assert [line.label for line in table_lines.operator_lines(cells_of([without_metrics]))] == [
+        "transfer time, median"
+    ]
 
 
 def test_sent_packets_are_summed_over_all_valid_repeats() -> None:

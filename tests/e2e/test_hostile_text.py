@@ -129,9 +129,9 @@ def round_trip(row: RepeatRow) -> dict[str, object]:
 
 @given(st.tuples(*[st.text(st.characters(exclude_categories=["C", "Z"]), max_size=12)] * 3))
 def test_a_table_that_is_read_again_has_equal_texts(texts: tuple[str, str, str]) -> None:
-    own = dict(zip(("distance", "reason", "sender"), texts, strict=True))
-    own = {name: "" if text in {"nan", "NaN"} else text for name, text in own.items()}
-    assert round_trip(replace(ROW, **own)) == own
+    columns_read = dict(zip(("distance", "reason", "sender"), texts, strict=True))
+    columns_read = {name: "" if text in {"nan", "NaN"} else text for name, text in columns_read.items()}
+    assert round_trip(replace(ROW, **columns_read)) == columns_read
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)

@@ -90,8 +90,8 @@ def test_a_trial_ends_valid(tmp_path: Path, pair: Pair) -> None:
 
 
 def test_busybox_sends_and_receives_by_tcp(tmp_path: Path) -> None:
-    bare = "userland: busybox, ssh: dropbear, sftp: false"
-    run = trial(tmp_path, Pair(bare, bare), "--protocol", "tcp")
+    userland_keys = "userland: busybox, ssh: dropbear, sftp: false"
+    run = trial(tmp_path, Pair(userland_keys, userland_keys), "--protocol", "tcp")
     assert run.code == 0, run.out + run.err
     (row,) = rows(only_trial(tmp_path))
     assert (row["status"], row["hash_match"]) == ("valid", "true")

@@ -119,15 +119,15 @@ def test_a_simulation_of_the_same_trial_is_compared_without_options(lab_copy: Pa
     compared = run_here(lab_copy, "compare", "simulated", str(trial), "--format", "csv")
     assert compared.code == 0, compared.err
     assert "not comparable" not in compared.err
-    both = {
+    values = {
         (row["protocol"], row["quantity"]): (float(row["a"]), float(row["b"]))
         for row in csv.DictReader(compared.out.splitlines())
         if row["a"] and row["b"]
     }
     for protocol in ("tcp", "udp"):
         # The simulation has no processing time in programs and kernels.
-        assert both[protocol, "transfer_s"][0] < 1.2 * both[protocol, "transfer_s"][1]
-        assert both[protocol, "rtt_median_s"][0] < both[protocol, "rtt_median_s"][1]
+        assert values[protocol, "transfer_s"][0] < 1.2 * values[protocol, "transfer_s"][1]
+        assert values[protocol, "rtt_median_s"][0] < values[protocol, "rtt_median_s"][1]
 
 
 def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy: Path) -> None:

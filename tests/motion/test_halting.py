@@ -112,8 +112,8 @@ def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -
     with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
         evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
         start(robot, "drive", "drive", DRIVE_SCRIPT)
-        own = halting.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
-        assert own.state is MotionState.STATIONARY
+        result = halting.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
+        assert result.state is MotionState.STATIONARY
         other = jobs.work_folder("trial-a", "tcp-01-2")
         evidence.begin(robot, other, "sender", "lo", token=ANNA.token)  # an order for one attempt keeps the lock
         halting.halt(robot, "bert@two", Deadline.after(60))

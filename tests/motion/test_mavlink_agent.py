@@ -179,19 +179,19 @@ def over_tcp() -> Iterator[str]:
 @contextmanager
 def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
     """Let a drone answer on a stream when it is open."""
-    over, ready = threading.Event(), threading.Event()
+    finished, ready = threading.Event(), threading.Event()
 
     def fly() -> None:
         with stream() as connection, drones.flying(connection.fileno(), connection.sendall, connection.recv):
             ready.set()
-            over.wait()
+            finished.wait()
 
     thread = threading.Thread(target=fly)
     thread.start()
     try:
         yield
     finally:
-        over.set()
+        finished.set()
         thread.join()
 
 

@@ -236,11 +236,11 @@ def test_an_error_of_the_lab_is_reported_with_its_remedy(ran: SuiteRun) -> None:
 
 def test_only_evidence_of_failures_is_kept(ran: SuiteRun, folder: Path) -> None:
     (kept_folder,) = (folder / "fieldkit-results").iterdir()
-    own = {path.name for path in (kept_folder / "test_robots.py").iterdir()}
-    assert own - {"set-up"} >= FAIL - {"test_fails_because_of_a_figure"}, (
+    names = {path.name for path in (kept_folder / "test_robots.py").iterdir()}
+    assert names - {"set-up"} >= FAIL - {"test_fails_because_of_a_figure"}, (
         "what that one is about was set up for several"
     )
-    assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in own if "asks" not in name)
+    assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in names if "asks" not in name)
     log = (kept_folder / "test_robots.py" / "test_fails_because_of_a_program" / "lab.log").read_text(encoding="utf-8")
     assert log.endswith("rover $ sh -c 'echo broken >&2; exit 3'\nbroken\nexit code 3\n")
     for name, trials in (("set-up", 1), ("test_fails_because_of_an_expectation", 1)):

@@ -199,14 +199,14 @@ def test_reused_pid_is_not_signalled(shell: LocalShell) -> None:
     """A job is identified by pid, start time and boot ID, never by its pid only."""
     job_spec = job("sleep", "60")
     jobs.start(shell, job_spec)
-    with subprocess.Popen(("sleep", "60"), start_new_session=True) as stranger:
+    with subprocess.Popen(("sleep", "60"), start_new_session=True) as other_process:
         record = shell.home / FOLDER / ".jobs" / "job" / "pid"
         true_record = record.read_text(encoding="ascii")
         _, ticks, boot = true_record.split()
-        record.write_text(f"{stranger.pid} {int(ticks) - 1} {boot}\n", encoding="ascii")
+        record.write_text(f"{other_process.pid} {int(ticks) - 1} {boot}\n", encoding="ascii")
         assert jobs.stop(shell, job_spec, signal="KILL") == jobs.KILLED
-        assert stranger.poll() is None
-        stranger.kill()
+        assert other_process.poll() is None
+        other_process.kill()
         record.write_text(true_record, encoding="ascii")
     jobs.stop(shell, job_spec, signal="TERM")
 
@@ -670,10 +670,10 @@ def test_archive_cannot_leave_the_folder_or_skip_checks(
 
 
 def test_truncated_archive_is_rejected(tmp_path: Path) -> None:
-    liar = HostileShell(tmp_path, {"scan.bag": b"x" * 5000})
-    liar.archive.write_bytes(liar.archive.read_bytes()[:2000])
+    hostile = HostileShell(tmp_path, {"scan.bag": b"x" * 5000})
+    hostile.archive.write_bytes(hostile.archive.read_bytes()[:2000])
     with pytest.raises(EvidenceError):
-        fetching.fetch(liar, FOLDER, "sender", "lo", tmp_path)
+        fetching.fetch(hostile, FOLDER, "sender", "lo", tmp_path)
 
 
 def test_other_users_cannot_write_to_the_folder_of_the_script(shell: LocalShell) -> None:

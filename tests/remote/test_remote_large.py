@@ -62,8 +62,8 @@ def into(tmp_path: Path) -> Path:
     return folder
 
 
-def fetch(robot: Flaky, into: Path, **more: object) -> None:
-    fetching.fetch(robot, FOLDER, "sender", "lo", into, **more)  # type: ignore[arg-type]
+def fetch(robot: Flaky, into: Path, **options: object) -> None:
+    fetching.fetch(robot, FOLDER, "sender", "lo", into, **options)  # type: ignore[arg-type]
 
 
 def names(folder: Path) -> set[str]:

@@ -517,14 +517,14 @@ def test_link_that_is_interrupted_is_restored(
 def test_two_commands_that_lose_one_link_are_sent_again_with_one_notice(
     shell: SshShell, line: CuttableLine, notices: list[str], pool: ThreadPoolExecutor, tmp_path: Path
 ) -> None:
-    both = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
-    for command in both:
+    waiting_commands = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
+    for command in waiting_commands:
         command.go.parent.mkdir()
-    done = [pool.submit(shell.run, command.argv, deadline=soon()) for command in both]
-    for command in both:
+    done = [pool.submit(shell.run, command.argv, deadline=soon()) for command in waiting_commands]
+    for command in waiting_commands:
         command.wait_for_starts(1)
     line.cut()
-    for command in both:
+    for command in waiting_commands:
         command.wait_for_starts(2)
         command.go.touch()
     assert [command.result(SOON).stdout for command in done] == [b"part\nwhole\n"] * 2
@@ -535,13 +535,13 @@ def test_two_commands_that_lose_one_link_are_sent_again_with_one_notice(
 def test_later_detection_of_a_loss_uses_the_restored_link(
     shell: SshShell, line: CuttableLine, notices: list[str], tmp_path: Path
 ) -> None:
-    both = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
+    waiting_commands = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
     sessions = []
-    for command in both:
+    for command in waiting_commands:
         command.go.parent.mkdir()
         sessions.append(shell.begin(command.argv, deadline=soon()))
     line.cut()
-    for command in both:
+    for command in waiting_commands:
         command.go.touch()
     for session in sessions:
         assert session.end(deadline=soon()).stdout == b"part\nwhole\n"

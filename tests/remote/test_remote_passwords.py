@@ -70,8 +70,8 @@ def password_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server
     )
     (folder / "shadow").write_text(f"root:{crypt.stdout.strip()}:20000:0:99999:7:::\nsshd:!:20000::::::\n")
     (folder / "shadow").chmod(0o640)
-    over = 'mount --bind "$0" /etc/shadow && exec "$@"'
-    within = ("unshare", "--mount", "--propagation", "private", "sh", "-c", over, str(folder / "shadow"))
+    command = 'mount --bind "$0" /etc/shadow && exec "$@"'
+    within = ("unshare", "--mount", "--propagation", "private", "sh", "-c", command, str(folder / "shadow"))
     with sshd(folder, within=within, PermitRootLogin="yes", PasswordAuthentication="yes") as server:
         yield server
 

@@ -338,10 +338,10 @@ def test_login_shell_with_a_greeting_uses_separate_sessions(tmp_path: Path) -> N
 
 @pytest.mark.emulated
 def test_missing_script_is_reported_each_time(tmp_path: Path) -> None:
-    with robot(tmp_path) as bare:
-        (bare.home / SCRIPT_PATH).unlink()
+    with robot(tmp_path) as plain_robot:
+        (plain_robot.home / SCRIPT_PATH).unlink()
         for _ in range(3):
-            assert SCRIPT_PATH.encode() in bare.run(":", check=False).stderr
+            assert SCRIPT_PATH.encode() in plain_robot.run(":", check=False).stderr
 
 
 class ReceivedChannel:

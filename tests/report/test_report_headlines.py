@@ -126,12 +126,12 @@ def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:
     evidence = evidence_with(tmp_path)
     plan = next(iter(evidence.plans.values()))
     assert plan.repeats == 1
-    more = Evidence(
+    other_evidence = Evidence(
         evidence.repeats,
         {source: plan.model_copy(update={"repeats": 5}) for source in evidence.plans},
         (),
         frozenset(),
     )
-    result = texts(next(iter(headlines(aggregate(evidence.repeats), more))))
+    result = texts(next(iter(headlines(aggregate(evidence.repeats), other_evidence))))
     assert result[0] == "1 of 5 valid"
     assert any(line.startswith("4 repeats not run") for line in result)

@@ -87,10 +87,13 @@ def _capture(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
 
 
 def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
-    way = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
+    path_keys = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
     keys = _given(name=NAMES)
     return st.builds(
-        lambda robot, more, steps: {"move": {"robot": robot, **way, **more, "during": steps}}, ROLES, keys, during
+        lambda robot, more, steps: {"move": {"robot": robot, **path_keys, **more, "during": steps}},
+        ROLES,
+        keys,
+        during,
     )
 
 

@@ -174,14 +174,14 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     parsed_procedure = procedure(
         "meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}"
     )
-    own = of_steps(placed.step for placed in parsed_procedure.walk())
-    assert names(own) == ["b.meter_level", "b.x", "meter_level"]
+    columns = of_steps(placed.step for placed in parsed_procedure.walk())
+    assert names(columns) == ["b.meter_level", "b.x", "meter_level"]
     filled = names(filled_by(placed.step for placed in parsed_procedure.walk()))
-    assert filled[-3:] == names(own)
+    assert filled[-3:] == names(columns)
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
     plan = los_plan().model_copy(update={"procedure": parsed_procedure})
-    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, without columns"
+    assert plan.table == (*trial_columns(), *columns), "a plan of an earlier version, without columns"
 
 
 @pytest.mark.parametrize(

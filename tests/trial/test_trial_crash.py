@@ -129,12 +129,12 @@ def at_write(moment: int, befalls: Callable[..., None]) -> None:
     count = 0
 
     def watched(call: Callable[..., object]) -> Callable[..., object]:
-        def counted(*words: object, **more: object) -> object:
+        def counted(*words: object, **options: object) -> object:
             nonlocal count
             count += 1
             if count == moment:
                 befalls(call, *words)
-            return None if call is FSYNC else call(*words, **more)  # a kill of a process does not affect the disk
+            return None if call is FSYNC else call(*words, **options)  # a kill of a process does not affect the disk
 
         return counted
 

@@ -144,8 +144,8 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
         near, far = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
 
         def carried(packets: list[Packet], role: str) -> list[Packet]:
-            own = _left(packets, role, lambda _: True)
-            return [packet for packet in packets if packet in own or chance.random() >= lost]
+            own_packets = _left(packets, role, lambda _: True)
+            return [packet for packet in packets if packet in own_packets or chance.random() >= lost]
 
         cut = chance.randrange(3)
         near = [*carried(near, "sender"), *aside[1:]]

@@ -21,7 +21,7 @@ def output(name: str) -> str:
     return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
 
 
-OWN = (
+OWN_FRAMES = (
     f"==> 101.00 link <==\n{output('link-station')}\n==> 101.00 survey <==\n{output('survey-mt7996-6')}"
     f"==> 101.00 station <==\n{output('station-iwlwifi-6')}"
     "==> 101.20 wireless <==\n0000   54.  -56.  -256        0      0      0      0      0        0\n"
@@ -94,9 +94,9 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
         + output("station-iwlwifi-6").replace("3441", "3461")
     )
     if packed:
-        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
+        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN_FRAMES.encode()))
     else:
-        (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
+        (tmp_path / "sender-link.txt").write_text(OWN_FRAMES, encoding="utf-8")
     samples_read = link_samples.read_robot(tmp_path, Role.SENDER)
     at_s = [item.utc_ns / S - BOOTED_S for item in samples_read]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
@@ -111,9 +111,9 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
     assert samples_read[2].stations == (StationSample("", -56.0),)
 
 
-@given(st.integers(0, len(OWN)))
+@given(st.integers(0, len(OWN_FRAMES)))
 def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
-    complete, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
+    complete, cut = link_samples.parse(OWN_FRAMES), link_samples.parse(OWN_FRAMES[:at])
     assert [item.utc_ns for item in cut] == [item.utc_ns for item in complete][: len(cut)]
     for item, other in zip(cut, complete, strict=False):
         for station in item.stations:
@@ -128,6 +128,6 @@ def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
         link_samples.read_robot(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
     assert link_samples.read_robot(tmp_path, Role.SENDER) == ()
-    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode())[:-20])
+    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN_FRAMES.encode())[:-20])
     with pytest.raises(EvidenceError, match="cannot be read"):
         link_samples.read_robot(tmp_path, Role.SENDER)

@@ -68,7 +68,7 @@ def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
     assert not {"iperf3_loss", "iperf3_datagrams_sent", "iperf3_jitter_s"} & values.keys()
     ports = [iperf3.parse(output(version, "tcp", end_name)).ports for end_name in ("client", "server")]
     assert len(ports[0]) == 2
-    assert ports[0] == tuple((own, other) for other, own in ports[1])
+    assert ports[0] == tuple((own_port, other) for other, own_port in ports[1])
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -35,10 +35,10 @@ def _put(at: int, form: str, value: int) -> Change:
     return change
 
 
-def _added(at: int, form: str, more: int) -> Change:
+def _added(at: int, form: str, added: int) -> Change:
     def change(packet: bytes) -> bytes:
         (old,) = struct.unpack_from(form, packet, at)
-        return _put(at, form, (old + more) % 256 ** struct.calcsize(form))(packet)
+        return _put(at, form, (old + added) % 256 ** struct.calcsize(form))(packet)
 
     return change
 
@@ -148,8 +148,8 @@ def test_a_snap_length_within_the_headers_does_not_appear_as_loss(
 
 def test_similar_traffic_is_not_mistaken_for_a_translation() -> None:
     sent, received = _udp(lambda packet: packet)
-    stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
-    of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in stranger]
+    other_stream = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
+    of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in other_stream]
     translated_here = [Frame(frame.time_ns, target(frame.data), 2000) for frame in received]
     for name, captures in {
         "nothing": (sent, received),

@@ -148,11 +148,11 @@ def test_one_wrong_time_neither_shifts_the_offset_nor_narrows_its_error(
     """Half of a round trip of 10 ms, and 5 ms of drift in the 10 s from the middle to either end."""
     world = World(3.0, 0.0)
     sent_s, delay_s = np.linspace(0, 20, 21), np.full(21, 0.005)
-    both = world.forward(sent_s, delay_s), world.reverse(sent_s, delay_s)
-    _stamps(both[direction])[end][10] += wrong_ns
-    clocks = estimate(*both)
+    delays = world.forward(sent_s, delay_s), world.reverse(sent_s, delay_s)
+    _stamps(delays[direction])[end][10] += wrong_ns
+    clocks = estimate(*delays)
     assert clocks is not None
-    at_ns = both[0].receiver_ns
+    at_ns = delays[0].receiver_ns
     assert np.abs(_ahead_s(clocks, at_ns) - 3.0).max() <= 2e-6
     assert clocks.error_s(np.array([clocks.middle_ns])) >= 0.005
 

@@ -245,12 +245,12 @@ def test_with_offload_a_tcp_frame_arrives_with_its_last_byte() -> None:
     back = segment(8, 0, back=True)
     arrivals = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
     arrivals += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
-    bare = segment(isn + 1, 0)
+    ack = segment(isn + 1, 0)
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
         for frames in (
-            [*sent, (3, back), (4, bare), (6, segment(9, 0, back=True))],
-            [*arrivals, (2, back), (5, bare), (5, segment(9, 0, back=True))],
+            [*sent, (3, back), (4, ack), (6, segment(9, 0, back=True))],
+            [*arrivals, (2, back), (5, ack), (5, segment(9, 0, back=True))],
         )
     )
     measures = _measured(sender, receiver, transfer(Protocol.TCP))

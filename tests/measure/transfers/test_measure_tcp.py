@@ -38,9 +38,9 @@ def _retransmitted(sent: Iterable[Range]) -> int:
     sent_before: set[int] = set()
     repeated = 0
     for start, size in sent:
-        own = set(range(start, start + size))
-        repeated += bool(own & sent_before)
-        sent_before |= own
+        sequence_numbers = set(range(start, start + size))
+        repeated += bool(sequence_numbers & sent_before)
+        sent_before |= sequence_numbers
     return repeated
 
 
@@ -101,14 +101,14 @@ def test_offload_alone_is_not_loss_retransmission_or_reordering(
     cuts = sorted(data.draw(st.sets(st.integers(1, end - 1), max_size=9))) if end > 1 else []
     sent = [(sum(sizes[:at]), size) for at, size in enumerate(sizes)]
     received = [(start, stop - start) for start, stop in zip([0, *cuts], [*cuts, end], strict=True)]
-    both = [
+    both_captures = [
         [
             Frame(10**18 + number, segment(isn, 0, flags=SYN, mss=1460)),
             *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in ranges),
         ]
         for number, ranges in enumerate((sent, received))
     ]
-    counts = tcp.count(tcp.match_transfer(packets(both[0]), packets(both[1]), TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(packets(both_captures[0]), packets(both_captures[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
     assert (counts.duplicated_bytes, counts.ambiguous_frames) == (0, 0)
@@ -199,9 +199,9 @@ def test_connections_are_counted_separately_and_other_ports_are_ignored() -> Non
 def test_retransmissions_of_an_earlier_transfer_are_not_counted() -> None:
     """Observed at 30 % loss: a connection of an aborted transfer sent a segment during a later repeat."""
     orphan = segment(2**31, 1448, sport=41878)
-    own = _frames(10, [(0, 100)], sport=42344)
-    sent = packets(timed([own[0], orphan, *own[1:]]))
-    received = packets(timed([orphan, *own]))
+    connection = _frames(10, [(0, 100)], sport=42344)
+    sent = packets(timed([connection[0], orphan, *connection[1:]]))
+    received = packets(timed([orphan, *connection]))
     counts = tcp.count(tcp.match_transfer(sent, received, TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (100, 100, 100)
     assert (counts.frames_sent, counts.frames_received) == (2, 2)

@@ -88,11 +88,11 @@ def test_without_permission_there_is_no_driver() -> None:
 
 
 def test_path_beyond_fence_or_speed_is_refused() -> None:
-    far = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
-    speed, fence = far.refusals(SCENE)
+    long_move = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
+    speed, fence = long_move.refusals(SCENE)
     assert speed.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
     assert fence.what == "its fence is 30 m from its place, but its path leads 32.0156 m away"
-    by_person = far.refusals(replace(SCENE, cast=CAST))
+    by_person = long_move.refusals(replace(SCENE, cast=CAST))
     assert [refusal.what for refusal in by_person] == [speed.what], "no fence if a person moves it"
     round_trip = move("robot: receiver, path: [{away: 25m}, {towards: 25m}, {away: 25m}], speed: 0.2m/s")
     assert not list(round_trip.refusals(SCENE)), "the fence limits the distance, not the length of the path"

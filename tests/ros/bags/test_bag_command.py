@@ -51,12 +51,12 @@ def write_bag(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Pat
         old.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
         old.chunk_threshold = 20_000
         with old:
-            own = {
+            channels = {
                 topic: old.add_connection(topic, "std_msgs/msg/String", typestore=types) for topic, *_ in messages[:3]
             }
             string = types.types["std_msgs/msg/String"]
             for topic, at_ns, text in messages:
-                old.write(own[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String"))
+                old.write(channels[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String"))
         return path
     path = folder / "all"
     if form is BagFormat.MCAP and len(messages) > 100:
@@ -78,10 +78,10 @@ def in_chunks(path: Path, messages: Sequence[Message], compression: CompressionT
         writer.start(profile="ros2")
         definition, _ = TYPES.generate_msgdef("std_msgs/msg/String", ros_version=2)
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", definition.encode())
-        own = {topic: writer.register_channel(topic, "cdr", schema) for topic, *_ in messages[:3]}
+        channels = {topic: writer.register_channel(topic, "cdr", schema) for topic, *_ in messages[:3]}
         for topic, at_ns, text in messages:
             data = TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"](data=text), "std_msgs/msg/String")
-            writer.add_message(own[topic], at_ns, bytes(data), at_ns)
+            writer.add_message(channels[topic], at_ns, bytes(data), at_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
 

@@ -117,8 +117,8 @@ def transform2(x: float, y: float, frame: str, child: str) -> Any:  # noqa: ANN4
 def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> None:
     kind = "tf2_msgs/msg/TFMessage"
     tree: Any = STORE2.types[kind]
-    both = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
-    path = write_ros2_bag(tmp_path, both, kind)
+    transforms = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
+    path = write_ros2_bag(tmp_path, transforms, kind)
     samples = bag_positions.read_bag(path, PositionSource(topic="/where", child="base"))
     assert (samples.frame, samples.values.tolist()) == ("frame world", [[1, 2, 0]])
     with pytest.raises(EvidenceError, match="has positions in several frames: base, world"):

@@ -60,8 +60,8 @@ def require_noticed(reasons: list[str], measured: Measured, before: Measured) ->
             continue
         assert isinstance(now, float), f"{name} is {now}, not {value}"
         assert isinstance(value, float), f"{name} is {now}, not {value}"
-        most = max(topic_captures.SLOW_S, 0.1 * now) if name.endswith("_s") else 0.0
-        assert now == pytest.approx(value, abs=most + 1e-4), f"{name} is {now}, not {value}"
+        tolerance = max(topic_captures.SLOW_S, 0.1 * now) if name.endswith("_s") else 0.0
+        assert now == pytest.approx(value, abs=tolerance + 1e-4), f"{name} is {now}, not {value}"
 
 
 @pytest.mark.parametrize("signed", [True, False], ids=["signed", "unsigned"])

@@ -78,5 +78,5 @@ def test_without_complete_logs_the_columns_are_empty() -> None:
 
 
 def test_its_columns_equal_those_of_other_flows() -> None:
-    own = [column.name for column in stalls.declare_columns("topic", "the topic", 0)]
-    assert [column.name for column in topic_stalls.COLUMNS] == own
+    names = [column.name for column in stalls.declare_columns("topic", "the topic", 0)]
+    assert [column.name for column in topic_stalls.COLUMNS] == names

@@ -104,10 +104,10 @@ def messages() -> dict[str, Any]:
     }
 
 
-def location_event(messages: dict[str, Any], **more: object) -> Any:  # noqa: ANN401 (a class made at run time)
+def location_event(messages: dict[str, Any], **options: object) -> Any:  # noqa: ANN401 (a class made at run time)
     event = messages["LocationEvent"]()
     for location in LOCATIONS:
-        added = event.locations.add(nemId=location.nem, **more)
+        added = event.locations.add(nemId=location.nem, **options)
         added.position.latitudeDegrees = location.latitude_deg
         added.position.longitudeDegrees = location.longitude_deg
         added.position.altitudeMeters = location.altitude_m
@@ -237,8 +237,8 @@ def network() -> Iterator[None]:
 
 def received(listener: EventListener, limit_s: float = 0.0) -> list[SerializedEvent]:
     events: list[SerializedEvent] = []
-    while (more := listener.receive(limit_s)) is not None:
-        events += more
+    while (event := listener.receive(limit_s)) is not None:
+        events += event
     return events
 
 

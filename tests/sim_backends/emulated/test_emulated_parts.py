@@ -189,9 +189,9 @@ class TestPlacement:
         assert self.LAWN.crossings(*ends) != [()], "the sender is behind the wall"
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
-        bare = self.LAWN.model_copy(update={"lines": {}})
+        without_lines = self.LAWN.model_copy(update={"lines": {}})
         with pytest.raises(ConfigurationError, match="no line for the places of robots in the scenario los"):
-            placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), bare)
+            placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), without_lines)
 
 
 class TestRequirements:

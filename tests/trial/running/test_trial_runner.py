@@ -281,13 +281,13 @@ def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> lis
     count, failed = 0, []
 
     def watched(name: str, call: Callable[..., object]) -> Callable[..., object]:
-        def counted(*words: object, **more: object) -> object:
+        def counted(*words: object, **options: object) -> object:
             nonlocal count
             count += 1
             if count >= moment:
                 failed.append(name)
                 raise error
-            return None if name == "fsync" else call(*words, **more)
+            return None if name == "fsync" else call(*words, **options)
 
         return counted
 
@@ -298,8 +298,8 @@ def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> lis
 
 @pytest.mark.parametrize("stride", mark_nightly([3, 1]))
 def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    full, moment, over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
-    while not over:
+    full, moment, is_over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
+    while not is_over:
         out = tmp_path / str(moment := moment + stride)
         with monkeypatch.context() as patched:
             failed = failing(patched, moment, full)
@@ -307,7 +307,7 @@ def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatc
                 run_trial(plan(), IdleTestbed(), out, lambda _: None)
             except ConfigurationError as error:
                 assert error.what  # noqa: PT017 (it may also end)
-            over = not failed
+            is_over = not failed
         if any(out.glob("*/trial.yaml")):
             folder = only(out)
             resume_trial(folder, IdleTestbed(), lambda _: None)
