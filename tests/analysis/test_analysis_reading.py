@@ -21,7 +21,7 @@ from fieldkit.trial.rows import to_csv
 from tests.helpers.tables import ROW, parsed, repeats, replace, write
 
 
-def same(first: Repeats, second: Repeats) -> bool:
+def are_equal(first: Repeats, second: Repeats) -> bool:
     texts = all((column == second.texts[name]).all() for name, column in first.texts.items() if name != "source")
     return texts and all(
         np.array_equal(column, second.numbers[name], equal_nan=True) for name, column in first.numbers.items()
@@ -70,7 +70,7 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 def test_rows_equal_those_read_from_their_table(rows: list[dict[str, Any]]) -> None:
     expected, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
     assert len(expected) == len(rows)
-    assert same(expected, read_back)
+    assert are_equal(expected, read_back)
     for first, second in ((expected.numbers, read_back.numbers), (expected.texts, read_back.texts)):
         assert [(name, column.dtype) for name, column in first.items()] == [
             (name, column.dtype) for name, column in second.items()
@@ -88,7 +88,7 @@ def test_any_split_into_files_gives_the_same_rows(cuts: list[int]) -> None:
     rows_read = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
-    assert same(rows_read, parsed(rows))
+    assert are_equal(rows_read, parsed(rows))
     assert aggregate(rows_read) == aggregate(parsed(rows))
 
 
@@ -107,7 +107,7 @@ def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path: Path, spell: Callable[
     before = read(paths, trial_columns())
     paths[0].write_text(spell(paths[0].read_text(encoding="utf-8")), encoding="utf-8", newline="")
     rows_read = read(paths, trial_columns())
-    assert same(rows_read, before)
+    assert are_equal(rows_read, before)
     assert list(rows_read.texts["source"]) == list(before.texts["source"])
 
 
@@ -207,7 +207,7 @@ def test_a_large_table_is_read_block_by_block_to_the_same_rows(
     all_rows = read([table], trial_columns())
     monkeypatch.setattr(table_files, "_BATCH_BYTES", 1000)
     blocks = read([table], trial_columns())
-    assert same(blocks, all_rows)
+    assert are_equal(blocks, all_rows)
     assert (blocks.texts["source"] == all_rows.texts["source"]).all()
 
 

@@ -14,11 +14,11 @@ class RecordingOperator:
     """An operator that fulfils and records each request."""
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.prompts: list[str] = []
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         assert not may_skip, "a fault during a repeat cannot be postponed"
-        self.asked.append(request)
+        self.prompts.append(request)
         return DONE
 
     def enter(self, question: Question) -> str:
@@ -40,7 +40,7 @@ class RecordingOperator:
 def test_request_and_duration_of_each_fault(fault: Fault, requests: list[str], lasted_s: float | None) -> None:
     operator = RecordingOperator()
     assert FieldTestbed(CAST, {}, operator).inject(fault) == lasted_s
-    assert operator.asked == requests
+    assert operator.prompts == requests
 
 
 class SlowOperator(RecordingOperator):
@@ -65,7 +65,7 @@ def test_link_down_lasts_from_first_to_second_answer(monkeypatch: pytest.MonkeyP
     operator = SlowOperator()
     monkeypatch.setattr("fieldkit.backends.field.time", operator)
     assert FieldTestbed(CAST, {}, operator).inject(Fault(FaultKind.LINK_DOWN, Role.SENDER, 10.0)) == 12.0
-    assert operator.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
+    assert operator.prompts == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
 
 
 MOVE = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
@@ -77,8 +77,8 @@ START_REQUEST = (
 def test_operator_moves_robot_and_brings_it_back() -> None:
     operator = RecordingOperator()
     with FieldTestbed(CAST, {}, operator).moving(MOVE):
-        assert operator.asked == [START_REQUEST.format("duckiedrone-1")]
-    assert operator.asked[1:] == ["bring turtlebot-1 back to its place"]
+        assert operator.prompts == [START_REQUEST.format("duckiedrone-1")]
+    assert operator.prompts[1:] == ["bring turtlebot-1 back to its place"]
 
 
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
@@ -88,4 +88,4 @@ def test_robot_is_brought_back_after_error_but_not_after_ctrl_c(error: BaseExcep
     with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(MOVE):
         raise error
     back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
-    assert operator.asked == [START_REQUEST.format("turtlebot-2"), *back]
+    assert operator.prompts == [START_REQUEST.format("turtlebot-2"), *back]

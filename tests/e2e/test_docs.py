@@ -60,7 +60,7 @@ class Command:
 
     text: str
     exit_code: int
-    shown: str
+    output: str
 
 
 def shape(output: str) -> list[str]:
@@ -115,8 +115,8 @@ def run_commands(page: Path, folder: Path) -> None:
             check=False,
         )
         assert process.returncode == command.exit_code, f"$ {command.text}\n{process.stdout}"
-        if command.shown and REPRODUCIBLE.search(command.text):
-            assert shape(command.shown) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
+        if command.output and REPRODUCIBLE.search(command.text):
+            assert shape(command.output) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
 
 
 COMMAND_PAGES = sorted(

@@ -55,7 +55,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         assert fieldkit(lab_folder, "lab", "down").code == 0
 
 
-def plain(lab_folder: Path, *argv: str) -> str:
+def run_plain(lab_folder: Path, *argv: str) -> str:
     """Run a program without any of fieldkit's environment."""
     done = subprocess.run(
         argv,
@@ -98,12 +98,12 @@ def test_ps_shows_robots_roles_addresses_positions_and_programs(lab: Path) -> No
 
 
 def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
-    assert plain(lab, "ssh", "-F", "ssh.conf", "ground-1", "hostname") == "ground-1\n"
-    assert plain(lab, "ssh", "-F", "ssh.conf", "air-1", "hostname") == "air-1\n"
+    assert run_plain(lab, "ssh", "-F", "ssh.conf", "ground-1", "hostname") == "ground-1\n"
+    assert run_plain(lab, "ssh", "-F", "ssh.conf", "air-1", "hostname") == "air-1\n"
     (lab / "there").write_bytes(os.urandom(300_000))
-    plain(lab, "scp", "-F", "ssh.conf", "there", "ground-1:")
+    run_plain(lab, "scp", "-F", "ssh.conf", "there", "ground-1:")
     (lab / "batch").write_text("get there back\n", encoding="utf-8")
-    plain(lab, "sftp", "-F", "ssh.conf", "-b", "batch", "ground-1")
+    run_plain(lab, "sftp", "-F", "ssh.conf", "-b", "batch", "ground-1")
     assert (lab / "back").read_bytes() == (lab / "there").read_bytes()
 
 
@@ -134,8 +134,8 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
 def test_rsync_reaches_the_robots(lab: Path) -> None:
     (lab / "folder").mkdir(exist_ok=True)
     (lab / "folder" / "data").write_bytes(os.urandom(300_000))
-    plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "folder", "air-1:")
-    plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "air-1:folder/data", "fetched")
+    run_plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "folder", "air-1:")
+    run_plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "air-1:folder/data", "fetched")
     assert (lab / "fetched").read_bytes() == (lab / "folder" / "data").read_bytes()
 
 
@@ -175,8 +175,8 @@ def test_a_robot_that_is_moved_away_is_unreachable_until_it_is_back(lab: Path) -
 def ahead_m(lab: Path) -> float:
     """Return the median range of the beam ahead of ground-1, over 2 s of its laser."""
     record = "source /opt/ros/noetic/setup.bash && rosbag record --duration=2 -O scan /scan"
-    plain(lab, "ssh", "-F", "ssh.conf", "ground-1", record)
-    plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
+    run_plain(lab, "ssh", "-F", "ssh.conf", "ground-1", record)
+    run_plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
     with Reader(lab / "scan.bag") as bag:
         scans: list[Any] = [
             shipped().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan") for *_, data in bag.messages()

@@ -45,7 +45,7 @@ def untested_commands(page: Path) -> Iterator[str]:
         yield END_OF_COMMAND.split(command)[0]
 
 
-def words(command: str) -> list[str]:
+def command_words(command: str) -> list[str]:
     return shlex.split(command, comments=True)[1:]
 
 
@@ -59,7 +59,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
-    arguments = words(command)
+    arguments = command_words(command)
     if arguments[0] in EXTERNAL:
         pytest.skip("a command of another package")
     cli.parser().parse_args(arguments)
@@ -67,7 +67,7 @@ def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
 
 def test_the_parser_refuses_a_wrong_option() -> None:
     with pytest.raises(ConfigurationError):
-        cli.parser().parse_args(words("fieldkit trial los 30ft --repeat 3x --nope"))
+        cli.parser().parse_args(command_words("fieldkit trial los 30ft --repeat 3x --nope"))
 
 
 @pytest.mark.parametrize("page", HAND_WRITTEN, ids=page_id)
@@ -136,4 +136,4 @@ def test_ci_files_of_the_installation_page_are_yaml(name: str) -> None:
     commands = [line[line.index("fieldkit trial") :] for line in text.splitlines() if "fieldkit trial" in line]
     assert commands
     for command in commands:
-        cli.parser().parse_args(words(command))
+        cli.parser().parse_args(command_words(command))

@@ -172,12 +172,12 @@ def over_tcp() -> Iterator[str]:
             accepted.join()
             return streams[0]
 
-        with _late(stream):
+        with _drone_answering(stream):
             yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
 
 
 @contextmanager
-def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
+def _drone_answering(stream: Callable[[], socket.socket]) -> Iterator[None]:
     """Let a drone answer on a stream when it is open."""
     finished, ready = threading.Event(), threading.Event()
 

@@ -98,7 +98,7 @@ class FakeServer:
 
     def __init__(self, serve: Callable[[socket.socket], object]) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.kept: list[object] = []
+        self.transports: list[object] = []
         self.serve = serve
         threading.Thread(target=self.accept, daemon=True).start()
 
@@ -106,7 +106,7 @@ class FakeServer:
         with contextlib.suppress(OSError):
             while True:
                 stream, _ = self.listener.accept()
-                self.kept.append((stream, self.serve(stream)))
+                self.transports.append((stream, self.serve(stream)))
 
     def connect(self, timeout_s: float) -> socket.socket:
         return socket.create_connection(self.listener.getsockname(), timeout=timeout_s)
@@ -785,7 +785,7 @@ def test_close_ends_a_hanging_login(
     mute = fakes(lambda stream: None)
     shell = server.shell(connect=mute.connect)
     done = pool.submit(shell.run, ("true",), deadline=soon())
-    wait_until(lambda: len(mute.kept) == 1, soon())
+    wait_until(lambda: len(mute.transports) == 1, soon())
     assert "fieldkit closed the connection" in str(ends_soon(done, shell))
 
 

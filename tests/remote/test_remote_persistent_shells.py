@@ -65,11 +65,11 @@ class Robot:
         """Return the pid of the persistent shell when it is open."""
         found: list[int] = []
 
-        def same() -> bool:
+        def is_same_shell() -> bool:
             found.append(self.pid())
             return found[-2:-1] == found[-1:]
 
-        wait_until(same, soon())
+        wait_until(is_same_shell, soon())
         return found[-1]
 
 

@@ -205,12 +205,12 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
     ]
     evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
-    listed = [(warning.text, list(map(plain, warning.reasons))) for warning in summary.warnings(cells, evidence)]
+    listed = [(warning.text, list(map(plain_text, warning.reasons))) for warning in summary.warnings(cells, evidence)]
     assert listed[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
     assert listed[1] == ("1 attempt failed.", ["no answer (1)"])
     assert listed[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
     assert listed[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
-    assert "2 repeats give 50 %" in plain(listed[3][0])
+    assert "2 repeats give 50 %" in plain_text(listed[3][0])
     assert listed[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
     assert listed[5][0].startswith("Different versions of fieldkit")
     assert len(listed) == 6
@@ -292,10 +292,10 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
 def ends(headline: headlines.Headline) -> list[str]:
     """Return one text per end of a headline."""
     lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
-    return [plain(" ".join(parts)) for parts in lines]
+    return [plain_text(" ".join(parts)) for parts in lines]
 
 
-def plain(text: str) -> str:
+def plain_text(text: str) -> str:
     return text.replace("\N{NO-BREAK SPACE}", " ")
 
 

@@ -37,7 +37,7 @@ PORTS = st.sampled_from([1234, 1234, 2222])
 NAMES = st.sampled_from(["up", "down", "recv", "n{n}", "n{n}"])
 
 
-def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+def _optional_keys(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
     """Return a strategy for mappings from which each key may be missing."""
     return st.fixed_dictionaries({}, optional=keys)
 
@@ -45,12 +45,12 @@ def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
 RECORD = st.builds(
     lambda robot, name: {"record": {"robot": robot, "topics": ["/scan"], "duration": "2s", **name}},
     st.sampled_from(["sender"] * 3 + ["receiver", "relay"]),
-    _given(name=st.sampled_from(["scan", "lidar", "recv"])),
+    _optional_keys(name=st.sampled_from(["scan", "lidar", "recv"])),
 )
 TRANSFER = st.builds(
     lambda ends, more: {"transfer": {"from": ends[0], "to": ends[1], **more}},
     ENDS,
-    _given(
+    _optional_keys(
         name=NAMES,
         file=st.sampled_from(["scan", "scan.bag", "lidar.bag", "none.bin"]),
         into=st.sampled_from(["recv.bag", "other.bag", "scan.bag", "ping.txt", "sender.pcap", "track.csv"]),
@@ -60,14 +60,14 @@ TRANSFER = st.builds(
 PING = st.builds(
     lambda ends, more: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **more}},
     ENDS,
-    _given(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
+    _optional_keys(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
 )
 
 
 IPERF3 = st.builds(
     lambda ends, more: {"iperf3": {"from": ends[0], "to": ends[1], "duration": "1s", **more}},
     ENDS,
-    _given(
+    _optional_keys(
         name=NAMES,
         protocol=st.sampled_from(["tcp", "udp"]),
         reverse=st.booleans(),
@@ -82,13 +82,13 @@ ROBOTS = st.sampled_from(
 
 
 def _capture(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
-    keys = _given(name=NAMES, robots=ROBOTS, port=PORTS)
+    keys = _optional_keys(name=NAMES, robots=ROBOTS, port=PORTS)
     return st.builds(lambda more, steps: {"capture": {**more, "during": steps}}, keys, during)
 
 
 def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
     path_keys = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
-    keys = _given(name=NAMES)
+    keys = _optional_keys(name=NAMES)
     return st.builds(
         lambda robot, more, steps: {"move": {"robot": robot, **path_keys, **more, "during": steps}},
         ROLES,
@@ -103,7 +103,7 @@ def _fault(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
         lambda robot, kind, more, steps: {"fault": {"robot": robot, **kind, **more, "during": steps}},
         ROLES,
         st.sampled_from(kinds),
-        _given(name=NAMES),
+        _optional_keys(name=NAMES),
         during,
     )
 

@@ -44,7 +44,7 @@ def _is_load(packet: bytes) -> bool:
     return not _is_icmp(packet) and not _is_later(packet) and int.from_bytes(packet[2:4], "big") > 60
 
 
-def _left(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
+def _own_packets(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
     """Return the packets that the robot in `role` sent; the first of each capture is the sender's."""
     sender = packets[0][1][HEADS + 12 : HEADS + 16]
     return [
@@ -58,7 +58,7 @@ def _waiting(attempt: Attempt, role: str, chosen: Chosen) -> list[Packet]:
     """Return packets sent in the other repeat, as if they were delayed until the start of this one."""
     other = Attempt(LOSSLESS / "repeats" / f"{attempt.protocol}-02", attempt.protocol)
     began_us, _ = attempt.packets("receiver.pcap")[0]
-    actual = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
+    actual = [(began_us, rest) for _, rest in _own_packets(other.packets(f"{role}.pcap"), role, chosen)]
     assert actual
     return actual
 
@@ -68,7 +68,7 @@ def _changed(packet: Packet, at: int, by: bytes) -> Packet:
     return time_us, rest[: HEADS + at] + by + rest[HEADS + at + len(by) :]
 
 
-def _told(attempt: Attempt) -> list[str]:
+def _reasons(attempt: Attempt) -> list[str]:
     return [reason for reason in attempt.problems() if EARLIER in reason]
 
 
@@ -120,11 +120,11 @@ def test_only_earlier_packets_arrived(tmp_path: Path, chosen: Chosen) -> None:
     attempt = of(Protocol.UDP, tmp_path)
     waiting = _waiting(attempt, "sender", chosen)
     attempt.capture("receiver", lambda _: (waiting * 5)[:9])
-    attempt.capture("sender", lambda packets: _left(packets, "sender", lambda _: True))
+    attempt.capture("sender", lambda packets: _own_packets(packets, "sender", lambda _: True))
     (attempt.folder / "recv.bag").write_bytes(b"")
     sent = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms\n"
     (attempt.folder / "ping.txt").write_text(f"PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.\n\n{sent}")
-    assert len(_told(attempt)) == 1, attempt.problems()
+    assert len(_reasons(attempt)) == 1, attempt.problems()
 
 
 @given(st.sampled_from(Protocol), st.integers(0, 2**32), st.sampled_from((0.0, 0.1, 0.6, 1.0)))
@@ -144,19 +144,19 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
         near, far = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
 
         def carried(packets: list[Packet], role: str) -> list[Packet]:
-            own_packets = _left(packets, role, lambda _: True)
+            own_packets = _own_packets(packets, role, lambda _: True)
             return [packet for packet in packets if packet in own_packets or chance.random() >= lost]
 
         cut = chance.randrange(3)
         near = [*carried(near, "sender"), *aside[1:]]
         far = [*strays[:2], *aside[:2], *carried(far, "receiver")]
-        replies = _left(far, "receiver", _is_icmp)
+        replies = _own_packets(far, "receiver", _is_icmp)
         late = replies[len(replies) - cut :]
         attempt.capture("sender", lambda _: near)
         attempt.capture(
             "receiver", lambda _: [changed_packet for changed_packet in far if changed_packet not in late]
         )
-        assert _told(attempt) == []
+        assert _reasons(attempt) == []
 
 
 def test_rewritten_ip_ids_are_not_an_earlier_attempt(tmp_path: Path) -> None:

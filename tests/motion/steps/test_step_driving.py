@@ -187,10 +187,10 @@ class Link:
         self.status = iter(status)
         self.last = ""
         self.broken = broken
-        self.asked = Event()
+        self.was_asked = Event()
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        self.asked.set()
+        self.was_asked.set()
         if self.broken:
             raise LinkError("is out of range", where=self.robot, remedy="wait")
         self.written.append(argv[-2])
@@ -235,9 +235,9 @@ def test_lost_link_does_not_end_the_wait() -> None:
     link = Link(status=['{"phase": "out"}'])
     with lease_of(link) as lease:
         link.broken = True
-        link.asked.clear()
-        lease.wait(link.asked.is_set, Deadline.after(60))
-        assert link.asked.is_set()
+        link.was_asked.clear()
+        lease.wait(link.was_asked.is_set, Deadline.after(60))
+        assert link.was_asked.is_set()
         assert lease.status == {"phase": "out"}
 
 

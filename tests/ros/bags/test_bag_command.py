@@ -225,7 +225,7 @@ def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def work_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -259,9 +259,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ids=lambda connection: " ".join(connection) if isinstance(connection, tuple) else "",
 )
 def test_impossible_requests_are_reported(
-    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
+    work_folder: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
 ) -> None:
-    write_bag(here, BagFormat.ROS1, expected(5))
+    write_bag(work_folder, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
     Path("packed.bag.gz").write_bytes(gzip.compress(b"a bag"))
     Path("empty.bag").touch()
@@ -271,10 +271,10 @@ def test_impossible_requests_are_reported(
     shutil.copyfile("all.bag", "all.db3")
     Path("zeros.mcap").write_bytes(bytes(1000))
     shutil.copyfile(KILLED / "bz2.bag.active", "killed.bag")
-    names = {path.name for path in here.iterdir()}
+    names = {path.name for path in work_folder.iterdir()}
     assert main(["bag", *words]) == code
     assert output_text in capsys.readouterr().err
-    assert {path.name for path in here.iterdir()} == names, "no file remains"
+    assert {path.name for path in work_folder.iterdir()} == names, "no file remains"
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.NONE])

@@ -218,13 +218,13 @@ def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
     attempt = KINDS["reliable over UDP"]
     resumed = next(row for place, row in enumerate(filter(is_sample, attempt.received)) if place == 30)[4]
 
-    def held(place: int, row: Row) -> Row | None:
+    def delayed(place: int, row: Row) -> Row | None:
         if not 15 <= place < 30:
             return row
         return None if place < 20 else (*row[:4], resumed - MS)
 
     reasons, measured = topic_attempts.judge_attempt(
-        replace(attempt, received=with_samples(attempt.received, held)), tmp_path
+        replace(attempt, received=with_samples(attempt.received, delayed)), tmp_path
     )
     assert reasons == []
     assert measured.values["topic_received"] == SAMPLES - 5

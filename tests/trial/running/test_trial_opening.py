@@ -93,7 +93,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
             assert (cast, shells) == (CAST, TESTBED.shells)
             recording.note("meet")
 
-        def held(shells: Shells, holder: Holder, *, sink: Sink) -> AbstractContextManager[None]:
+        def lock(shells: Shells, holder: Holder, *, sink: Sink) -> AbstractContextManager[None]:
             assert shells == TESTBED.shells
             recording.holder = holder
             return recording.around("hold")
@@ -109,7 +109,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
             return Outcome(folder, (), 2, 0)
 
         monkeypatch.setattr(preflight, "connect_all", meet)
-        monkeypatch.setattr(locks, "held", held)
+        monkeypatch.setattr(locks, "locked_exclusively", lock)
         monkeypatch.setattr(runner, "run_trial", run_trial)
         monkeypatch.setattr(resumption, "resume_trial", resume_trial)
         return recording

@@ -77,11 +77,11 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
 ) -> None:
     stop, fetch = Stop(), Robots.fetch
 
-    def asked(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def recorded_fetch(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         stop.after_repeat = not remote.endswith("tcp-01-1")
         return fetch(self, remote, into, clean=clean)
 
-    monkeypatch.setattr(Robots, "fetch", asked)
+    monkeypatch.setattr(Robots, "fetch", recorded_fetch)
     with pytest.raises(KeyboardInterrupt):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append, stop)
     assert [event.status for event in repeat_ends(events)] == [Status.VOID, Status.VALID]

@@ -24,7 +24,7 @@ EXIT_S = 300.0
 TASKS = [Task(policy, seed) for policy in ("one", "other") for seed in (3, 1, 2)]
 
 
-def drawn(task: Task) -> tuple[str, int, float]:
+def random_result(task: Task) -> tuple[str, int, float]:
     """Return a result that depends only on the task; tasks that are submitted first take longest."""
     stream = RandomStream(task.seed, task.policy)
     for number in range(0, 3_000 // task.seed, 256):
@@ -49,16 +49,16 @@ def killed(task: Task) -> int:
 
 
 def test_results_are_in_the_order_of_the_tasks() -> None:
-    expected = [drawn(task) for task in TASKS]
+    expected = [random_result(task) for task in TASKS]
     counted: list[int] = []
-    assert run_many(drawn, TASKS, workers=Workers(2), progress=counted.append) == expected
+    assert run_many(random_result, TASKS, workers=Workers(2), progress=counted.append) == expected
     assert counted == [1, 2, 3, 4, 5, 6]
 
 
 @given(st.permutations(TASKS))
 def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
-    results = dict(zip(tasks, run_many(drawn, tasks, workers=Workers(1)), strict=True))
-    assert [results[task] for task in TASKS] == [drawn(task) for task in TASKS]
+    results = dict(zip(tasks, run_many(random_result, tasks, workers=Workers(1)), strict=True))
+    assert [results[task] for task in TASKS] == [random_result(task) for task in TASKS]
 
 
 @pytest.mark.parametrize("workers", [1, 2])

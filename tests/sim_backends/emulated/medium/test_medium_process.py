@@ -86,7 +86,7 @@ def bench() -> Iterator[Bench]:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
+def routed_namespaces() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
     """Namespaces with default routes, for tests that depend on no counters."""
     with benches() as make:
         medium, spaces = make(PLAIN)
@@ -287,9 +287,9 @@ def test_packets_that_waited_to_be_read_count_as_late(bench: Bench) -> None:
 @pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
 @pytest.mark.parametrize("relay", [None, "r"])
 def test_multicast_and_broadcast_reach_everyone(
-    plain: tuple[MediumClient, dict[str, Namespace]], address: str, relay: str | None
+    routed_namespaces: tuple[MediumClient, dict[str, Namespace]], address: str, relay: str | None
 ) -> None:
-    medium, spaces = plain
+    medium, spaces = routed_namespaces
     medium.place(PLACES, relay=relay)
     listeners = {name: spaces[name].start(sys.executable, "-c", LISTEN, ADDRESSES[name]) for name in ("b", "r")}
     for listener in listeners.values():
@@ -352,8 +352,8 @@ def test_the_medium_continues_between_the_other_robots(bench: Bench) -> None:
     assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
 
 
-def test_invalid_requests_are_rejected(plain: tuple[MediumClient, dict[str, Namespace]]) -> None:
-    medium, spaces = plain
+def test_invalid_requests_are_rejected(routed_namespaces: tuple[MediumClient, dict[str, Namespace]]) -> None:
+    medium, spaces = routed_namespaces
     fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
     with pytest.raises(RobotError, match="attached already"):
         medium.attach("a", "10.9.1.1/24", RADIO, fd)
