@@ -63,7 +63,7 @@ def test_the_line_is_never_wider_than_the_terminal() -> None:
 
 
 def test_no_estimate_before_the_first_repeat_ends() -> None:
-    assert line(80, *STARTED[1:2], PhaseStarted("preflight")) == f"{'─' * 12}  0/40  preflight  for 0.0 s"
+    assert line(80, *STARTED[1:2], PhaseStarted("check")) == f"{'─' * 12}  0/40  check  for 0.0 s"
 
 
 def test_no_line_during_a_question_and_after_the_end() -> None:
