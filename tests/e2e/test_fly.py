@@ -153,7 +153,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(fie
     process.send_signal(signal.SIGINT)
     stopped = finish(process)
     assert stopped.code == 130
-    stops, comes, ground = map(
+    stop_line, return_line, ground_line = map(
         stopped.err.index,
         (
             "stopping: copter-1 returns automatically, if it is in the air: this takes up to about ",
@@ -161,7 +161,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(fie
             "copter-1: stopped (on the ground)",
         ),
     )
-    assert stops < comes < ground
+    assert stop_line < return_line < ground_line
     assert height_m(field_robots, Role.SENDER) < 1e-3, "confirmed when it is there"
     assert_landed(field_robots, Role.SENDER, "return: the job was cancelled")
     assert far_m(field_robots, Role.SENDER) < NEAR_M

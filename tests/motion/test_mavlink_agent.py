@@ -248,10 +248,10 @@ def test_peer_that_restarts_at_another_port_is_answered(monkeypatch: pytest.Monk
     with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
         first.settimeout(60)
         second.settimeout(60)
-        for sends, heard_by in ((first, first), (second, first), (second, second)):
+        for source, heard_by in ((first, first), (second, first), (second, second)):
             if heard_by is second:
                 monkeypatch.setattr(devices, "_PEER_TIMEOUT_S", 0.0)
-            sends.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
+            source.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
             select.select([device], [], [], 60)
             assert device.read()
             device.write(b"to whom it may concern")
@@ -312,9 +312,9 @@ class FakeLink:
         assert frame
 
 
-@pytest.mark.parametrize(("comes", "is_refused"), [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize(("arrives", "is_refused"), [(False, False), (True, False), (False, True)])
 def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
-    comes: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    arrives: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     clock, link, sender = FakeClock(), FakeLink(), Sender()
     monkeypatch.setattr(mavlink, "time", clock)
@@ -332,11 +332,11 @@ def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
     turn(500.0, drones.beat(), d.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0))
     turn(559.9, drones.beat())
     assert not recorder.ready
-    if comes:
+    if arrives:
         turn(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
     if is_refused:
         link.messages = {32: MessageRate(100_000, d.MAV_RESULT_DENIED, 0.0)}
-    if comes or is_refused:
+    if arrives or is_refused:
         turn(560.1, drones.beat())
         assert recorder.ready
         turn(2000.0)

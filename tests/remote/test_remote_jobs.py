@@ -502,9 +502,9 @@ def test_folder_is_fetched_completely_with_the_host_state_before_and_after(shell
 
 
 def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, tmp_path: Path) -> None:
-    waits = ("sh", "-c", "trap 'exit 0' INT; echo up; while :; do sleep 0.02; done")
+    waiting = ("sh", "-c", "trap 'exit 0' INT; echo up; while :; do sleep 0.02; done")
     stopped, broken, lost, slow = (
-        replace(job(*waits, name=name), ready="log:up") for name in ("stopped", "broken", "lost", "slow")
+        replace(job(*waiting, name=name), ready="log:up") for name in ("stopped", "broken", "lost", "slow")
     )
     for job_spec in (stopped, broken, lost):
         jobs.start(shell, job_spec)

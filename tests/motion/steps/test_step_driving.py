@@ -300,8 +300,8 @@ def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]
 
 
 def test_early_stop_aborts_steps_inside(stopped: list[str]) -> None:
-    waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
-    step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
+    waiting_step = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
+    step = schema.validate(schema.parse(json.dumps(waiting_step), source="x.yaml"), MoveStep)
     field = Field(Link(after="out", status=[READY] * 4 + ['{"ended": "beyond the fence"}']))
     with pytest.raises(RobotError, match="it stopped on its path: beyond the fence") as caught:
         step.run(quick_scene(), field, lambda *_: None)

@@ -253,8 +253,10 @@ def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float)
 
 def test_driving_robot_has_columns_and_time_for_the_return() -> None:
     text = f"robot: receiver, path: [{{away: 2m}}], speed: 0.2m/s, {PING}"
-    drives = {role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in CAST.items()}
-    driving, moved = resolved_move(text, drives), resolved_move(text)
+    driving_robots = {
+        role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in CAST.items()
+    }
+    driving, moved = resolved_move(text, driving_robots), resolved_move(text)
     assert {column.name for column in driving.output_columns()} >= {
         "drive_out_m",
         "drive_back_off_m",

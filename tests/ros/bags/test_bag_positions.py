@@ -78,7 +78,7 @@ def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late
 
 
 @pytest.mark.parametrize(
-    ("made", "frame", "places"),
+    ("make_message", "frame", "places"),
     [
         (odometry, PLACED, [[0, 0, 0], [1, 2, 0]]),
         (stamped, "frame map", [[0, 0, 0], [1, 2, 0]]),
@@ -88,9 +88,9 @@ def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late
     ],
 )
 def test_every_message_type_has_positions(
-    tmp_path: Path, made: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
+    tmp_path: Path, make_message: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
 ) -> None:
-    path = write_bag(tmp_path, [made(BEGAN_NS, 0.0, 0.0), made(BEGAN_NS + S, 1.0, 2.0)])
+    path = write_bag(tmp_path, [make_message(BEGAN_NS, 0.0, 0.0), make_message(BEGAN_NS + S, 1.0, 2.0)])
     samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.frame, samples.values.tolist()) == (frame, places)
     assert samples.times_ns.tolist() == [BEGAN_NS, BEGAN_NS + S]

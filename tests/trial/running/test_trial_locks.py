@@ -292,8 +292,8 @@ def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tm
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event), ThreadPoolExecutor(1) as pool:
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
         (tmp_path / "bin" / "df").unlink(missing_ok=True)
-        waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
-        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was checked
+        wrapper = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
+        (tmp_path / "bin" / "df").write_text(wrapper, encoding="ascii")  # called after the lock was checked
         (tmp_path / "bin" / "df").chmod(0o755)
         submitted = pool.submit(begin, robot, ANNA)
         wait_until(called.exists, Deadline.after(30))

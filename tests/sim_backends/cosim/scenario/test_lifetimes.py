@@ -171,12 +171,12 @@ def test_an_agent_appears_at_its_start_and_moves_from_then_on(physics: str, path
 @pytest.mark.parametrize("physics", ["builtin", "mujoco"])
 def test_an_absent_agent_is_no_obstacle(physics: str, path: Path) -> None:
     """A robot drives through the place where another one has been, and collides with it while it is there."""
-    drives = {"kind": "velocity-profile", "legs": [{"duration": "5s", "speed": "1m/s"}]}
+    motion = {"kind": "velocity-profile", "legs": [{"duration": "5s", "speed": "1m/s"}]}
     changes = {
         "physics.federate": physics,
         "traffic": [],
         "duration": "4s",
-        "agents.a": {"robot": "husky", "at_m": [28.5, 10], "motion": drives, "radio": {}},
+        "agents.a": {"robot": "husky", "at_m": [28.5, 10], "motion": motion, "radio": {}},
         "agents.c.robot": "husky",
         "agents.c.motion": {"kind": "standing"},
         "agents.c.radio": {},

@@ -204,11 +204,11 @@ def test_flows_of_one_pair_are_distinguished_in_fragments_and_mixed(bench: Bench
     back = ("b", "a", socket.IPPROTO_UDP, 1234)
     for flow in (*flows.values(), back):
         assert medium.delays(*flow) == NO_PACKETS
-    sends = "import socket,sys; s=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n"
-    sends += "for n, size, port in ((2, 8192, 1234), (3, 972, 1235), (1, 9000, 99)):\n"
-    sends += "    for _ in range(n): s.sendto(bytes(size), (sys.argv[1], port))"
+    sender_program = "import socket,sys; s=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n"
+    sender_program += "for n, size, port in ((2, 8192, 1234), (3, 972, 1235), (1, 9000, 99)):\n"
+    sender_program += "    for _ in range(n): s.sendto(bytes(size), (sys.argv[1], port))"
     ping(spaces["a"], ADDRESSES["b"], count=2)
-    spaces["a"].run(sys.executable, "-c", sends, ADDRESSES["b"])
+    spaces["a"].run(sys.executable, "-c", sender_program, ADDRESSES["b"])
     wait_until(lambda: medium.delays(*flows[1235]).packets == 3, Deadline.after(LONG_S))
     large, small = (medium.delays(*flow) for flow in flows.values())
     assert (large.packets, large.propagation_ns) == (12, 12 * 20_000_000)
