@@ -206,9 +206,9 @@ def test_mistyped_word_suggests_the_right_one(
     words: str, message: str, remedy: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words.split()) == 2
-    shown = capsys.readouterr().err
-    assert shown.startswith(f"error: {message}")
-    assert f"\n  remedy: {remedy}" in shown
+    error_text = capsys.readouterr().err
+    assert error_text.startswith(f"error: {message}")
+    assert f"\n  remedy: {remedy}" in error_text
 
 
 def test_the_citation_names_the_version_and_the_paper() -> None:

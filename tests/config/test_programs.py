@@ -30,9 +30,9 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def put(name: str, source: str = "procedures/p.yaml") -> LabProgram:
-    held = schema.validate(schema.parse(f"# a comment\nput: {name}", source=source), Holder).put
-    assert held is not None
-    return held
+    value = schema.validate(schema.parse(f"# a comment\nput: {name}", source=source), Holder).put
+    assert value is not None
+    return value
 
 
 def write_program(path: str, content: bytes = SCRIPT, mode: int = 0o644) -> None:

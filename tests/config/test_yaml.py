@@ -128,7 +128,7 @@ def test_devices_and_folders_are_rejected(path: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "where", "message"),
+    ("text", "location", "message"),
     [
         ("# lab\n\nbackend: field\n", "x:3", "required key 'robots' is missing"),
         ("", "x:1", "keys with values are needed here, and there are none"),
@@ -139,10 +139,10 @@ def test_devices_and_folders_are_rejected(path: str) -> None:
         (f"robots: {{a: {{profile: x}}}}\nroles: {{}}\npatience: {'9' * 15}s", "x:3", "too large"),
     ],
 )
-def test_error_in_a_site_file_has_message_and_line(text: str, where: str, message: str) -> None:
+def test_error_in_a_site_file_has_message_and_line(text: str, location: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(text, source="x"), Site)
-    assert (caught.value.where, message in caught.value.what) == (where, True), caught.value
+    assert (caught.value.where, message in caught.value.what) == (location, True), caught.value
 
 
 CAMPAIGN = """\

@@ -17,7 +17,7 @@ from tests.helpers.paths import DATA
 
 _IW: Final = DATA / "iw"
 _CLOCK: Final = "==> clock <==\n100.00 1700000100.000000000 100.00\n==> iw station dump <==\n"
-_OWN: Final = "".join(
+_SAMPLES_TEXT: Final = "".join(
     f"==> 101.{at:02d} {name} <==\n{path.read_text(encoding='utf-8')}"
     for name, pattern in (("link", "link-*"), ("survey", "survey-*"), ("station", "station*"), ("wireless", "wire*"))
     for at, path in enumerate(sorted(_IW.glob(f"{pattern}.txt")))
@@ -49,7 +49,7 @@ def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
     """Read a robot's own link samples, with one mutated file and the others intact."""
     (place / "sender-before.txt").write_text(_CLOCK, encoding="utf-8")
     if "link" not in name:
-        (place / "sender-link.txt").write_text(_OWN, encoding="utf-8")
+        (place / "sender-link.txt").write_text(_SAMPLES_TEXT, encoding="utf-8")
     (place / name).write_bytes(data)
     _measure(list(robot_link_samples.read(place, Role.SENDER)))
 
@@ -81,13 +81,13 @@ def _match_expression(data: bytes, place: Path) -> None:
 
 def radio_targets() -> Iterator[Target]:
     """Yield the targets."""
-    samples = robot_link_samples.parse(_OWN)
+    samples = robot_link_samples.parse(_SAMPLES_TEXT)
     testbeds = link_samples.text({Role.SENDER: samples, Role.RECEIVER: samples[:3]}).encode()
     yield Target("link-csv", (testbeds,), _read_testbed_samples)
     states = (_CLOCK + (_IW / "station-iwlwifi-6.txt").read_text(encoding="utf-8")).encode()
     for name, seed in (
-        ("sender-link.txt", _OWN.encode()),
-        ("sender-link.txt.gz", gzip.compress(_OWN.encode(), mtime=0)),
+        ("sender-link.txt", _SAMPLES_TEXT.encode()),
+        ("sender-link.txt.gz", gzip.compress(_SAMPLES_TEXT.encode(), mtime=0)),
         ("sender-before.txt", states),
     ):
         yield Target(f"own-{name}".replace(".", "_"), (seed,), partial(_read_robot_samples, name))

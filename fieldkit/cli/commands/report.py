@@ -36,7 +36,7 @@ def add(parser: Parser) -> None:
         "--repeat",
         default="",
         metavar="NAME",
-        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median one of the worst cell)",
+        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median one of the worst condition)",
     )
     parser.add_argument(
         "--quantity",

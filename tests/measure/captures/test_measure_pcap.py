@@ -157,7 +157,7 @@ def test_any_changed_bit_of_an_ipv4_header_makes_its_checksum_wrong(
     changed = header.copy()
     changed[bit // 8] ^= 1 << bit % 8
     not_computed = header[:10] + bytes(2) + header[12:]
-    frames = timed([bytes(each) + bytes(20) for each in (header, changed, not_computed)])
+    frames = timed([bytes(head) + bytes(20) for head in (header, changed, not_computed)])
     packets = pcap.parse(file_bytes(frames, link_type=101), where="x").packets
     is_computed, is_decoded = any(changed[10:12]), int.from_bytes(changed[2:4]) >= len(header)
     expected = [False, *([is_computed] if is_decoded else []), False]

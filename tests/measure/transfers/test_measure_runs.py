@@ -31,8 +31,8 @@ def test_runs_of_any_lengths(some: list[tuple[int, int]], chunk_bytes: int) -> N
 
 @given(st.integers(1, 5_000))
 def test_a_run_cut_anywhere_gives_what_is_before_the_cut(cut: int) -> None:
-    whole = file_bytes([Frame(index, segment(index, 0)) for index in range(100)])
-    data = whole[: max(24, len(whole) - cut)]
+    content = file_bytes([Frame(index, segment(index, 0)) for index in range(100)])
+    data = content[: max(24, len(content) - cut)]
     capture = pcap.parse(data, where="test")
     per_packet = len(segment(0, 0)) + 16
     assert len(capture.packets) == (len(data) - 24) // per_packet

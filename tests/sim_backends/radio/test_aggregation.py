@@ -145,10 +145,10 @@ def bianchi_bit_s(mode: WifiMode, stations: int) -> float:
     airtime_ns, aifs_ns = mode.airtime_ns(aggregate.size_bytes), mode.band.best_effort_aifs_ns
     success_ns = airtime_ns + mode.band.sifs_ns + response_ns(mode, aggregate.response_bytes) + aifs_ns
     collision_ns = airtime_ns + mode.band.sifs_ns + SLOT_NS + 20_000 + aifs_ns
-    idle, one = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
-    slot_ns = idle * SLOT_NS + one * success_ns + (1 - idle - one) * collision_ns
+    idle, single = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
+    slot_ns = idle * SLOT_NS + single * success_ns + (1 - idle - single) * collision_ns
     assert CCA_TIME_NS < SLOT_NS
-    return one * len(aggregate.frames) * 8000 / slot_ns * 1e9
+    return single * len(aggregate.frames) * 8000 / slot_ns * 1e9
 
 
 # ns-3 3.37, `benchmarks.high_throughput_vs_ns3`: payloads of 1000 bytes, Mbit/s.
@@ -172,10 +172,10 @@ def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order(
     arrived = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
     attempts = [attempt for attempt in log if attempt.number]
     assert arrived == list(range(500))
-    again = [attempt for attempt in attempts if attempt.number > 1]
-    assert 0.02 < len(again) / len(attempts) < 0.5
+    retries = [attempt for attempt in attempts if attempt.number > 1]
+    assert 0.02 < len(retries) / len(attempts) < 0.5
     together = {attempt.start_ns for attempt in attempts if attempt.number == 1}
-    assert any(attempt.start_ns in together for attempt in again), "sent again together with new frames"
+    assert any(attempt.start_ns in together for attempt in retries), "sent again together with new frames"
 
 
 def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> None:
