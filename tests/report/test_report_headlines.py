@@ -131,6 +131,7 @@ def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:
         {source: plan.model_copy(update={"repeats": 5}) for source in evidence.plans},
         (),
         frozenset(),
+        evidence.verified,
     )
     shown = texts(next(iter(headlines(aggregate(evidence.repeats), more))))
     assert shown[0] == "1 of 5 valid"
