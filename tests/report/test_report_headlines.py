@@ -131,6 +131,7 @@ def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:
         {source: plan.model_copy(update={"repeats": 5}) for source in evidence.plans},
         (),
         frozenset(),
+        evidence.verified,
     )
     result = texts(next(iter(headlines(aggregate(evidence.repeats), other_evidence))))
     assert result[0] == "1 of 5 valid"

@@ -159,6 +159,16 @@ def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
     assert strip.marks[-1].title == "udp-2400, void: no capture, UDP datagram loss 5.56 %"
 
 
+def test_the_void_marks_of_a_page_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strips, "MAX_OTHER_MARKS", 30)
+    rows = [lawns.row(number, status="void" if number % 2 else "valid") for number in range(1, 101)]
+    evidence = load_evidence(table(tmp_path, rows))
+    cells = aggregate(evidence.repeats)
+    ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
+    assert sum(mark.status == "void" for mark in strip.marks) == 30
+    assert (strip.left_out, strip.others_left_out) == (0, 20)
+
+
 @pytest.mark.parametrize(("loss", "expected"), [(0.0, "none"), (0.125, "full height 12.5 %")])
 def test_strip_states_its_scale(tmp_path: Path, loss: float, expected: str) -> None:
     evidence = load_evidence(

@@ -34,7 +34,7 @@ def selected_row(rows: Sequence[RepeatRow], *missing: int) -> int | None:
     """Return the row selected for the time line if evidence exists for all rows except some."""
     table = parsed([replace(row, repeat=1 + number) for number, row in enumerate(rows)])
     remaining = frozenset(range(len(rows))).difference(missing)
-    return repeat_to_draw(aggregate(table), PartialEvidence(table, {}, (), frozenset(), remaining), "")
+    return repeat_to_draw(aggregate(table), PartialEvidence(table, {}, (), frozenset(), frozenset(), remaining), "")
 
 
 def rows_with(row: RepeatRow, name: str, *values: float) -> list[RepeatRow]:
