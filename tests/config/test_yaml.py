@@ -1,12 +1,9 @@
 """YAML input: parsed as YAML 1.2 defines it, or rejected with line and remedy."""
 
-import re
 from collections.abc import Callable
-from operator import itemgetter
 from pathlib import Path
 
 import pytest
-import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -245,40 +242,3 @@ def test_damaged_files_cause_only_configuration_errors(file: tuple[str, type[sch
 def test_any_text_causes_only_configuration_errors(text: str) -> None:
     check_text(text, Site)
     check_text(f"robots: {text}", Site)
-
-
-def reading(text: str) -> tuple[str, object]:
-    """Return the document with its lines, or the error, as text."""
-    try:
-        document = documents.parse(text, source="x.yaml")
-    except ConfigurationError as error:
-        return str(error), error.remedy
-    return repr(document.data), document.lines
-
-
-TOKENS = (
-    *CHARACTERS,
-    "\n  ",
-    "\n- ",
-    ": ",
-    "- ",
-    "\n\n",
-    " #",
-    "\r",
-    "\x85",
-    "\u2028",
-    "é",
-    '"\\u2028"',
-    "---\n",
-    "%YAML 1.1\n",
-)
-YAML_TEXTS = st.lists(st.sampled_from(TOKENS), max_size=30).map("".join)
-
-
-@pytest.mark.skipif(not yaml.__with_libyaml__, reason="this PyYAML has no libyaml")
-@given(YAML_TEXTS | damaged().map(itemgetter(0)))
-def test_libyaml_and_the_parser_in_python_give_equal_results(text: str) -> None:
-    fast = reading(text)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(documents, "_DIFFERENT_IN_LIBYAML", re.compile(""))
-        assert reading(text) == fast
