@@ -8,8 +8,10 @@ machine is idle. On a busy host a clock that runs at the rate of the host is too
 beacons of its radios before the next ones are due, and its queues overflow.
 """
 
+import lzma
 import os
 import shutil
+import struct
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -32,11 +34,19 @@ PACKAGE_OF: Final = {
 }
 """Debian package per program."""
 
+_BOOT_SECTORS_OFFSET: Final = 0x1F1
+_BOOT_MAGIC_OFFSET: Final = 0x202
+_BOOT_PAYLOAD_OFFSET: Final = 0x248
+_BOOT_HEADER_END: Final = 0x250
+
 _JOB, _OUTPUT = "job.sh", "output"
 _MAX_OUTPUT_BYTES: Final = 16 << 20
 # An overloaded host misses the timer interrupts by which the kernel checks its IO-APIC, and the kernel would panic.
-# Mitigations of processor faults and self-tests of ciphers make emulation slower, and protect nothing here.
-_KERNEL_OPTIONS: Final = "console=ttyS0 rdinit=/init panic=-1 quiet no_timer_check mitigations=off cryptomgr.notests"
+# Mitigations of processor faults, self-tests of ciphers, read-only pages and the routing of interrupts by ACPI need
+# seconds of emulation, and protect nothing here.
+_KERNEL_OPTIONS: Final = (
+    "console=ttyS0 rdinit=/init panic=-1 quiet no_timer_check mitigations=off cryptomgr.notests rodata=off acpi=noirq"
+)
 _NS_PER_INSTRUCTION_EXPONENT: Final = 1
 """An emulated instruction needs 2^1 ns: 500 million instructions per second, as of a slow processor."""
 
@@ -75,6 +85,22 @@ def find_kernel(roots: Sequence[Path] = (Path("/"),)) -> Kernel | None:
             if any(modules.rglob("mac80211_hwsim.ko")):
                 return Kernel(image, modules)
     return None
+
+
+def uncompressed_kernel(image: bytes) -> bytes:
+    """Return the ELF file in a boot image (Linux, Documentation/arch/x86/boot.rst), which QEMU boots by PVH.
+
+    The machine would need seconds to decompress it. An image with a compression other than xz is returned as it is.
+    """
+    if len(image) < _BOOT_HEADER_END or image[_BOOT_MAGIC_OFFSET:][:4] != b"HdrS":
+        return image
+    offset, size = struct.unpack_from("<II", image, _BOOT_PAYLOAD_OFFSET)
+    start = (image[_BOOT_SECTORS_OFFSET] + 1) * 512 + offset
+    payload = image[start : start + size]
+    if not payload.startswith(b"\xfd7zXZ\0"):
+        return image
+    # The payload ends with its uncompressed size, which the decompressor leaves out.
+    return lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(payload)
 
 
 def require_machine(roots: Sequence[Path] = (Path("/"),)) -> Kernel:
@@ -120,10 +146,11 @@ def run_in_machine(
         shared = folder / "shared"
         shared.mkdir()
         (shared / _JOB).write_text(script, encoding="utf-8")
+        (folder / "kernel").write_bytes(uncompressed_kernel(kernel.image.read_bytes()))
         (folder / "initrd").write_bytes(build_initrd(kernel.modules, radios=radios, job=_JOB, output=_OUTPUT))
         with (folder / "errors").open("wb") as errors:
             machine = subprocess.Popen(
-                _command_line(kernel, folder, memory_mib),
+                _command_line(folder, memory_mib),
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=errors,
@@ -144,10 +171,10 @@ def run_in_machine(
         return JobResult(int(code.read_text(encoding="ascii")), _read_text(shared / _OUTPUT))
 
 
-def _command_line(kernel: Kernel, folder: Path, memory_mib: int) -> list[str]:
+def _command_line(folder: Path, memory_mib: int) -> list[str]:
     argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *_accelerators(), "-cpu", "max"]
     argv += ["-m", str(memory_mib), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
-    argv += ["-kernel", str(kernel.image), "-initrd", "initrd", "-append", _KERNEL_OPTIONS]
+    argv += ["-kernel", "kernel", "-initrd", "initrd", "-append", _KERNEL_OPTIONS]
     argv += ["-serial", "file:console", "-device", "virtio-rng-pci"]
     for tag, path, access in (("host", "/", ",readonly=on"), ("lab", str(folder / "shared"), "")):
         argv += ["-fsdev", f"local,id={tag},path={path},security_model=none,multidevs=remap{access}"]
