@@ -192,10 +192,13 @@ double Goodput(const Options& options)
     auto to = InetSocketAddress(interfaces.GetAddress(options.stations), 9);
     PacketSinkHelper sink("ns3::UdpSocketFactory", to);
     auto received = DynamicCast<PacketSink>(sink.Install(nodes.Get(options.stations)).Get(0));
+    // A saturated station, without events for many packets that exceed its queue.
+    uint64_t offered_bit_s =
+        options.ampdu ? 1.1 * WifiMode(options.mode).GetDataRate(options.width, options.guard_ns, options.streams) : 70000000;
     for (uint32_t n = 0; n < options.stations; n++)
     {
         OnOffHelper source("ns3::UdpSocketFactory", to);
-        source.SetConstantRate(DataRate(options.ampdu ? "1300Mbps" : "70Mbps"), options.payload);
+        source.SetConstantRate(DataRate(offered_bit_s), options.payload);
         source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
     }
     uint64_t before = 0;

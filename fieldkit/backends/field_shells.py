@@ -8,7 +8,7 @@ from typing import Protocol
 
 from fieldkit.remote import passwords
 from fieldkit.remote.keys import read_private_key
-from fieldkit.remote.link import over_tcp
+from fieldkit.remote.sockets import over_tcp
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final
 from fieldkit.campaign.order import PlannedTrial
 from fieldkit.campaign.plan import CAMPAIGN_FILE, CampaignPlan
 from fieldkit.config import schema
+from fieldkit.config.json_records import Codec
 from fieldkit.config.schema import Field
 from fieldkit.core import files, jsonl
 from fieldkit.trial import store
@@ -56,7 +57,7 @@ class CampaignEntry:
     unmet: int = 0
 
 
-_CODEC: Final = schema.Codec(CampaignEntry)
+_CODEC: Final = Codec(CampaignEntry)
 
 
 class CampaignJournal:

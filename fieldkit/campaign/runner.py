@@ -19,6 +19,7 @@ from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import TimeEstimate, format_bytes
 from fieldkit.trial import estimates, journal
+from fieldkit.trial.check import shortfalls
 from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.request import TrialRequest, make_plan
@@ -97,8 +98,8 @@ class CampaignRun:
         shortened = (
             line for trial in remaining for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        shortfalls = (line for trial in remaining for line in self._plans[trial].shortfalls())
-        for line in dict.fromkeys((*shortened, *shortfalls)):
+        undecided = (line for trial in remaining for line in shortfalls.of_plan(self._plans[trial]))
+        for line in dict.fromkeys((*shortened, *undecided)):
             self._sink(Note(line))
 
     def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:

@@ -139,8 +139,8 @@ def add_cells(parser: Parser, default: str = CONDITION) -> None:
         "--by",
         default=default,
         metavar="COLUMN,...",
-        help=f"columns that distinguish conditions, or `source`, the folder or file of a row; cells are sorted by "
-        f"them in this order (default {default})",
+        help=f"columns that distinguish conditions, or `source`, the folder or file of a row; conditions are sorted "
+        f"by them in this order (default {default})",
     )
 
 

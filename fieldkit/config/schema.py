@@ -1,17 +1,15 @@
 """Strict YAML and JSON: load, validate, freeze. Errors in YAML have file, line and the nearest valid key.
 
 This is the only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
-`Strict`, loaded by `load`; records that only programs write are parsed by a `Codec`.
+`Strict`, loaded by `load`.
 """
 
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
 from decimal import Decimal
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Generic, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -38,7 +36,6 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, SchemaValidator, core_schema
 
-from fieldkit.config import yaml_errors
 from fieldkit.config.documents import Document, Location, parse, read, to_text
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, did_you_mean
@@ -51,7 +48,6 @@ __all__ = [
     "Bits",
     "Bool",
     "Bytes",
-    "Codec",
     "ConfigDict",
     "CoreSchema",
     "Document",
@@ -73,6 +69,8 @@ __all__ = [
     "Span",
     "Speed",
     "Strict",
+    "TypeAdapter",
+    "ValidationError",
     "ValidationInfo",
     "WithJsonSchema",
     "by_kind",
@@ -96,6 +94,8 @@ Quantity = TypeVar("Quantity")
 
 _ENCLOSING: ContextVar[tuple[type["Strict"], ...]] = ContextVar("_ENCLOSING", default=())
 """Models of the mapping that is being validated and of its enclosing mappings, the outermost first."""
+_SHAPES: Final[dict[str, str]] = {}
+"""Description of the texts that match a pattern, by pattern; see `pattern_field`."""
 _FOLDER: ContextVar[Path] = ContextVar("_FOLDER", default=Path())
 
 
@@ -116,7 +116,7 @@ def pattern_field(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic
         pattern: A regular expression for the whole text.
         words: Description of a valid text for error messages: `a name in lower-case letters`.
     """
-    yaml_errors.SHAPES[pattern] = words
+    _SHAPES[pattern] = words
     return Field(pattern=pattern)
 
 
@@ -240,6 +240,8 @@ class Strict(BaseModel):
     def _unknown_key(cls, key: Any, data: Mapping[Any, Any]) -> Exception:  # noqa: ANN401 (any YAML value)
         if package := cls.missing_package(str(key)):
             return _unknown(str(key), f"it needs the package {package}, which is not installed")
+        from fieldkit.config import yaml_errors  # noqa: PLC0415 (most files have no errors; also below)
+
         outer = [_types(model) for model in _ENCLOSING.get()[:-1]]
         hint, index = yaml_errors.misplaced_hint(key, data, _types(cls), outer)
         return _unknown(str(key), hint, outer[index] if index >= 0 else ())
@@ -367,7 +369,9 @@ def validate(document: Document, model: type[Model]) -> Model:
     try:
         return model.model_validate(document.data)
     except ValidationError as error:
-        raise yaml_errors.explain(error.errors(), document) from error
+        from fieldkit.config import yaml_errors  # noqa: PLC0415
+
+        raise yaml_errors.explain(error.errors(), document, _SHAPES) from error
     finally:
         _FOLDER.reset(token)
 
@@ -381,45 +385,3 @@ def dump(model: Strict) -> str:
     """Return the YAML that `load` reads back as an equal model; values that are None are omitted."""
     data = model.model_dump(mode="json", by_alias=True, exclude_none=True)
     return to_text(data)
-
-
-Record = TypeVar("Record")
-
-
-class Codec(Generic[Record]):
-    """Converts records of one type to JSON values and back, for lines of a journal and messages between programs.
-
-    A field with another name in the file is declared as `Annotated[str, Field(alias="other")]`.
-
-    Args:
-        record: The type, for example a frozen dataclass whose fields are annotated.
-    """
-
-    def __init__(self, record: type[Record]) -> None:
-        self._record = record
-
-    @cached_property
-    def _adapter(self) -> TypeAdapter[Record]:
-        return TypeAdapter(self._record)  # takes 10 ms, and few commands use each adapter
-
-    def parse(self, data: Any) -> Record:  # noqa: ANN401 (any JSON value)
-        """Return the record of a JSON value.
-
-        A missing field has its default; values are not converted to other types.
-
-        Raises:
-            ValueError: The value is not such a record.
-        """
-        try:
-            # In strict mode pydantic accepts lists for tuples and words for enumerations only in JSON text.
-            # Its parser rejects half of a surrogate pair, which the parser of Python accepts, so it is replaced.
-            text = json.dumps(data, ensure_ascii=False).encode(errors="replace")
-            return self._adapter.validate_json(text, strict=True)
-        except ValidationError as error:
-            first = error.errors()[0]
-            place = ".".join(map(str, first["loc"]))
-            raise ValueError(f"{place}: {first['msg']}" if place else first["msg"]) from error
-
-    def dump(self, record: Record) -> Any:  # noqa: ANN401 (any JSON value)
-        """Return the JSON value from which `parse` makes an equal record."""
-        return self._adapter.dump_python(record, mode="json", by_alias=True)

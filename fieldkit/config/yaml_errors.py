@@ -69,21 +69,19 @@ def _is_opaque_mapping(kind: Any) -> bool:  # noqa: ANN401 (any type)
     return any(get_args(part) == (str, object) for part in (kind, *get_args(kind)))
 
 
-SHAPES: Final[dict[str, str]] = {}
-"""Description of the texts that match a pattern, by pattern; see `schema.pattern_field`."""
-
 _WORDS: Final = re.compile(r"\^\(([A-Za-z0-9_|]+)\)\$")
 _MAX_SHOWN: Final = 60
 _NO_KEYS_HINT: Final = ", and there are none; indent the keys that belong to this line more than this line"
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
 
-def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
+def explain(problems: Sequence[Any], document: Document, shapes: Mapping[str, str]) -> ConfigurationError:
     """Return the first problem in a document, with file, line and key path.
 
     Args:
         problems: All problems, as `ErrorDetails` of pydantic.
         document: The document.
+        shapes: Description of the texts that match a pattern, by pattern.
     """
 
     def line(problem: Any) -> int:  # noqa: ANN401 (as in `explain`)
@@ -97,11 +95,11 @@ def explain(problems: Sequence[Any], document: Document) -> ConfigurationError:
     if missing:
         message = f"required key {missing!r} is missing"
     elif place and place[-1] == "[key]":
-        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_message(first)}"
+        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_message(first, shapes)}"
     elif first.get("ctx", {}).get("outer"):
         message = _misindented(first, document)
     else:
-        message = _message(first)
+        message = _message(first, shapes)
     path = ".".join(str(part) for part in (*document.place, *document.existing_part(place)))
     remedy = f"add {missing}: to it" if missing else "correct this line"
     # A value with several valid forms has one problem per form at the same location.
@@ -149,7 +147,7 @@ def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
     return (*location, *context.get("at", ()), *(() if key is None else (key,)))
 
 
-def _message(problem: Mapping[str, Any]) -> str:
+def _message(problem: Mapping[str, Any], shapes: Mapping[str, str]) -> str:
     message = _MESSAGES.get(problem["type"], problem["msg"])
     value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
@@ -163,7 +161,7 @@ def _message(problem: Mapping[str, Any]) -> str:
             kinds = re.findall(r"'([^']+)'", context["expected_tags"])
             message = f"there is no kind {context['tag']!r}; {did_you_mean(context['tag'], kinds, _kinds(kinds))}"
         case "string_pattern_mismatch":
-            message = _pattern_message(str(value), context["pattern"])
+            message = _pattern_message(str(value), context["pattern"], shapes)
         case "too_short":
             least, short = context["min_length"], context["actual_length"]
             message = f"at least {format_count(least, 'item')} are needed here, not {short}"
@@ -200,12 +198,12 @@ def _kinds(names: Sequence[str]) -> str:
     return f"kinds: {', '.join(names)}"
 
 
-def _pattern_message(text: str, pattern: str) -> str:
+def _pattern_message(text: str, pattern: str, shapes: Mapping[str, str]) -> str:
     """Return the message about a text that does not match a pattern."""
     if words := _WORDS.fullmatch(pattern):
         return _choice_message(text, words[1].split("|"))
-    if pattern in SHAPES:
-        return f"{_quoted(text)} is not {SHAPES[pattern]}"
+    if pattern in shapes:
+        return f"{_quoted(text)} is not {shapes[pattern]}"
     return f"{_quoted(text)} should match pattern {pattern!r}"
 
 

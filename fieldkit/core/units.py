@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
@@ -29,9 +30,11 @@ _QUANTITY: Final = re.compile(
 def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
     """Return `text`, a non-negative number with one of `units`, in the unit whose factor is 1.
 
+    The value is the float nearest to the exact product, so `13ms` equals 0.013.
+
     Args:
         text: For example `15s`, `0.2 s`, `30ft`.
-        units: Factor per unit symbol.
+        units: Factor per unit symbol; the shortest decimal of a factor counts as its exact value.
         what: The kind of quantity, for the message.
 
     Raises:
@@ -47,7 +50,7 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
         raise ConfigurationError(f"{what} {text!r} has no unit", remedy=example)
     if match["unit"] not in units:
         raise ConfigurationError(f"{what} {text!r} has the unknown unit {match['unit']!r}", remedy=example)
-    value = float(match["number"]) * units[match["unit"]]
+    value = float(Fraction(match["number"]) * Fraction(repr(units[match["unit"]])))
     if value > _MAX_VALUE:
         raise ConfigurationError(f"{what} {text[:40]!r} is too large", remedy="check the unit")
     return value

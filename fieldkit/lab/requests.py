@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from fieldkit.config.schema import Codec
+from fieldkit.config.json_records import Codec
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
 from fieldkit.core.model import Vector
 from fieldkit.lab.folder import LabFolder

@@ -90,7 +90,11 @@ class AttemptEvidence:
     def links(self, role: Role) -> Sequence[LinkSample]:
         """Return a robot's link samples in order of time: those of the testbed if there are any, else the robot's."""
         modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
-        return modelled.get(role) or self.read_or_none(link_samples.read_robot, "", role) or ()
+        if samples := modelled.get(role):
+            return samples
+        from fieldkit.measure.evidence import robot_link_samples  # noqa: PLC0415 (modelled radios need no parser of iw)
+
+        return self.read_or_none(robot_link_samples.read, "", role) or ()
 
     def counters(self, role: Role) -> Counters:
         """Return the increments of a robot's kernel counters during the attempt; an unknown one is None."""

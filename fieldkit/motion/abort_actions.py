@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from typing_extensions import override
 
@@ -11,10 +11,7 @@ from fieldkit.config.schema import ConfigDict, RootModel
 from fieldkit.core.model import Role
 from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.steps.scene import Refusal, Scene, Shells
-from fieldkit.trial.procedure_section import ProcedureSection
-
-if TYPE_CHECKING:
-    from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure_section import ProcedureSection, TrialOutline
 
 ON_ABORT: Final = "on_abort"
 
@@ -39,7 +36,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
         return frozenset(self.root)
 
     @override
-    def refusals(self, plan: "Plan") -> Iterator[Refusal]:
+    def refusals(self, plan: TrialOutline) -> Iterator[Refusal]:
         """Yield a refusal for each robot without an autopilot link to land it."""
         for role in self.root:
             if mavlink_of(plan.cast[role].profile) is None:
@@ -47,23 +44,23 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
                 yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
 
     @override
-    def dry_run_notes(self, plan: "Plan") -> Iterator[str]:
+    def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:
         for role, action in self.root.items():
             yield f"if it is aborted: {plan.cast[role].name} is commanded to {action}"
 
     @override
-    def abort_notes(self, plan: "Plan") -> Iterator[str]:
+    def abort_notes(self, plan: TrialOutline) -> Iterator[str]:
         for role in self.guarded_roles(plan):
             yield f"{plan.cast[role].name} is commanded to {self.root[role]}"
 
     @override
-    def around_steps(self, plan: "Plan", scene: Scene, shells: Shells) -> AbstractContextManager[None]:
+    def around_steps(self, plan: TrialOutline, scene: Scene, shells: Shells) -> AbstractContextManager[None]:
         from fieldkit.motion.running.guards import guarded  # noqa: PLC0415 (it imports the code that flies drones)
 
         actions = {role: self.root[role].value for role in self.guarded_roles(plan)}
         return guarded(actions, plan, scene, shells)
 
-    def guarded_roles(self, plan: "Plan") -> tuple[Role, ...]:
+    def guarded_roles(self, plan: TrialOutline) -> tuple[Role, ...]:
         """Return the roles whose drones no step flies, so that a guard must watch them."""
         moved = plan.procedure.moved()
         return tuple(role for role in self.root if role not in moved)

@@ -13,7 +13,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, LinkLostError, did_you_mean
 from fieldkit.core.model import LinkSample, Role
 from fieldkit.core.text import sanitized
-from fieldkit.measure.evidence import link_samples
+from fieldkit.measure.evidence import robot_link_samples
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.shell import Completed, Shell
 
@@ -240,7 +240,9 @@ class RobotHandle:
             return testbed.oracle.links(continue_sampling=False)[self.role][-1]
         command = ("iw", "dev", self._robot.profile.radio.interface, "station", "dump")
         completed = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
-        return LinkSample(time.time_ns(), link_samples.parse_stations(completed.stdout.decode(errors="replace")))
+        return LinkSample(
+            time.time_ns(), robot_link_samples.parse_stations(completed.stdout.decode(errors="replace"))
+        )
 
     @property
     def _robot(self) -> Robot:

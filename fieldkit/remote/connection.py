@@ -10,9 +10,10 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, LinkLostError
 from fieldkit.core.units import format_duration
 from fieldkit.remote.identity import Address, Credentials
-from fieldkit.remote.link import BROKEN, Connect, Link, LoginRefusedError, Timing
+from fieldkit.remote.link import BROKEN, Link, LoginRefusedError
 from fieldkit.remote.login import closed_error, log_in
 from fieldkit.remote.persistent_shells import ShellPool
+from fieldkit.remote.sockets import Connect, Timing
 
 T = TypeVar("T")
 

@@ -6,7 +6,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
-from dataclasses import dataclass
 from typing import Final
 
 import paramiko
@@ -15,11 +14,10 @@ from typing_extensions import override
 from fieldkit.core.deadline import Deadline, call_with_deadline
 from fieldkit.core.errors import HostKeyError, RobotError
 from fieldkit.core.units import format_count
+from fieldkit.remote import sockets
 from fieldkit.remote.identity import Address, Credentials, HostKey
 from fieldkit.remote.keys import private_keys
-
-Connect = Callable[[float], socket.socket]
-"""Returns a new socket that is connected to the robot's SSH server; raises OSError after a timeout in seconds."""
+from fieldkit.remote.sockets import Connect, Timing
 
 Channel = paramiko.Channel
 Transport = paramiko.Transport
@@ -131,32 +129,6 @@ class LoginRefusedError(RobotError):
     """The robot refused the login."""
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Timeouts of an SSH connection. The kernel closes a connection after about `probe_s` + `dead_s` without answers.
-
-    Attributes:
-        connect_s: Timeout from name resolution to the end of the login; shorter than the 10 s within which a lost
-            link must be reported, because an unused link may have been lost earlier.
-        probe_s: Silence after which the kernel sends keepalive probes, in whole seconds.
-        dead_s: Age of unacknowledged data at which the connection is lost. With SSH keepalives alone, paramiko
-            reported a dead connection as active for more than 25 s (field notes).
-        reply_s: Minimum remaining time of a repeated command.
-        pause_s: First pause between attempts to reconnect; it is doubled after each attempt, up to `probe_s`.
-    """
-
-    connect_s: float = 8.0
-    probe_s: int = 2
-    dead_s: float = 5.0
-    reply_s: float = 10.0
-    pause_s: float = 0.2
-
-
-def over_tcp(host: str, port: int) -> Connect:
-    """Return a function that connects to an SSH server over this computer's network."""
-    return lambda timeout_s: socket.create_connection((host, port), timeout=timeout_s)
-
-
 class Link:
     """A connection to one SSH server. `close` from another thread ends all waits.
 
@@ -195,7 +167,7 @@ class Link:
             EOFError: It closed the connection.
         """
         stream = self._connect(self._timing.connect_s)
-        _enable_keepalive(stream, self._timing)
+        sockets.enable_keepalive(stream, self._timing)
         transport = paramiko.Transport(stream, packetizer_class=_Packetizer)
         with self._lock:
             self._stream, self._transport = stream, transport
@@ -278,7 +250,7 @@ class Link:
     def extend_timeout(self, seconds: float) -> None:
         """Extend `Timing.dead_s`, the time that the peer may be silent, by some seconds."""
         stream, _ = self._connection()
-        _set_timeout(stream, self._timing.dead_s + seconds)
+        sockets.set_timeout(stream, self._timing.dead_s + seconds)
 
     def open_spares(self) -> None:
         """Start to open channels in advance, so that later commands need not wait for a channel.
@@ -393,20 +365,6 @@ def _closes_spares(transport: paramiko.Transport) -> bool:
 
 def _without_weak(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in names if not any(word in name for word in _WEAK_ALGORITHMS))
-
-
-def _enable_keepalive(stream: socket.socket, timing: Timing) -> None:
-    """Make the kernel close the connection if the peer does not answer, also while no data is sent."""
-    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    _set_timeout(stream, timing.dead_s)
-    stream.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, timing.probe_s)
-    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, timing.probe_s)
-
-
-def _set_timeout(stream: socket.socket, seconds: float) -> None:
-    """Set the maximum age of unacknowledged data or probes; Linux then ignores the number of probes (tcp(7))."""
-    stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(seconds * 1000))
 
 
 def _login_attempts(

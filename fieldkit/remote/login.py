@@ -10,7 +10,8 @@ from typing import Final
 from fieldkit.core.deadline import Deadline, call_with_deadline
 from fieldkit.core.errors import FieldkitError, LinkError, LinkLostError, RobotError
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Connect, Link, Timing, UnfitServerError
+from fieldkit.remote.link import BROKEN, Link, UnfitServerError
+from fieldkit.remote.sockets import Connect, Timing
 
 _NO_ROUTE: Final = {errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN, errno.ENETDOWN}
 

@@ -13,10 +13,11 @@ from fieldkit.remote.command import printable, quote
 from fieldkit.remote.connection import Connection
 from fieldkit.remote.drain import drain, wait_for_output
 from fieldkit.remote.identity import Address, Credentials, HostKey
-from fieldkit.remote.link import BROKEN, Connect, FloodError, Link, NoSessionError, Timing
+from fieldkit.remote.link import BROKEN, FloodError, Link, NoSessionError
 from fieldkit.remote.persistent_shells import Execution, RunningCommand
 from fieldkit.remote.script import CALL
 from fieldkit.remote.shell import Completed
+from fieldkit.remote.sockets import Connect, Timing
 
 CONNECT_S: Final = Timing.connect_s
 PATIENCE_S: Final = 60.0

@@ -51,6 +51,8 @@ _FIRST: Final = "expected and lab-defined figures"
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12
 """Maximum number of charts of quantities that are not defined by fieldkit."""
+MAX_TRIALS_IN_TABLE: Final = 200
+"""Maximum number of trials in the table of their provenance."""
 _MAX_IN_TABLE: Final = 8
 """Maximum number of visible columns of quantities that are not defined by fieldkit."""
 
@@ -113,6 +115,8 @@ class Contents:
         trials: Provenance of each trial.
         evidence: The table and the available evidence.
         command: The command that regenerates this report.
+        export_command: The command that exports every attempt.
+        max_trials: Maximum number of trials that are listed.
     """
 
     title: str
@@ -128,6 +132,8 @@ class Contents:
     trials: Sequence[summary.Provenance]
     evidence: Evidence
     command: str
+    export_command: str
+    max_trials: int = MAX_TRIALS_IN_TABLE
 
     @property
     def charts(self) -> list[Chart]:
@@ -146,6 +152,7 @@ def build_contents(
     title: str,
     repeat: str,
     command: Sequence[str],
+    paths: Sequence[str] = (),
     quantities: Sequence[str] = (),
     unmeasured: Sequence[str] = (),
     sweep_condition: Sequence[str] = (),
@@ -157,11 +164,12 @@ def build_contents(
         title: Its title; empty for a generated one.
         repeat: Repeat for the time line, as `repeat_to_draw`.
         command: The words of the operator's command, without `--rebuild`.
+        paths: The paths in it.
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
         sweep_condition: Columns of the flow and the factors, if the repeats are the runs of sweeps.
     """
-    evidence = load_evidence(repeats)
+    evidence = load_evidence(repeats, repeat)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
     cells = sorted(aggregate(repeats), key=_sort_key)
     identities = Identities(cells)
@@ -202,6 +210,7 @@ def build_contents(
         trials=list(summary.trial_provenance(evidence)),
         evidence=evidence,
         command=shlex.join([*command, "--rebuild"] if is_whole else command),
+        export_command=shlex.join(("fieldkit", "export", *paths, "--format", "csv", "-o", "attempts.csv")),
     )
 
 

@@ -87,6 +87,10 @@ def _by_scenario(kind: tuple[str, str]) -> tuple[bool, int, str, str]:
 
 MAX_BEHIND: Final = 100
 """Maximum number of single repeats behind one estimate; of more repeats, every k-th is drawn."""
+_FEWEST_BEHIND: Final = 10
+"""Maximum number of single repeats behind one estimate if there are many conditions."""
+_MAX_BEHIND_IN_CHART: Final = 2000
+"""Maximum number of single repeats in the chart of a quantity, shared by its conditions."""
 _MIN_TOP_PERCENT: Final = 1.0
 _MAX_LENGTH: Final = 2.0
 """Maximum length of the axis, as a multiple of the largest value. Wider intervals are cut there."""
@@ -152,6 +156,11 @@ class Point:
         return self.high - self.low > _VAGUE_FROM * (ends[1] - ends[0])
 
 
+def max_behind(evidence: Evidence) -> int:
+    """Return the maximum number of single repeats that are drawn behind one estimate."""
+    return min(MAX_BEHIND, max(_FEWEST_BEHIND, _MAX_BEHIND_IN_CHART // max(1, evidence.conditions)))
+
+
 def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> Point:
     """Return the estimate of a quantity under one condition, with values multiplied by `factor`.
 
@@ -160,7 +169,7 @@ def point(cell: Cell, quantity: Quantity, factor: float, evidence: Evidence) -> 
     estimate = cell.estimates[quantity.name]
     low, high = (None if end is None else factor * end for end in (estimate.low, estimate.high))
     values, is_bound = evidence.observed(cell, quantity)
-    every_kth = slice(None, None, max(-(-len(values) // MAX_BEHIND), 1))
+    every_kth = slice(None, None, max(-(-len(values) // max_behind(evidence)), 1))
     if quantity.kind is Kind.FLAG:
         values = values[:0]
     return Point(

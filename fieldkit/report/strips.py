@@ -16,10 +16,11 @@ from fieldkit.report.theme import Colour
 from fieldkit.report.trial_folders import Evidence
 
 MAX_MARKS: Final = 2000
-"""Maximum number of marks on a page, shared by its strips. If there are more attempts, valid ones are omitted evenly;
-others are never omitted."""
+"""Maximum number of marks on a page, shared by its strips; more valid attempts are omitted evenly."""
+MAX_OTHER_MARKS: Final = 2000
+"""Maximum number of marks of void and failed attempts on a page, shared by its strips; more are omitted evenly."""
 FEWEST_MARKS: Final = 20
-"""Fewest marks of valid attempts in a strip."""
+"""Fewest marks of valid attempts, and of others, in a strip that has more attempts."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,8 @@ class Strip:
         place: Its condition, as far as it differs from the others of its group.
         colour: Colour of its series.
         marks: Marks in order of time.
-        left_out: Valid attempts without a mark.
+        left_out: Number of valid attempts without a mark.
+        others_left_out: Number of void and failed attempts without a mark.
     """
 
     cell: Cell
@@ -56,6 +58,7 @@ class Strip:
     colour: Colour
     marks: Sequence[Mark]
     left_out: int
+    others_left_out: int
 
 
 @dataclass(frozen=True)
@@ -76,20 +79,24 @@ class StripGroup:
 def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
     """Yield the strips of all cells, those of a protocol and a topology together."""
     differing = wording.differing(cells) - {"topology"}
-    max_marks = max(FEWEST_MARKS, MAX_MARKS // max(1, len(cells)))
+    limits = [max(FEWEST_MARKS, limit // max(1, len(cells))) for limit in (MAX_MARKS, MAX_OTHER_MARKS)]
     for title, group in panels(cells).items():
         heights = _heights(group, [cell for cell in cells if cell.key["protocol"] == group[0].key["protocol"]])
         strips = []
         for cell in group:
             rows = evidence.rows(cell)
-            kept = _thinned(rows, evidence, max_marks)
+            is_valid = evidence.repeats.texts["status"][rows] == Status.VALID
+            others = _evenly(rows[~is_valid], limits[1])
+            valid = _evenly(rows[is_valid], max(FEWEST_MARKS, limits[0] - len(others)))
+            kept = rows[np.isin(rows, np.concatenate((valid, others)))]
             strips.append(
                 Strip(
                     cell=cell,
                     place=wording.place(cell, differing=differing),
                     colour=identities.of(cell).style.colour,
                     marks=[_mark(row, heights, evidence) for row in kept.tolist()],
-                    left_out=len(rows) - len(kept),
+                    left_out=int(is_valid.sum()) - len(valid),
+                    others_left_out=int((~is_valid).sum()) - len(others),
                 )
             )
         yield StripGroup(title, str(heights), strips)
@@ -122,15 +129,12 @@ def _heights(group: Sequence[Cell], cells: Sequence[Cell]) -> _Heights:
     return _Heights(loss, max(cell.estimates[loss.name].maximum for cell in cells if loss.name in cell.estimates))
 
 
-def _thinned(rows: NDArray[np.int64], evidence: Evidence, max_count: int) -> NDArray[np.int64]:
-    is_valid = evidence.repeats.texts["status"][rows] == Status.VALID
-    valid, other = np.flatnonzero(is_valid), np.flatnonzero(~is_valid)
-    max_valid = max(FEWEST_MARKS, max_count - len(other))
-    if len(valid) <= max_valid:
+def _evenly(rows: NDArray[np.int64], max_count: int) -> NDArray[np.int64]:
+    """Return the rows, or `max_count` of them at equal distances."""
+    if len(rows) <= max_count:
         return rows
-    evenly = valid[np.linspace(0, len(valid) - 1, max_valid).round().astype(np.int64)]
-    kept: NDArray[np.int64] = rows[np.sort(np.concatenate((evenly, other)))]
-    return kept
+    chosen: NDArray[np.int64] = rows[np.linspace(0, len(rows) - 1, max_count).round().astype(np.int64)]
+    return chosen
 
 
 def _mark(row: int, heights: _Heights, evidence: Evidence) -> Mark:

@@ -19,6 +19,11 @@ from fieldkit.core.units import format_count
 from fieldkit.report import wording
 from fieldkit.report.trial_folders import Evidence
 
+_MAX_LISTED: Final = 20
+"""Maximum number of sentences about evidence that is left out."""
+_MAX_REASONS: Final = 50
+"""Maximum number of different reasons."""
+
 
 @dataclass(frozen=True)
 class Caution:
@@ -75,7 +80,9 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
             f"{version_count} versions of the tables: columns that an older version lacks are missing unless tables "
             "are rebuilt."
         )
-    yield from map(Caution, evidence.unread)
+    yield from map(Caution, evidence.unread[:_MAX_LISTED])
+    if (more := len(evidence.unread) - _MAX_LISTED) > 0:
+        yield Caution(f"{more} further notes of this kind are not shown; fieldkit verify lists them for a trial.")
 
 
 def _values(cells: Sequence[Cell], name: str) -> list[str]:
@@ -114,7 +121,12 @@ def utc(at_ns: float) -> str:
 def _counted(reasons: Sequence[str]) -> list[str]:
     """Return the reasons with their counts, the most frequent first."""
     counted = Counter(reason or "no reason given" for reason in reasons)
-    return [f"{reason} ({count})" for reason, count in sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))]
+    ordered = sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))
+    lines = [f"{reason} ({count})" for reason, count in ordered[:_MAX_REASONS]]
+    more = ordered[_MAX_REASONS:]
+    return (
+        [*lines, f"{format_count(len(more), 'other reason')} ({sum(count for _, count in more)})"] if more else lines
+    )
 
 
 def title(cells: Sequence[Cell]) -> str:

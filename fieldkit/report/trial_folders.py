@@ -1,10 +1,12 @@
 """The trial folders of the rows of a table, if available: plan, raw files, links."""
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,9 @@ from fieldkit.measure.evidence import ping
 from fieldkit.trial import manifest, planned_evidence, store
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
+MAX_TRIALS: Final = 300
+"""Maximum number of trials whose evidence is compared with the manifest and shown."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -30,12 +35,20 @@ class Evidence:
         plans: Plans by the `source` of rows; only sources that are folders of trials have one.
         unread: A sentence per plan that could not be read, and per trial whose evidence differs from its manifest.
         changed: Folders of attempts whose evidence differs from the manifest. It counts as not available.
+        verified: The `source` of the trials whose evidence was compared with the manifest; that of others is not
+            available.
     """
 
     repeats: Repeats
     plans: Mapping[str, Plan]
     unread: tuple[str, ...]
     changed: frozenset[Path]
+    verified: frozenset[str]
+
+    @property
+    def conditions(self) -> int:
+        """Number of conditions in the table."""
+        return len(self._rows)
 
     @cached_property
     def quantities(self) -> Mapping[str, Quantity]:
@@ -108,7 +121,12 @@ class Evidence:
     def attempt(self, row: int) -> AttemptEvidence | None:
         """Return a row's raw evidence, or None if it is not available."""
         plan, texts, name = self.plan(row), self.repeats.texts, self.repeats.folder(row)
-        if plan is None or name is None or plan.trial != texts["trial"][row]:
+        if (
+            plan is None
+            or name is None
+            or texts["source"][row] not in self.verified
+            or plan.trial != texts["trial"][row]
+        ):
             return None
         folder = store.attempt_folder(Path(texts["source"][row]), name)
         return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed else None
@@ -124,18 +142,54 @@ class Evidence:
         return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
 
 
-def load_evidence(repeats: Repeats) -> Evidence:
-    """Return a table of repeats with the evidence in its sources."""
-    plans, unread, changed = {}, [], set[Path]()
+def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
+    """Return a table of repeats with the evidence in its sources.
+
+    All plans are read. Of more than `MAX_TRIALS` trials, only the evidence of so many is available.
+
+    Args:
+        repeats: The table.
+        attempt: An attempt whose evidence must be available, as for `Repeats.row`; empty for none.
+
+    Raises:
+        ConfigurationError: There is no such attempt, or there are several.
+    """
+    plans: dict[str, Plan] = {}
+    unread, changed = [], set[Path]()
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
-        if not (Path(source) / PLAN_FILE).is_file():
-            continue
+        if (Path(source) / PLAN_FILE).is_file():
+            try:
+                plans[source] = store.read_plan(Path(source))
+            except FieldkitError as error:
+                unread.append(error.located)
+    first = [repeats.texts["source"][repeats.row(attempt)]] if attempt else []
+    chosen = _chosen(repeats, plans, first)
+    for source in chosen:
         try:
-            plans[source] = store.read_plan(Path(source))
             if differences := manifest.differences(Path(source)):
                 summary = manifest.summarize(differences)
                 unread.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
                 changed |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:
             unread.append(error.located)
-    return Evidence(repeats, MappingProxyType(plans), tuple(unread), frozenset(changed))
+    if len(chosen) < len(plans):
+        unread.append(
+            f"Packets, replies and the time line are of {len(chosen)} of {len(plans)} trials, chosen evenly over the "
+            "conditions; all other figures are of all trials. To choose other trials: --where."
+        )
+    return Evidence(repeats, MappingProxyType(plans), tuple(unread), frozenset(changed), frozenset(chosen))
+
+
+def _chosen(repeats: Repeats, plans: Mapping[str, Plan], first: Iterable[str]) -> list[str]:
+    """Return at most `MAX_TRIALS` sources with plans: `first`, one per condition, a second one, and so on."""
+    if len(plans) <= MAX_TRIALS:
+        return list(plans)
+    condition_of = dict(zip(repeats.texts["source"].tolist(), repeats.keys(DEFAULT_BY), strict=True))
+    counts: Counter[Key] = Counter()
+    ranks = {}
+    for source in plans:
+        ranks[source] = counts[condition_of[source]]
+        counts[condition_of[source]] += 1
+    ranks |= dict.fromkeys((source for source in first if source in plans), -1)
+    chosen = set(sorted(plans, key=lambda source: ranks[source])[:MAX_TRIALS])
+    return [source for source in plans if source in chosen]

@@ -11,7 +11,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Field
 from fieldkit.steps.base import Step
 from fieldkit.steps.capabilities import ChecksPlacement, DependsOnCast
-from fieldkit.steps.nest import Nest
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 
 
 class AlongStep(Step, DependsOnCast, ChecksPlacement):
@@ -52,7 +52,7 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
         return self.with_duration(path_s).model_copy(update={"along": False})
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if self.along and not any(nest.has_path for nest in within):
             return f"along: true needs a move around it; put it into a move, or write {self.duration_key}"
         return None

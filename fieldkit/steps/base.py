@@ -1,9 +1,9 @@
 """The contract of a step: its YAML keys, jobs, requirements, files, checks and columns."""
 
 from abc import ABC
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import EntryPoint
 from inspect import isabstract
 from typing import Annotated, Any, ClassVar
@@ -175,6 +175,13 @@ def step_types() -> LazyMapping[type[Step]]:
         ConfigurationError: As `kinds.find`.
     """
     return LazyMapping(kinds.find(), _load)
+
+
+def prepare(step: Step, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
+    """Start the processes of a step that must be ready first; return the function that runs the step."""
+    return (
+        step.prepare(scene, testbed) if isinstance(step, capabilities.Prepares) else partial(step.run, scene, testbed)
+    )
 
 
 @dataclass(frozen=True)

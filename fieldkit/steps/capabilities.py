@@ -7,8 +7,7 @@ that mypy checks the signatures of its methods. For a kind of another package it
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 from typing_extensions import override
 
@@ -17,10 +16,7 @@ from fieldkit.core.columns import Value
 from fieldkit.core.model import Role
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, RecordedFile, Refusal, Scene
-
-if TYPE_CHECKING:
-    from fieldkit.steps.base import Step
-    from fieldkit.steps.nest import Nest
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 
 
 class Capability(ABC):  # noqa: B024 (its subclasses have the abstract methods)
@@ -50,11 +46,6 @@ class Prepares(Capability):
 
         A capture calls it in a thread while tcpdump starts. Both functions raise the errors of `Step.run`.
         """
-
-
-def prepare(step: "Step", scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-    """Start the processes of a step that must be ready first; return the function that runs the step."""
-    return step.prepare(scene, testbed) if isinstance(step, Prepares) else partial(step.run, scene, testbed)
 
 
 class DescribesActions(Capability):
@@ -121,7 +112,7 @@ class ChecksPlacement(Capability):
     """A step that is not allowed everywhere in a procedure."""
 
     @abstractmethod
-    def placement_error(self, earlier: "Sequence[Step]", within: "Sequence[Nest]") -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         """Return the reason why the step is not allowed at its position in the procedure; None if it is.
 
         Args:
@@ -196,7 +187,7 @@ class SendsFile(Capability):
     """A step that sends a file."""
 
     @abstractmethod
-    def transfer(self, scene: Scene, within: "Sequence[Nest]") -> Transfer | None:
+    def transfer(self, scene: Scene, within: Sequence[EnclosingStep]) -> Transfer | None:
         """Return the packet filter of the file transfer; None if the step sends no file.
 
         Args:

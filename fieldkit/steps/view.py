@@ -2,16 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence import host, tcpdump_log
 from fieldkit.steps.scene import Scene
-
-if TYPE_CHECKING:
-    from fieldkit.steps.nest import Nest
+from fieldkit.steps.surroundings import EnclosingStep
 
 
 @dataclass(frozen=True)
@@ -26,7 +23,7 @@ class View:
 
     scene: Scene
     evidence: AttemptEvidence
-    within: Sequence["Nest"] = ()
+    within: Sequence[EnclosingStep] = ()
 
     def capture(self, role: Role) -> Capture | None:
         """Return the capture of a robot around the step; None if there is none or it is incomplete."""
@@ -56,12 +53,12 @@ class View:
         return before.clock.first_ns, after.clock.last_ns
 
 
-def capture_around(within: Sequence["Nest"], role: Role) -> str | None:
+def capture_around(within: Sequence[EnclosingStep], role: Role) -> str | None:
     """Return the file of the innermost capture of a robot around a step; None if the robot does not capture.
 
     Args:
         within: The steps around the step, the outermost first.
         role: Role of the robot.
     """
-    files = (nest.captures().get(role) for nest in reversed(within))
+    files = (step.captures().get(role) for step in reversed(within))
     return next((file for file in files if file is not None), None)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
-from fieldkit.config.schema import Codec, Field
+from fieldkit.config.json_records import Codec
+from fieldkit.config.schema import Field
 from fieldkit.core import jsonl, laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import ENDED, Protocol, RepeatId, Status

@@ -6,7 +6,6 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Final
 
-from fieldkit.analysis import sample_size
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
 from fieldkit.config.schema import Field, Int, Number, Strict
@@ -139,10 +138,6 @@ class Plan(Strict):
 
     def _sections(self) -> Iterable[ProcedureSection]:
         return self.procedure.sections.values()
-
-    def shortfalls(self) -> Iterator[str]:
-        """Yield a sentence for each expectation that the plan cannot decide, for example with too few repeats."""
-        return sample_size.unmet_requirements(self.procedure.expectations, self.procedure.figures, self.repeats)
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
         """Return the actions of the testbed in one repeat in addition to the commands, one sentence each."""

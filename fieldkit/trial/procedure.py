@@ -139,7 +139,9 @@ class Procedure(catalog.Named, Sectioned):
     def _can_be_measured(self) -> "Procedure":
         """Reject steps that would be measured incorrectly or not at all."""
         robot_files = (
-            name(role) for role in self.roles() for name in (host.before_file, host.after_file, link_samples.file)
+            name(role)
+            for role in self.roles()
+            for name in (host.before_file, host.after_file, link_samples.robot_file)
         )
         used_resources, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
         filled = set[str]()

@@ -24,7 +24,7 @@ _NO_NEW_AGENTS: Final = count_bytes(0)
 
 
 class _Layouts(NamedTuple):
-    """Layouts of parts of many states; each skips the other parts.
+    """Layouts of `struct` that each read one part of many states and skip the others.
 
     Attributes:
         indices: The index and the reserved field, as one number, which is the index if the reserved field is 0.
@@ -174,7 +174,7 @@ class ReceivedStates(Mapping[str, State]):
         return self._rows is agents.indices or self._rows == agents.indices
 
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
-        """Return True if other states have the same agents with the same limits; it may be False if unsure."""
+        """Return True if other states have the same agents with the same limits; False may also mean unknown."""
         return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 
     @property
@@ -227,7 +227,7 @@ def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates
     layouts = _layouts(len(data) // STATE.size)
     indices, limits = layouts.indices.unpack(data), layouts.limits.unpack(data)
     headings = layouts.headings.unpack(data)
-    # The sum of finite numbers may be too large, then each is checked.
+    # The sum of finite numbers may overflow; then each number is checked.
     if not (
         math.isfinite(sum(layouts.positions.unpack(data)))
         and math.inf not in headings

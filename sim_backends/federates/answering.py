@@ -73,7 +73,7 @@ class FederateService:
         """Return the answer to a hello.
 
         Raises:
-            ValueError: The federate has not the role that the coordinator expects.
+            ValueError: The federate has another role than the coordinator expects.
         """
         role = PHYSICS if hasattr(federate, "step_ns") else NETWORK
         if role != hello.role:
@@ -111,7 +111,7 @@ def _next_event_ns(federate: Any) -> int:  # noqa: ANN401 (a physics or a networ
 
 @dataclass
 class _FederateCopy:
-    """The federate, or a copy of it: it, its agents, and the last time to which it has advanced."""
+    """The federate or a copy of it, with its agents and the last time to which it has advanced."""
 
     federate: Any
     agents: AgentTable
@@ -119,7 +119,7 @@ class _FederateCopy:
 
 
 class _Heartbeat:
-    """Sends `busy` while a request takes long.
+    """Sends `busy` at an interval while a request is computed.
 
     Args:
         channel: The channel.
@@ -145,7 +145,7 @@ class _Heartbeat:
             self._channel.send(frame, None)
 
     def stop(self) -> None:
-        """Send nothing from now on."""
+        """Send no more heartbeats."""
         with self._lock:
             self._stopped.set()
 
@@ -288,6 +288,6 @@ def serve_channel(
         channel: The channel.
         service: The federate.
         token: Token that the coordinator must send.
-        hello_s: Longest wait for its first message; None for no limit.
+        hello_s: Maximum wait for its first message; None for no limit.
     """
     return _Run(service, channel, token, hello_s).serve()

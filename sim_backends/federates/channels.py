@@ -44,13 +44,13 @@ class FrameChannel(Protocol):
 
         Raises:
             ClosedError: The other side closed the channel.
-            DeadlineError: No whole frame has arrived in time.
+            DeadlineError: No complete frame arrived before the deadline.
             MalformedFrameError: The header is malformed.
         """
         ...
 
     def close(self) -> None:
-        """Close the channel; nothing happens if it is closed."""
+        """Close the channel; a second call has no effect."""
         ...
 
 

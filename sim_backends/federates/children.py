@@ -44,7 +44,7 @@ class Child:
             raise ConfigurationError(f"{command!r} is not a command: {error}") from error
         if not words:
             raise ConfigurationError("the command of a federate is empty")
-        # A file, because a pipe that nothing reads would block a federate that writes much.
+        # A file, because a federate that writes much would block on a pipe without a reader.
         self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
         try:
             process = subprocess.Popen(
@@ -76,7 +76,7 @@ class Child:
         return [line.rstrip() for line in tail.splitlines() if line.strip()][-_TAIL_LINES:]
 
     def exit_text(self, wait_s: float = 0.5) -> str:
-        """Return a text about its end, such as `it has exited with code 1`; empty if it still runs after a time."""
+        """Describe how it ended, such as `it has exited with code 1`; empty if it still runs after a short wait."""
         deadline_s = time.monotonic() + wait_s
         while not _has_exited(self._process.pid):
             if time.monotonic() > deadline_s:
@@ -91,7 +91,7 @@ class Child:
         return f"it was ended by {signal.Signals(info.si_status).name}"
 
     def kill(self) -> None:
-        """End the process immediately, as it cannot be expected to end without that."""
+        """Kill the process immediately."""
         if self._finalizer.alive:
             _signal_group(self._process.pid, signal.SIGKILL)
         self._finalizer()
@@ -122,12 +122,12 @@ def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[
             time.sleep(_POLL_S)
         if _has_exited(process.pid):
             break
-    # Also ends what the command has started, and a process that is suspended.
+    # SIGKILL to the group also ends processes that the command started, and suspended ones.
     _signal_group(process.pid, signal.SIGKILL)
     process.wait()
     stderr.close()
 
 
 def _signal_group(pid: int, number: signal.Signals) -> None:
-    with suppress(ProcessLookupError, PermissionError):  # if only the zombie is left
+    with suppress(ProcessLookupError, PermissionError):  # only the zombie remains
         os.killpg(pid, number)

@@ -18,7 +18,7 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 
 _LIMIT_S: Final = 900.0
-"""Longest time of a compilation, and of the wait for another process that compiles the same program."""
+"""Timeout of a compilation, and of the wait for another process that compiles the same program."""
 _POLL_S: Final = 0.1
 _SHOWN_LINES: Final = 15
 _LIBRARY: Final = Path(__file__).parent / "cpp"
@@ -138,7 +138,7 @@ def _locked(path: Path, name: str) -> Iterator[None]:
     """Hold a lock file, so that processes that start together compile the program once.
 
     Raises:
-        ConfigurationError: Another process holds the lock for too long.
+        ConfigurationError: Another process held the lock until the timeout.
     """
     deadline_s = time.monotonic() + _LIMIT_S
     with path.open("wb") as file:

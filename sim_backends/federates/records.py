@@ -193,7 +193,7 @@ def read_arrival_delays(reader: FrameReader, count: int) -> list[ArrivalDelay]:
     """Return the parts of the delays of `count` arrivals.
 
     Raises:
-        MalformedFrameError: There are not as many, or a part is negative.
+        MalformedFrameError: There are fewer than `count`, or a part is negative.
     """
     begin = reader.position
     delays = [

@@ -134,7 +134,7 @@ class RemotePhysics(_RemoteFederate):
 class RemoteNetwork(_RemoteFederate):
     """A network in another process.
 
-    If it does not support that agents disappear, it receives the last states of absent agents, or their starts.
+    A network that does not support absent agents receives their last states, or their start states.
 
     Args:
         session: The session.
@@ -162,11 +162,11 @@ class RemoteNetwork(_RemoteFederate):
         self._log_delay: ArrivalDelayLog | None = None
 
     def log_arrival_delays(self, log: ArrivalDelayLog | None) -> None:
-        """Pass the parts of the delays of all arrivals from now on to `log`, if it reports them; None stops it."""
+        """Pass the parts of the delays of later arrivals to `log`, if the network reports them; None ends this."""
         self._log_delay = log
 
     def sample_links(self) -> dict[str, LinkSample]:
-        """Return a sample of the links of each radio, at the time that it has reached; empty if it has none.
+        """Return a sample of the links of each radio, at its current time; empty if it has no radios.
 
         Raises:
             FederateError: It failed, or sent a malformed answer.
@@ -197,7 +197,7 @@ class RemoteNetwork(_RemoteFederate):
         if isinstance(states, DeadReckoned):
             since_ns, reckoning_ns = states.since_ns, states.step_ns
         if self._last_states is not None:
-            # Absent agents are at rest, so that they are not extrapolated.
+            # Absent agents are sent at rest, so that they are not extrapolated.
             absent = [name for name in self._last_states if name not in states]
             if absent:
                 states = {**states, **{name: State(self._last_states[name].position_m) for name in absent}}

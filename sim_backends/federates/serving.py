@@ -13,7 +13,7 @@ from sim_backends.federates.transports.transport_table import FORMS, parse_addre
 
 _CONNECT_S: Final = 60.0
 _HELLO_S: Final = 10.0
-"""Longest wait for the first message of a program that has connected; others wait for their turn meanwhile."""
+"""Maximum wait for the first message after a program connects; other programs are queued meanwhile."""
 
 
 def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)

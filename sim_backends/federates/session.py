@@ -93,10 +93,10 @@ class FederateSession:
         self._released.append(copy)
 
     def welcome(self, hello: Hello) -> Welcome:
-        """Return the federate's answer to the beginning of a run.
+        """Send hello, and return the federate's welcome.
 
         Raises:
-            FederateError: It failed, does not answer, or does not suit; the message names it.
+            FederateError: It failed, does not answer, or is not compatible; the message names it.
         """
         what = f"begin a run as {ROLES[self._role]}"
         welcome = self.request(
@@ -127,8 +127,8 @@ class FederateSession:
             copy: Copy of the federate.
             body: Body of the request.
             answer: Kind of the answer.
-            decode: Returns the answer of its body.
-            what: Returns what the federate is asked to do, for errors.
+            decode: Decodes the body of the answer.
+            what: Returns a description of the request, for error messages.
 
         Raises:
             UnansweredError: It did not answer within its deadline.
@@ -162,7 +162,7 @@ class FederateSession:
             self.fail(f"{self.name} failed at the request to {what()}: {error}{self._progress()}{self._exit_text()}")
 
     def _exchange(self, request: bytes, expected: Header) -> ProtocolFrame:
-        """Send a request, and return its answer or the error; the federate may report before that it computes."""
+        """Send a request, and return the answer or error; `busy` messages before it extend the wait."""
         started_s = time.monotonic()
         limit_s, last_s = started_s + self._deadline_s, started_s + PATIENCE * self._deadline_s
         self._busy_ns = None
@@ -236,8 +236,8 @@ class FederateSession:
             limit_s: Longest wait, in seconds of wall time.
 
         Raises:
-            ClosedError: It has closed the connection.
-            DeadlineError: It has not.
+            ClosedError: The federate has closed the connection.
+            DeadlineError: The connection is still open at the limit.
         """
         deadline_s = time.monotonic() + limit_s
         self._channel.send(encode(MessageKind.BYE, 0, 0), deadline_s)
@@ -245,7 +245,7 @@ class FederateSession:
             self._channel.receive(deadline_s)
 
     def close(self) -> None:
-        """End the session, and the process that it has started; nothing happens if it has ended."""
+        """End the session and its child process; a second call has no effect."""
         if self._is_closed:
             return
         self._is_closed = True

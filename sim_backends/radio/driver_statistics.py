@@ -66,9 +66,9 @@ class RadioMeter:
         link.retries += len(frames) - new
         link.rate_bit_s = transmission.mode.rate_bit_s
 
-    def on_failure(self, transmitter: int, receiver: int) -> None:
-        """Record that a packet was given up."""
-        self.link(transmitter, receiver).failures += 1
+    def on_failures(self, transmitter: int, receiver: int, packets: int) -> None:
+        """Record that packets were given up."""
+        self.link(transmitter, receiver).failures += packets
 
     def link(self, transmitter: int, receiver: int) -> LinkMeter:
         """Return the counters of a link, which continue to change."""

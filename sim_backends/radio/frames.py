@@ -86,7 +86,11 @@ def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> 
         receiver: Index of the receiver.
         noise_mw: Its noise power in 20 MHz.
     """
-    return part_success_probability(frame, receiver, noise_mw, (frame.start_ns, frame.end_ns), 8.0 * frame.size_bytes)
+    bits = 8.0 * frame.size_bytes
+    if not frame.interferers:  # most frames, without a further call
+        mode = frame.mode
+        return math.exp(log_success(mode, decibel(frame.powers_mw[receiver] / (noise_mw * mode.noise_factor)), bits))
+    return part_success_probability(frame, receiver, noise_mw, (frame.start_ns, frame.end_ns), bits)
 
 
 def part_success_probability(

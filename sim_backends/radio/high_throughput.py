@@ -31,7 +31,7 @@ HighThroughput = Literal["HT", "VHT", "HE"]
 _ORDER: Final[tuple[WifiAmendment, ...]] = ("n", "ac", "ax")
 _FORMATS: Final[dict[WifiAmendment, HighThroughput]] = {"n": "HT", "ac": "VHT", "ax": "HE"}
 
-# Modulation and code rate by MCS: tables 19-27, 21-29 and 27-111.
+# Modulation and code rate by MCS: tables 19-27 and 21-29, clause 27.5.
 _MCS: Final[tuple[tuple[Modulation, Fraction], ...]] = (
     ("BPSK", Fraction(1, 2)),
     ("QPSK", Fraction(1, 2)),

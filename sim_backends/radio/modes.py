@@ -147,9 +147,18 @@ class WifiMode:
         TXTIME of 17.4.3 (OFDM), 19.4.3 (HT, mixed format), 21.4.3 (VHT), 27.4.3 (HE, single user, no packet
         extension), with the signal extension of the band.
         """
-        symbols = -(-(_SERVICE_BITS + _TAIL_BITS * self.encoders + 8 * size_bytes) // self.bits_per_symbol)
-        data_ns = -(-symbols * self.symbol_ns // self.granularity_ns) * self.granularity_ns
-        return self.preamble_ns + data_ns + self.band.signal_extension_ns
+        data_ns = -(-(self._overhead_bits + 8 * size_bytes) // self.bits_per_symbol) * self.symbol_ns
+        if self.granularity_ns > 1:
+            data_ns = -(-data_ns // self.granularity_ns) * self.granularity_ns
+        return self._overhead_ns + data_ns
+
+    @cached_property
+    def _overhead_bits(self) -> int:
+        return _SERVICE_BITS + _TAIL_BITS * self.encoders
+
+    @cached_property
+    def _overhead_ns(self) -> int:
+        return self.preamble_ns + self.band.signal_extension_ns
 
 
 def _modes(letter: str, band: Band, table: tuple[tuple[str, Modulation, int, int, int], ...]) -> tuple[WifiMode, ...]:

@@ -155,9 +155,10 @@ class Reception(Generic[Payload]):
         """
         if index not in transmission.receivers:
             return False
-        return self._draw(transmission, index, purpose) < success_probability(
-            transmission, index, self._channel.noise_mw[index]
+        draw = self._link_draws(transmission.transmitter, index, purpose).draw(
+            transmission.packet, transmission.attempt
         )
+        return draw < success_probability(transmission, index, self._channel.noise_mw[index])
 
     def decoded_frames(
         self, index: int, transmission: Transmission, aggregate: Aggregate[Payload]
@@ -193,10 +194,6 @@ class Reception(Generic[Payload]):
         detected_by = [index for index, detected in enumerate(is_detected) if detected and index != transmitter]
         reach = self._reaches[transmitter] = _Reach(powers_mw, detected_by)
         return reach
-
-    def _draw(self, transmission: Transmission, receiver: int, purpose: str) -> float:
-        draws = self._link_draws(transmission.transmitter, receiver, purpose)
-        return draws.draw(transmission.packet, transmission.attempt)
 
     def _link_draws(self, transmitter: int, receiver: int, purpose: str) -> PacketDraws:
         key = transmitter, receiver, purpose

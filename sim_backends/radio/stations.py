@@ -7,7 +7,7 @@ from sim_backends.radio.aggregation import Aggregate, BlockAckSession
 from sim_backends.radio.contention import Contention
 from sim_backends.radio.frames import Frame, Transmission
 from sim_backends.radio.links import LinkCounters, Payload
-from sim_backends.radio.modes import SHORT_RETRY_LIMIT
+from sim_backends.radio.modes import SHORT_RETRY_LIMIT, WifiMode
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 
@@ -78,6 +78,7 @@ class Peer(Generic[Payload]):
     Attributes:
         failed_exchanges: Number of aggregates without a Block Ack since the last one.
         last_frame: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
+        mode: Mode of the last attempt.
     """
 
     __slots__ = (
@@ -85,6 +86,7 @@ class Peer(Generic[Payload]):
         "failed_exchanges",
         "last_frame",
         "lost",
+        "mode",
         "queue_dropped",
         "rate",
         "receiver",
@@ -98,6 +100,7 @@ class Peer(Generic[Payload]):
         self.session = session
         self.sent = self.queue_dropped = self.lost = self.delivered = 0
         self.failed_exchanges = 0
+        self.mode: WifiMode
         self.last_frame: Frame[Payload] | None = None
 
     def has_received(self, frame: Frame[Payload]) -> bool:

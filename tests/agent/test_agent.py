@@ -61,11 +61,11 @@ class Cable:
     hosts: tuple[TestHost, TestHost]
     program: Path
 
-    def arguments(self, over: str, host: TestHost, **network: object) -> dict[str, Any]:
+    def arguments(self, middleware_name: str, host: TestHost, **network: object) -> dict[str, Any]:
         node = f"fieldkit_{host.pid}"
         topic = topics.describe(shipped(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
         taking_part = {"address": host.address, "domain": 3, "node": node, **network}
-        return {"network": taking_part, "topic": topic, "stream": {"over": over, **STREAM}}
+        return {"network": taking_part, "topic": topic, "stream": {"over": middleware_name, **STREAM}}
 
     @contextmanager
     def running(
@@ -91,17 +91,17 @@ def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
         yield Cable(hosts, program)
 
 
-def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> None:
+def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> None:
     """Stream from one host to the other, and check that all samples arrive unchanged."""
     near, far = cable.hosts
-    sent, came = tmp_path / "sent", tmp_path / "came"
-    hears = cable.arguments(over, far, peers=(near.address,), **network)
-    with cable.running(far, "subscribe", hears, str(came)) as subscriber:
-        speaks = cable.arguments(over, near, peers=(far.address,), **network)
-        with cable.running(near, "publish", speaks, str(sent)) as publisher:
+    sent, received = tmp_path / "sent", tmp_path / "came"
+    subscriber_arguments = cable.arguments(middleware_name, far, peers=(near.address,), **network)
+    with cable.running(far, "subscribe", subscriber_arguments, str(received)) as subscriber:
+        publisher_arguments = cable.arguments(middleware_name, near, peers=(far.address,), **network)
+        with cable.running(near, "publish", publisher_arguments, str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
     assert subscriber.returncode == 0
-    left, arrived = topic_logs.rows(sent), topic_logs.rows(came)
+    left, arrived = topic_logs.rows(sent), topic_logs.rows(received)
     kinds = [row[0] for row in left if row[0] != records.SKIPPED]
     assert kinds[:3] == [records.ORIGIN, records.BEGUN, records.MATCHED]
     expected = [row[2:5] for row in left if row[0] == records.SAMPLE]
@@ -113,9 +113,9 @@ def exchanged(cable: Cable, tmp_path: Path, over: str, **network: object) -> Non
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("discovery", ["multicast", "peers"])
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_samples_arrive_without_a_master(cable: Cable, tmp_path: Path, over: str, discovery: str) -> None:
-    exchanged(cable, tmp_path, over, discovery=discovery)
+@pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
+def test_samples_arrive_without_a_master(cable: Cable, tmp_path: Path, middleware_name: str, discovery: str) -> None:
+    exchanged(cable, tmp_path, middleware_name, discovery=discovery)
 
 
 @pytest.mark.emulated
@@ -143,24 +143,24 @@ def test_samples_arrive_with_a_ros_1_master(cable: Cable, tmp_path: Path) -> Non
 @pytest.mark.emulated
 def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path) -> None:
     near, far = cable.hosts
-    sent, came = tmp_path / "sent", tmp_path / "came"
-    with cable.running(far, "subscribe", cable.arguments("dds", far), str(came)) as subscriber:
+    sent, received = tmp_path / "sent", tmp_path / "came"
+    with cable.running(far, "subscribe", cable.arguments("dds", far), str(received)) as subscriber:
         with cable.running(near, "publish", cable.arguments("dds", near), str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
         subscriber.kill()
-    arrived = [row[3] for row in topic_logs.rows(came) if row[0] == records.SAMPLE]
+    arrived = [row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE]
     assert arrived == [row[3] for row in topic_logs.rows(sent) if row[0] == records.SAMPLE]
-    assert topic_logs.rows(came)[-1][0] == records.SAMPLE
+    assert topic_logs.rows(received)[-1][0] == records.SAMPLE
 
 
 @pytest.mark.emulated
 def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) -> None:
     near, far = cable.hosts
-    sent, came = tmp_path / "sent", tmp_path / "came"
-    with cable.running(far, "subscribe", cable.arguments("dds", far), str(came)) as subscriber:
-        speaks = cable.arguments("dds", near)
-        speaks["stream"]["duration_s"] = 3.0  # stopped before it has received all samples
-        with cable.running(near, "publish", speaks, str(sent)) as publisher:
+    sent, received = tmp_path / "sent", tmp_path / "came"
+    with cable.running(far, "subscribe", cable.arguments("dds", far), str(received)) as subscriber:
+        publisher_arguments = cable.arguments("dds", near)
+        publisher_arguments["stream"]["duration_s"] = 3.0  # stopped before it has received all samples
+        with cable.running(near, "publish", publisher_arguments, str(sent)) as publisher:
             wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)
             try:
@@ -221,23 +221,23 @@ def attacked(host: TestHost, *words: str) -> None:
 
 
 @contextmanager
-def unharmed(cable: Cable, tmp_path: Path, over: str, **network: object) -> Iterator[Path]:
+def unharmed(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> Iterator[Path]:
     """Stream from one host to the other while the body runs; both programs must survive and stop cleanly after it.
 
     Yields the log of the received samples.
     """
     near, far = cable.hosts
-    came, sent = tmp_path / "came", tmp_path / "sent"
-    hears = cable.arguments(over, near, peers=(far.address,), **network)
-    speaks = cable.arguments(over, far, peers=(near.address,), **network)
-    endless = {**speaks, "stream": {**speaks["stream"], "duration_s": 600.0}}
-    with cable.running(near, "subscribe", hears, str(came)) as subscriber:
+    received, sent = tmp_path / "came", tmp_path / "sent"
+    subscriber_arguments = cable.arguments(middleware_name, near, peers=(far.address,), **network)
+    publisher_arguments = cable.arguments(middleware_name, far, peers=(near.address,), **network)
+    endless = {**publisher_arguments, "stream": {**publisher_arguments["stream"], "duration_s": 600.0}}
+    with cable.running(near, "subscribe", subscriber_arguments, str(received)) as subscriber:
         with cable.running(far, "publish", endless, str(sent)) as publisher:
-            yield came
+            yield received
             assert publisher.poll() is None
         assert subscriber.poll() is None
     assert (subscriber.returncode, publisher.returncode) == (0, 0)
-    for log in (sent, came):
+    for log in (sent, received):
         assert records.SAMPLE in {row[0] for row in topic_logs.rows(log)}
         assert topic_logs.rows(log)[-1][0] == records.END
 
@@ -252,11 +252,11 @@ def test_changed_rtps_messages_stop_neither_program(cable: Cable, tmp_path: Path
 @pytest.mark.emulated
 def test_forged_heartbeat_silences_a_subscription(cable: Cable, tmp_path: Path) -> None:
     """CycloneDDS follows RTPS: samples before the oldest available one are lost; see docs/studies/hostile.md."""
-    with unharmed(cable, tmp_path, "dds") as came:
+    with unharmed(cable, tmp_path, "dds") as received:
         attacked(cable.hosts[1], "heartbeat")
         output_text = newest(tmp_path / "sent") + 1  # sent, and perhaps not yet in the log
         wait_until(lambda: newest(tmp_path / "sent") > output_text + 50, Deadline.after(60))
-        assert 0 <= newest(came) <= output_text
+        assert 0 <= newest(received) <= output_text
 
 
 def newest(log: Path) -> int:
@@ -271,9 +271,9 @@ def test_invalid_tcpros_data_stop_neither_program(cable: Cable, tmp_path: Path) 
     with ExitStack() as stack:
         process = stack.enter_context(near.start(("rosmaster", "--core", "-p", "11311")))
         stack.callback(process.terminate)
-        with unharmed(cable, tmp_path, "ros1", **network) as came:
+        with unharmed(cable, tmp_path, "ros1", **network) as received:
             attacked(far, "tcpros", f"http://{near.address}:11311", f"{near.address}:40001", f"{far.address}:40001")
-            sequences = {row[3] for row in topic_logs.rows(came) if row[0] == records.SAMPLE}
+            sequences = {row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE}
             deadline_s = time.monotonic() + 60
-            while {row[3] for row in topic_logs.rows(came) if row[0] == records.SAMPLE} <= sequences:
+            while {row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE} <= sequences:
                 assert time.monotonic() < deadline_s, "nothing comes any more"

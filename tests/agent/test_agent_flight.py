@@ -77,13 +77,13 @@ def test_state_from_messages_of_an_autopilot() -> None:
 
 def test_other_systems_and_damaged_frames_are_ignored() -> None:
     state, link = state_from(d.MAVLink_local_position_ned_message(1, 1.0, 2.0, 3.0, 0, 0, 0))
-    stranger = d.MAVLink(None, srcSystem=9, srcComponent=1)
+    other_system = d.MAVLink(None, srcSystem=9, srcComponent=1)
     elsewhere = d.MAVLink_local_position_ned_message(2, 99.0, 99.0, 99.0, 0, 0, 0)
     damaged = bytearray(elsewhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)))
     damaged[15] ^= 1
     nowhere = d.MAVLink_local_position_ned_message(2, math.nan, 0, 0, 0, 0, 0)
     link.coming = [
-        elsewhere.pack(stranger),
+        elsewhere.pack(other_system),
         bytes(damaged),
         nowhere.pack(d.MAVLink(None, srcSystem=7, srcComponent=1)),
     ]
@@ -130,13 +130,13 @@ def test_sent_messages_are_those_of_pymavlink() -> None:
     ignored = {
         flag.name.removeprefix("POSITION_TARGET_TYPEMASK_") for bit, flag in flags.items() if mask & bit == bit
     }
-    rates = {f"{what}{axis}_IGNORE" for axis in "XYZ" for what in "VA"}
+    rates = {f"{kind}{axis}_IGNORE" for axis in "XYZ" for kind in "VA"}
     assert ignored == {*rates, "YAW_RATE_IGNORE"}
     assert (ask.param1, ask.param2) == (d.MAVLINK_MSG_ID_ATTITUDE, 100_000)
 
 
-def plan(way: list[tuple[float, float, float]]) -> FlightPlan:
-    return FlightPlan("udpout:127.0.0.1:1", "orders", "land", 5.0, height_m=3.0, legs=way)
+def plan(legs: list[tuple[float, float, float]]) -> FlightPlan:
+    return FlightPlan("udpout:127.0.0.1:1", "orders", "land", 5.0, height_m=3.0, legs=legs)
 
 
 def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:

@@ -73,7 +73,7 @@ def test_no_faults_for_a_ready_autopilot() -> None:
 
 
 @pytest.mark.parametrize(
-    ("replaced", "what"),
+    ("replaced", "fault"),
     [
         ({"first": beat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
         ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors turn"),
@@ -99,15 +99,15 @@ def test_no_faults_for_a_ready_autopilot() -> None:
         ({"back": parameter("RTL_ALT", 1500)}, "it returns at a height of 15 m, but only 10 m are allowed"),
     ],
 )
-def test_each_fault_is_reported(replaced: dict[str, Any], what: str) -> None:
-    assert any(what in item for item in faults(**replaced)), faults(**replaced)
+def test_each_fault_is_reported(replaced: dict[str, Any], fault: str) -> None:
+    assert any(fault in item for item in faults(**replaced)), faults(**replaced)
 
 
 def test_text_in_pieces_is_joined() -> None:
     long = b"PreArm: Battery 1 below minimum arming voltage, which stands in BATT_ARM_VOLT"
     pieces = {f"text{n}": d.MAVLink_statustext_message(2, long[50 * n :][:50], 5, n) for n in range(2)}
-    (what,) = faults(**pieces)
-    assert what.endswith("armed: Battery 1 below minimum arming voltage, which stands in BATT_ARM_VOLT")
+    (fault,) = faults(**pieces)
+    assert fault.endswith("armed: Battery 1 below minimum arming voltage, which stands in BATT_ARM_VOLT")
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])

@@ -48,8 +48,8 @@ def test_all_types_of_robots_can_be_built(name: str) -> None:
     read = struct.deserialize(empty)  # type: ignore[attr-defined]
     written = read.serialize(use_version_2=False)
     store = shipped().ros2
-    again = store.serialize_cdr(store.deserialize_cdr(written, described.type), described.type)
-    assert bytes(again) == written
+    converted = store.serialize_cdr(store.deserialize_cdr(written, described.type), described.type)
+    assert bytes(converted) == written
 
 
 def test_custom_type_can_be_built() -> None:

@@ -56,7 +56,7 @@ def test_px4_modes_are_those_of_pymavlink() -> None:
 def test_mode_names_are_those_of_pymavlink() -> None:
     px4 = {name: PX4.mode_name(main << 16 | sub << 24) for name, (_, main, sub) in mavutil.px4_map.items()}
     del px4["RTGS"], px4["FOLLOWME"]  # not in px4_custom_mode.h any more, which has FOLLOW_TARGET
-    assert {name: given.rpartition(".")[2] for name, given in px4.items()} == {name: name for name in px4}
+    assert {name: full_name.rpartition(".")[2] for name, full_name in px4.items()} == {name: name for name in px4}
     assert PX4.mode_name(4 << 16 | 6 << 24) == "AUTO.LAND"
     obsolete = {"POSITION", "OF_LOITER", "RATE_ACRO"}
     named = {name: COPTER.mode_name(number) for name, number in ACM.items() if name not in obsolete}

@@ -30,7 +30,7 @@ TASK = {
 }
 
 
-def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str = "base_footprint") -> bytes:
+def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child_frame: str = "base_footprint") -> bytes:
     """Serialize a message with rosbags."""
     store = STORES[cdr]
     kinds = store.types
@@ -43,7 +43,7 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str =
     vector = kinds["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
     message = kinds["nav_msgs/msg/Odometry"](
         header,
-        child,
+        child_frame,
         kinds["geometry_msgs/msg/PoseWithCovariance"](kinds["geometry_msgs/msg/Pose"](point, turned), zeros),
         kinds["geometry_msgs/msg/TwistWithCovariance"](kinds["geometry_msgs/msg/Twist"](vector, vector), zeros),
     )
@@ -55,7 +55,7 @@ def odometry(pose: OdometryPose, *, cdr: bool, frame: str = "odom", child: str =
 @pytest.mark.parametrize("names", [("odom", "base_footprint"), ("", ""), ("o", "abcdefghi")])
 def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> None:
     pose = OdometryPose(3.5, -2.25, 1.25)
-    read = drive.read_odometry(odometry(pose, cdr=cdr, frame=names[0], child=names[1]), cdr=cdr)
+    read = drive.read_odometry(odometry(pose, cdr=cdr, frame=names[0], child_frame=names[1]), cdr=cdr)
     assert read == pytest.approx(pose)
     kinds = STORES[cdr].types
     vector = kinds["geometry_msgs/msg/Vector3"]
@@ -69,14 +69,14 @@ def test_messages_are_those_of_rosbags(names: tuple[str, str], cdr: bool) -> Non
 def test_invalid_odometry_is_none(data: bytes, cdr: bool) -> None:
     pose = drive.read_odometry(data, cdr=cdr)
     assert pose is None or all(map(math.isfinite, pose))
-    whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
-    assert drive.read_odometry(whole[: min(len(data), 80)], cdr=cdr) is None
+    sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=cdr)
+    assert drive.read_odometry(sample[: min(len(data), 80)], cdr=cdr) is None
 
 
 def test_odometry_with_nan_is_none() -> None:
-    whole = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
-    at = whole.index(struct.pack("<d", 1.0))
-    assert drive.read_odometry(whole[:at] + struct.pack("<d", math.nan) + whole[at + 8 :], cdr=False) is None
+    sample = odometry(OdometryPose(1.0, 2.0, 0.5), cdr=False)
+    at = sample.index(struct.pack("<d", 1.0))
+    assert drive.read_odometry(sample[:at] + struct.pack("<d", math.nan) + sample[at + 8 :], cdr=False) is None
 
 
 class World:
@@ -149,9 +149,9 @@ def run(
         "orders": str(world.orders),
         "status": str(folder / "status"),
     }
-    ended = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
+    reason = drive.drive(world, arguments, folder / "log", world)  # type: ignore[arg-type]
     log = [json.loads(line) for line in (folder / "log").read_text(encoding="ascii").splitlines()]
-    return ended, log, json.loads((folder / "status").read_text(encoding="ascii"))
+    return reason, log, json.loads((folder / "status").read_text(encoding="ascii"))
 
 
 def test_drives_out_and_back_and_ends_with_zero_velocity(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -26,13 +26,13 @@ HEIGHT_M = 0.6
 
 
 def plan(folder: Path, port: int) -> FlightPlan:
-    where, orders = f"udpout:127.0.0.1:{port}", str(folder / "orders")
-    return FlightPlan(where, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0, fence_m=20.0)
+    connection, orders = f"udpout:127.0.0.1:{port}", str(folder / "orders")
+    return FlightPlan(connection, orders, "land", 60.0, height_m=HEIGHT_M, ceiling_m=10.0, fence_m=20.0)
 
 
-def order(folder: Path, number: int, what: str) -> None:
+def order(folder: Path, number: int, command: str) -> None:
     beside = folder / "orders.new"
-    beside.write_text(f"{number} {what} 60\n", encoding="ascii")
+    beside.write_text(f"{number} {command} 60\n", encoding="ascii")
     beside.replace(folder / "orders")
 
 
@@ -103,8 +103,8 @@ def test_autopilot_without_reports_is_commanded_to_land(
         return [] if silent.is_set() and lost in {None, parse_frame(frame).kind} else [frame]
 
     with drones.autopilot_at_udp(damage) as (port, autopilot):
-        flight_plan, over = plan(tmp_path, port), threading.Event()
-        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, over)))
+        flight_plan, finished = plan(tmp_path, port), threading.Event()
+        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, finished)))
         pilot.start()
         try:
             wait_until_up(autopilot)
@@ -113,7 +113,7 @@ def test_autopilot_without_reports_is_commanded_to_land(
             silent.clear()
             pilot.join(60)
         finally:
-            over.set()
+            finished.set()
             pilot.join(60)
     assert codes == [landing.REFUSED]
     assert reason in capfd.readouterr().err
@@ -125,18 +125,18 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
     """As behind a stopped router: the alarm is logged first, and the program exits some time later."""
     monkeypatch.setattr(loop, "_FLIGHT_HEARTBEAT_TIMEOUT_S", 5.0)
     monkeypatch.setattr(landing, "NO_HEARTBEAT_S", 1.0)
-    silent, over, codes = threading.Event(), threading.Event(), list[int]()
+    silent, finished, codes = threading.Event(), threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
     with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):
         flight_plan = plan(tmp_path, port)
-        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, over)))
+        pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, finished)))
         pilot.start()
         try:
             wait_until_up(autopilot)
             silent.set()
             pilot.join(60)
         finally:
-            over.set()
+            finished.set()
             pilot.join(60)
     assert codes == [landing.REFUSED]
     lines = capfd.readouterr().err.splitlines()

@@ -37,18 +37,18 @@ def pilot(path: Path, beats: int) -> Iterator["subprocess.Popen[bytes]"]:
 
 
 def test_exit_suspension_and_hang_are_detected(tmp_path: Path) -> None:
-    own = LivenessFile(str(tmp_path / "file"), GUARD)
-    assert own.poll() == "has ended", "it has not started"
+    liveness_file = LivenessFile(str(tmp_path / "file"), GUARD)
+    assert liveness_file.poll() == "has ended", "it has not started"
     with pilot(tmp_path / "file", 10**9) as process:
-        wait_until(lambda: own.poll() == "", Deadline.after(60))
-        assert own.other_state == liveness.FLYING
+        wait_until(lambda: liveness_file.poll() == "", Deadline.after(60))
+        assert liveness_file.other_state == liveness.FLYING
         process.send_signal(signal.SIGSTOP)
-        wait_until(lambda: own.poll() == "is suspended", Deadline.after(60))
-        own.kill_other()
+        wait_until(lambda: liveness_file.poll() == "is suspended", Deadline.after(60))
+        liveness_file.kill_other()
         assert process.wait(60) == -signal.SIGKILL
-        assert own.poll() == "has ended"
+        assert liveness_file.poll() == "has ended"
     with pilot(tmp_path / "file", 5):
-        wait_until(lambda: own.poll().startswith("has not run for"), Deadline.after(60))
+        wait_until(lambda: liveness_file.poll().startswith("has not run for"), Deadline.after(60))
 
 
 def test_other_process_with_the_same_pid_is_not_killed(tmp_path: Path) -> None:

@@ -22,12 +22,12 @@ LIMIT_S = "90"
 
 
 @contextmanager
-def end(host: TestHost, verb: str, over: str, file: Path) -> Iterator[subprocess.Popen[str]]:
+def end(host: TestHost, verb: str, middleware_name: str, file: Path) -> Iterator[subprocess.Popen[str]]:
     """Run a publisher or subscription while the body runs."""
     quality = parse_qos(f"transient_local,depth={DEPTH}")
     topic = topics.describe(shipped(), "/map", TYPE, quality, domain=0, node=verb)
     network = {"address": host.address, "node": verb}
-    words = (verb, over, json.dumps(network), json.dumps(topic), str(file))
+    words = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(file))
     inside = ("timeout", "-k", "10", LIMIT_S, "nsenter", "-t", str(host.pid), "-n")
     command = (*inside, sys.executable, str(WIRE_END), *words)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -39,14 +39,14 @@ def end(host: TestHost, verb: str, over: str, file: Path) -> Iterator[subprocess
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_late_subscription_receives_the_last_samples(over: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
+def test_late_subscription_receives_the_last_samples(middleware_name: str, tmp_path: Path) -> None:
     store = shipped().ros2
     published = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
     file = tmp_path / "samples"
     file.write_text("\n".join(published), encoding="ascii")
-    with two_connected_hosts() as (near, far), end(near, "say", over, file) as publisher:
-        with end(far, "hear", over, file) as ears:
+    with two_connected_hosts() as (near, far), end(near, "say", middleware_name, file) as publisher:
+        with end(far, "hear", middleware_name, file) as ears:
             assert ears.stdout is not None
             for line in ears.stdout:
                 if line.strip() == published[-1]:
@@ -54,6 +54,6 @@ def test_late_subscription_receives_the_last_samples(over: str, tmp_path: Path) 
             assert publisher.stdout is not None
             assert publisher.stdout.readline() == "matched\n"
         # All samples were published before.
-        with end(far, "hear", over, file) as late:
+        with end(far, "hear", middleware_name, file) as late:
             assert late.stdout is not None
             assert [late.stdout.readline().strip() for _ in range(DEPTH)] == published[-DEPTH:]

@@ -25,7 +25,7 @@ from tests.helpers import drones
 from tests.helpers.mavlink_router import MavlinkRouter
 
 PATIENCE_S = 60.0
-WAYS = ("udpout", "tcp", "tcp of one client", "udpin", "serial")
+LINK_KINDS = ("udpout", "tcp", "tcp of one client", "udpin", "serial")
 
 
 @contextmanager
@@ -38,12 +38,12 @@ def drone_at(kind: str) -> Iterator[str]:
         with socket.socket(type=socket.SOCK_DGRAM) as drone, socket.socket(type=socket.SOCK_DGRAM) as free:
             drone.bind(("127.0.0.1", 0))
             free.bind(("127.0.0.1", 0))
-            there = free.getsockname()
+            address = free.getsockname()
             free.close()
-            with drones.flying(drone.fileno(), lambda frame: drone.sendto(frame, there), drone.recv) as autopilot:
+            with drones.flying(drone.fileno(), lambda frame: drone.sendto(frame, address), drone.recv) as autopilot:
                 greeting = drones.Sender(255, 190).frame(drones.beat())
                 list(autopilot.receive(greeting, drones.PEER, time.monotonic_ns()))
-                yield f"udpin:127.0.0.1:{there[1]}"
+                yield f"udpin:127.0.0.1:{address[1]}"
     else:
         with drones.at_udp() as port, MavlinkRouter(port, 1 if kind.endswith("client") else 100) as router:
             yield f"udpout:127.0.0.1:{router.udp}" if kind == "udpout" else f"tcp:127.0.0.1:{router.tcp}"
@@ -99,7 +99,7 @@ def assert_nothing_remains(connection: str) -> None:
         threading.Event().wait(0.05)
 
 
-@pytest.mark.parametrize("kind", WAYS)
+@pytest.mark.parametrize("kind", LINK_KINDS)
 def test_each_connection_is_shared_by_four_programs(kind: str) -> None:
     with drone_at(kind) as connection:
         with connected_sessions(connection, 4) as sessions:
@@ -112,7 +112,7 @@ def test_each_connection_is_shared_by_four_programs(kind: str) -> None:
         assert_nothing_remains(connection)
 
 
-@pytest.mark.parametrize("kind", WAYS)
+@pytest.mark.parametrize("kind", LINK_KINDS)
 def test_survey_detects_the_autopilot_beside_another_program(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     with drone_at(kind) as connection, connected_sessions(connection) as sessions:
         exchange_until(sessions, lambda: sessions[0].drone.alive)

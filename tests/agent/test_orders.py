@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 
 from fieldkit.agent.orders import Orders
 
-KNOWN = ("stay", "climb", "go", "home")
+ORDERS = ("stay", "climb", "go", "home")
 
 
 def test_orders_are_read_once_in_sequence_and_expire(tmp_path: Path) -> None:
     path = tmp_path / "orders"
-    orders = Orders(str(path), KNOWN, 60.0)
+    orders = Orders(str(path), ORDERS, 60.0)
     assert not orders.poll(), "there is no file"
     for text, order, new in (
         ("", "stay", False),
@@ -38,14 +38,14 @@ def test_orders_are_read_once_in_sequence_and_expire(tmp_path: Path) -> None:
 
 
 def test_first_order_has_a_timeout(tmp_path: Path) -> None:
-    assert Orders(str(tmp_path / "orders"), KNOWN, 0.0).expired
-    assert not Orders(str(tmp_path / "orders"), KNOWN, 60.0).expired
+    assert Orders(str(tmp_path / "orders"), ORDERS, 0.0).expired
+    assert not Orders(str(tmp_path / "orders"), ORDERS, 60.0).expired
 
 
 @given(st.binary(max_size=120))
 def test_any_file_content_is_tolerated(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "orders"
     path.write_bytes(data)
-    orders = Orders(str(path), KNOWN, 60.0)
+    orders = Orders(str(path), ORDERS, 60.0)
     orders.poll()
-    assert orders.order in KNOWN
+    assert orders.order in ORDERS

@@ -44,11 +44,11 @@ def samples(path: Path) -> dict[int, int]:
 def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
     program = tmp_path / "agent.pyz"
     program.write_bytes(agent.content())
-    sent, came = tmp_path / "sent", tmp_path / "came"
+    sent, received = tmp_path / "sent", tmp_path / "came"
     command = (sys.executable, str(program))
     with (
         two_connected_hosts() as (near, far),
-        near.start((*command, "subscribe", arguments(near, "/again", "ears"), str(came))) as subscriber,
+        near.start((*command, "subscribe", arguments(near, "/again", "ears"), str(received))) as subscriber,
         near.start((*command, "publish", arguments(near, "/stream", "mouth"), str(sent))) as publisher,
     ):
         environment = ("env", f"ROS_DOMAIN_ID={DOMAIN}", f"ROS_HOME={tmp_path}")
@@ -75,6 +75,6 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
         # Equal to the serialization of ROS 2, except for the padding of the last word.
         assert republished.startswith(expected)
         assert len(republished) - len(expected) < 4
-    back = samples(came)
-    assert back
-    assert all(times[sequence] == sent_ns for sequence, sent_ns in back.items())
+    received_samples = samples(received)
+    assert received_samples
+    assert all(times[sequence] == sent_ns for sequence, sent_ns in received_samples.items())

@@ -34,8 +34,8 @@ while True:
 
 
 def plan(folder: Path, port: int) -> FlightPlan:
-    where = f"udpout:127.0.0.1:{port}"
-    return FlightPlan(where, "", "land", 0.0, rescues=True, liveness=str(folder / "liveness"))
+    connection = f"udpout:127.0.0.1:{port}"
+    return FlightPlan(connection, "", "land", 0.0, rescues=True, liveness=str(folder / "liveness"))
 
 
 @contextmanager
@@ -119,11 +119,11 @@ def test_drone_that_a_person_has_taken_over_is_not_commanded(
 
 
 def test_stop_signal_does_not_stop_the_rescue(tmp_path: Path) -> None:
-    over = threading.Event()
-    over.set()
+    finished = threading.Event()
+    finished.set()
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot), programs(tmp_path):
         fly_up(autopilot, ARDUCOPTER)
-        assert flight.fly(plan(tmp_path, port), over) == 0
+        assert flight.fly(plan(tmp_path, port), finished) == 0
         assert autopilot.vehicle.body.on_ground
 
 

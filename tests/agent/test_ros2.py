@@ -30,12 +30,12 @@ LONG_S: Final = 120
 TRIES: Final = 5
 
 
-def arguments(over: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
-    node = f"fieldkit_{over}_{topic}"
+def arguments(middleware_name: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
+    node = f"fieldkit_{middleware_name}_{topic}"
     described = topics.describe(shipped(), f"/{topic}", TYPE, PROFILES["default"], domain=DOMAIN, node=node)
     described["quality"] |= quality
-    stream = {"over": over, "size_bytes": size, "rate_hz": 20.0, "duration_s": 1.0, "patience_s": 15.0}
-    discovery = "environment" if over == "ros2" else "multicast"
+    stream = {"over": middleware_name, "size_bytes": size, "rate_hz": 20.0, "duration_s": 1.0, "patience_s": 15.0}
+    discovery = "environment" if middleware_name == "ros2" else "multicast"
     network = {"address": host.address, "domain": DOMAIN, "node": node, "discovery": discovery}
     return {"network": network, "topic": described, "stream": stream}
 
@@ -49,11 +49,11 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def running(
-    host: TestHost, program: Path, verb: str, what: dict[str, Any], log: Path
+    host: TestHost, program: Path, verb: str, arguments: dict[str, Any], log: Path
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run a publisher or subscriber while the body runs, in the folder of its log."""
-    python = PYTHONS[what["stream"]["over"]]
-    inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(what), str(log))
+    python = PYTHONS[arguments["stream"]["over"]]
+    inside = ("env", "-C", str(log.parent), python, str(program), verb, json.dumps(arguments), str(log))
     with host.start(inside) as process:
         assert process.stderr is not None
         # Fast DDS may print warnings about types of CycloneDDS before.
@@ -71,9 +71,11 @@ def exchange(program: Path, folder: Path) -> bool:
     """Stream in both directions at the same time; return True if all endpoints matched."""
     with two_connected_hosts() as (near, far), ExitStack() as stack:
 
-        def start(host: TestHost, over: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
-            what = arguments(over, host, topic, SIZES[topic], durability="transient_local", depth=100)
-            return stack.enter_context(running(host, program, verb, what, folder / f"{topic}.{verb}"))
+        def start(host: TestHost, middleware_name: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
+            topic_arguments = arguments(
+                middleware_name, host, topic, SIZES[topic], durability="transient_local", depth=100
+            )
+            return stack.enter_context(running(host, program, verb, topic_arguments, folder / f"{topic}.{verb}"))
 
         subscribers = [start(far, "dds", "subscribe", "there"), start(near, "ros2", "subscribe", "back")]
         publishers = [start(far, "dds", "publish", "back"), start(near, "ros2", "publish", "there")]
@@ -93,9 +95,9 @@ def test_fast_dds_and_cyclonedds_exchange_samples_through_the_agent(program: Pat
     # On a busy machine CycloneDDS sometimes does not discover an endpoint of Fast DDS that has discovered it.
     assert any(exchange(program, tmp_path) for _ in range(TRIES))
     for topic in SIZES:
-        sent, came = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
+        sent, received = (read(tmp_path / f"{topic}.{verb}", records.SAMPLE) for verb in ("publish", "subscribe"))
         assert sent
-        assert [row[1:] for row in came] == [row[1:] for row in sent]
+        assert [row[1:] for row in received] == [row[1:] for row in sent]
 
 
 @pytest.mark.emulated
@@ -121,7 +123,7 @@ def test_ros_2_node_leaves_no_file_in_the_home_of_its_robot(program: Path, tmp_p
     assert not list(home.iterdir())
 
 
-SHOWN: Final = """
+PRINT_POLICIES: Final = """
 import json, sys
 sys.path.insert(0, sys.argv[1])
 from fieldkit.agent.messaging import ros2
@@ -141,14 +143,16 @@ print(json.dumps([policies, made.deadline.nanoseconds, made.lifespan.nanoseconds
 
 @pytest.mark.emulated
 def test_network_settings_and_quality_in_rclpy(program: Path) -> None:
-    done = subprocess.run((ROS2, "-c", SHOWN, str(program)), capture_output=True, check=False, timeout=LONG_S)
+    done = subprocess.run(
+        (ROS2, "-c", PRINT_POLICIES, str(program)), capture_output=True, check=False, timeout=LONG_S
+    )
     assert done.returncode == 0, done.stderr
-    policies, deadline_ns, lifespan_ns, output, ways = json.loads(done.stdout)
+    policies, deadline_ns, lifespan_ns, output, network_settings = json.loads(done.stdout)
     assert policies == ["BEST_EFFORT", "KEEP_LAST", 7, "TRANSIENT_LOCAL"]
     assert (deadline_ns, lifespan_ns) == (100_000_000, 2_000_000_000)
     assert "this ROS 2 has no lab_msgs/msg/Radio" in output
     domain = {"ROS_DOMAIN_ID": "7"}
-    assert ways == {
+    assert network_settings == {
         "environment": domain,
         "multicast": domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET", "ROS_STATIC_PEERS": ""},
         "peers": domain | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "10.0.0.2;10.0.0.3"},

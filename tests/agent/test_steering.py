@@ -70,8 +70,8 @@ def within_limits(task: DriveTask, driven: list[DriveVelocity]) -> bool:
         abs(velocity.forward_m_s) <= task.speed_m_s and abs(velocity.turn_rad_s) <= task.turn_rad_s + 1e-9
         for velocity in driven
     )
-    most = task.acceleration_m_s2 * TICK_S + 1e-9
-    gentle = all(after.forward_m_s - before.forward_m_s <= most for before, after in pairwise(driven))
+    max_change = task.acceleration_m_s2 * TICK_S + 1e-9
+    gentle = all(after.forward_m_s - before.forward_m_s <= max_change for before, after in pairwise(driven))
     return fast and gentle
 
 
@@ -236,7 +236,7 @@ def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("start", "last", "why"),
+    ("start", "last", "reason"),
     [
         ((6.0, 0.0, 0.0), None, "it is 6.00 m from its place, outside its fence of 5 m"),
         ((0.5, 0.0, 0.0), None, "it is 0.50 m and 0.00 rad from its place"),
@@ -245,11 +245,11 @@ def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
     ],
 )
 def test_robot_that_is_not_at_its_place_does_not_start(
-    start: tuple[float, float, float], last: tuple[float, float, float] | None, why: str
+    start: tuple[float, float, float], last: tuple[float, float, float] | None, reason: str
 ) -> None:
     driver = Driver(replace(TASK, origin=(0.0, 0.0, 0.0), last=last), 0.0)
     assert set(run(driver, Robot(OdometryPose(*start)))) == {ZERO_VELOCITY}
-    assert (driver.stop_reason, driver.refused) == (why, True)
+    assert (driver.stop_reason, driver.refused) == (reason, True)
 
 
 def test_later_repeats_use_the_heading_of_the_origin() -> None:

@@ -23,17 +23,21 @@ TYPE = "std_msgs/msg/UInt8MultiArray"
 TOPIC = Topic("/stream", TYPE)
 
 
-def streamed(over: str = "dds", size: int = 100, *, patience_s: float = 5.0) -> Stream:
-    return Stream(over, size, rate_hz=200.0, duration_s=0.1, patience_s=patience_s)
+def streamed(middleware_name: str = "dds", size: int = 100, *, patience_s: float = 5.0) -> Stream:
+    return Stream(middleware_name, size, rate_hz=200.0, duration_s=0.1, patience_s=patience_s)
 
 
 @pytest.mark.parametrize("size", [24, 25, 100, 4097])
 def test_sample_is_a_ros_message(size: int) -> None:
     """Equal to the serialization of rosbags for ROS 1 and ROS 2."""
-    for over, store in (("dds", shipped().ros2), ("ros1", shipped().ros1)):
-        sample = SampleCodec(streamed(over, size)).encode(7, 123_456_789)
-        message = store.deserialize_cdr(sample, TYPE) if over == "dds" else store.deserialize_ros1(sample, TYPE)
-        again = store.serialize_cdr(message, TYPE) if over == "dds" else store.serialize_ros1(message, TYPE)
+    for middleware_name, store in (("dds", shipped().ros2), ("ros1", shipped().ros1)):
+        sample = SampleCodec(streamed(middleware_name, size)).encode(7, 123_456_789)
+        message = (
+            store.deserialize_cdr(sample, TYPE) if middleware_name == "dds" else store.deserialize_ros1(sample, TYPE)
+        )
+        again = (
+            store.serialize_cdr(message, TYPE) if middleware_name == "dds" else store.serialize_ros1(message, TYPE)
+        )
         assert bytes(again) == sample
         data = np.asarray(message.data).tobytes()  # type: ignore[attr-defined]
         assert len(data) == size
@@ -41,8 +45,8 @@ def test_sample_is_a_ros_message(size: int) -> None:
 
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1), st.sampled_from(["dds", "zenoh", "ros1"]))
-def test_sample_can_be_decoded(sequence: int, at_ns: int, over: str) -> None:
-    samples = SampleCodec(streamed(over))
+def test_sample_can_be_decoded(sequence: int, at_ns: int, middleware_name: str) -> None:
+    samples = SampleCodec(streamed(middleware_name))
     assert samples.decode(samples.encode(sequence, at_ns)) == (sequence, at_ns)
 
 
@@ -99,10 +103,10 @@ def logged(path: Path) -> list[tuple[int, int, int, int]]:
 
 
 def published(
-    tmp_path: Path, middleware: FakeMiddleware, what: Stream | None = None
+    tmp_path: Path, middleware: FakeMiddleware, task: Stream | None = None
 ) -> list[tuple[int, int, int, int]]:
     log = Log(str(tmp_path / "log"))
-    stream.publish(middleware, TOPIC, what or streamed(), log, threading.Event())
+    stream.publish(middleware, TOPIC, task or streamed(), log, threading.Event())
     log.end(1)
     return logged(tmp_path / "log")
 
@@ -153,9 +157,9 @@ def test_samples_during_a_blocked_write_are_skipped(tmp_path: Path) -> None:
 
 
 def test_subscription_logs_arriving_samples(tmp_path: Path) -> None:
-    log, over = Log(str(tmp_path / "log")), threading.Event()
-    over.set()
-    stream.subscribe(FakeMiddleware(), TOPIC, streamed(), log, over)
+    log, finished = Log(str(tmp_path / "log")), threading.Event()
+    finished.set()
+    stream.subscribe(FakeMiddleware(), TOPIC, streamed(), log, finished)
     log.end(1)
     size = len(SampleCodec(streamed()).encode(0, 0))
     assert logged(tmp_path / "log") == [
@@ -169,12 +173,12 @@ def test_log_error_in_a_thread_of_the_middleware_stops_the_subscription(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The delivering thread continues, so an ignored error would look like missing samples."""
-    log, over = Log(str(tmp_path / "log")), threading.Event()
+    log, finished = Log(str(tmp_path / "log")), threading.Event()
 
     def fails(*_: int, **__: int) -> None:
         raise LogError("the log cannot be written")
 
     monkeypatch.setattr(log, "note", fails)
     with pytest.raises(LogError, match="cannot be written"):
-        stream.subscribe(FakeMiddleware(), TOPIC, streamed(), log, over)
-    assert over.is_set()
+        stream.subscribe(FakeMiddleware(), TOPIC, streamed(), log, finished)
+    assert finished.is_set()

@@ -18,8 +18,8 @@ numbers = st.integers(-(2**63), 2**63 - 1)
 @given(numbers, numbers, st.binary(min_size=16, max_size=16))
 def test_attachments_are_those_of_zenohs_serializer(sequence: int, at_ns: int, gid: bytes) -> None:
     """`zenoh::ext::Serializer` with the three values that rmw_zenoh uses."""
-    whole = (zenoh.ext.Int64(sequence), zenoh.ext.Int64(at_ns), gid)
-    assert adapter.ATTACHMENT.pack(sequence, at_ns, len(gid), gid) == zenoh.ext.z_serialize(whole).to_bytes()
+    fields = (zenoh.ext.Int64(sequence), zenoh.ext.Int64(at_ns), gid)
+    assert adapter.ATTACHMENT.pack(sequence, at_ns, len(gid), gid) == zenoh.ext.z_serialize(fields).to_bytes()
 
 
 def test_publishers_have_different_identifiers() -> None:

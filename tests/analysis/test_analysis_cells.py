@@ -152,9 +152,9 @@ def test_any_column_can_identify_conditions_and_missing_values_come_first() -> N
 
 def test_intervals_depend_only_on_the_rows_of_their_cell() -> None:
     rows = [replace(UDP, transfer_s=float(n) ** 1.5, byte_loss=n / 97) for n in range(12)]
-    (alone,) = summarize(rows)
+    (cell,) = summarize(rows)
     among = summarize([replace(UDP, distance="1m"), *rows])[1]
-    assert among == alone
+    assert among == cell
 
 
 def test_no_rows_give_no_cells() -> None:

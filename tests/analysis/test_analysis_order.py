@@ -15,10 +15,10 @@ from tests.helpers.tables import ROW, RepeatRow, replace, write
 START_NS = 1_795_262_410_000_000_000
 
 
-def autoregressive(random: np.random.Generator, cells: int, n: int, kept: float) -> independence.Floats:
+def autoregressive(random: np.random.Generator, cells: int, n: int, coefficient: float) -> independence.Floats:
     values = np.zeros((cells, n + 50))
     for at in range(1, n + 50):
-        values[:, at] = kept * values[:, at - 1] + random.normal(size=cells)
+        values[:, at] = coefficient * values[:, at - 1] + random.normal(size=cells)
     return values[:, 50:]
 
 
@@ -64,9 +64,9 @@ def test_about_5_percent_of_the_tables_of_independent_repeats_have_a_mark(n: int
     assert 0.03 < marked < 0.08
 
 
-@pytest.mark.parametrize(("n", "kept", "result"), [(10, 0.8, 48), (20, 0.8, 86), (40, 0.8, 99), (20, 0.5, 51)])
-def test_the_power_for_dependent_repeats_is_that_of_the_docs(n: int, kept: float, result: float) -> None:
-    values = autoregressive(np.random.default_rng(4), 4000, n, kept)
+@pytest.mark.parametrize(("n", "coefficient", "result"), [(10, 0.8, 48), (20, 0.8, 86), (40, 0.8, 99), (20, 0.5, 51)])
+def test_the_power_for_dependent_repeats_is_that_of_the_docs(n: int, coefficient: float, result: float) -> None:
+    values = autoregressive(np.random.default_rng(4), 4000, n, coefficient)
     assert 100 * (independence.p_values(values) < 0.05).mean() == pytest.approx(result, abs=2.5)
 
 
@@ -78,11 +78,11 @@ def test_too_few_repeats_or_values_are_not_tested() -> None:
 
 def rows(times_s: list[float]) -> list[RepeatRow]:
     """Repeats whose rows are not in the order of time."""
-    made = [
+    table = [
         replace(ROW, repeat=1 + n, started_utc_ns=START_NS + n * 10**10, transfer_s=time_s, rtt_median_s=None)
         for n, time_s in enumerate(times_s)
     ]
-    return [made[at] for at in np.random.default_rng(5).permutation(len(made))]
+    return [table[at] for at in np.random.default_rng(5).permutation(len(table))]
 
 
 def test_a_trend_is_reported_in_tables_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,8 +101,8 @@ def test_a_trend_is_reported_in_tables_and_json(tmp_path: Path, capsys: pytest.C
 
 
 def test_repeats_without_start_times_are_not_tested(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    made = rows([1.0 + n for n in range(20)])
-    path = write(tmp_path, [replace(made[0], started_utc_ns=None), *made[1:]])
+    table = rows([1.0 + n for n in range(20)])
+    path = write(tmp_path, [replace(table[0], started_utc_ns=None), *table[1:]])
     assert main(["aggregate", str(path), "--quantity", "transfer_s", "--format", "json"]) == 0
     result = json.loads(capsys.readouterr().out)
     assert result["cautions"] == []

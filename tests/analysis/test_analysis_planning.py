@@ -22,15 +22,16 @@ def half(interval: Interval | None) -> float:
 
 
 @given(st.integers(0, 30), st.integers(1, 30), st.floats(0.01, 0.6))
-def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, wanted: float) -> None:
+def test_a_flag_needs_the_number_of_wilsons_formula(true: int, untrue: int, expected: float) -> None:
     n = true + untrue
     p, z = true / n, scipy.stats.norm.ppf(0.975)
     total = next(
-        many
-        for many in count(n)
-        if z / (1 + z * z / many) * math.sqrt(p * (1 - p) / many + (z / many) ** 2 / 4) <= wanted * (1 + 1e-9)
+        repeats
+        for repeats in count(n)
+        if z / (1 + z * z / repeats) * math.sqrt(p * (1 - p) / repeats + (z / repeats) ** 2 / 4)
+        <= expected * (1 + 1e-9)
     )
-    assert additional_repeats(wilson(true, n), n, wanted, Kind.FLAG) == total - n
+    assert additional_repeats(wilson(true, n), n, expected, Kind.FLAG) == total - n
 
 
 @given(st.integers(2, 25), st.floats(0.2, 1.5))
@@ -39,11 +40,11 @@ def test_students_quantile_decreases_with_more_repeats(n: int, part: float) -> N
     interval = median(times)
     now = half(interval)
 
-    def expected(many: int) -> float:
-        quantile = scipy.stats.t.ppf(0.975, [many - 1, n - 1]) if n < 6 else (1, 1)
-        return float(now * quantile[0] / quantile[1] * math.sqrt(n / many))
+    def expected(repeats: int) -> float:
+        quantile = scipy.stats.t.ppf(0.975, [repeats - 1, n - 1]) if n < 6 else (1, 1)
+        return float(now * quantile[0] / quantile[1] * math.sqrt(n / repeats))
 
-    total = next(many for many in count(n) if expected(many) <= part * now * (1 + 2e-4))
+    total = next(n_repeats for n_repeats in count(n) if expected(n_repeats) <= part * now * (1 + 2e-4))
     assert interval is not None
     assert additional_repeats(interval, n, part * now, Kind.MEDIAN) == pytest.approx(total - n, abs=1)
 

@@ -21,7 +21,7 @@ from fieldkit.trial.rows import to_csv
 from tests.helpers.tables import ROW, parsed, repeats, replace, write
 
 
-def same(first: Repeats, second: Repeats) -> bool:
+def are_equal(first: Repeats, second: Repeats) -> bool:
     texts = all((column == second.texts[name]).all() for name, column in first.texts.items() if name != "source")
     return texts and all(
         np.array_equal(column, second.numbers[name], equal_nan=True) for name, column in first.numbers.items()
@@ -68,10 +68,10 @@ def rows_of_anything(draw: st.DrawFn) -> list[dict[str, Any]]:
 
 @given(rows_of_anything())
 def test_rows_equal_those_read_from_their_table(rows: list[dict[str, Any]]) -> None:
-    made, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
-    assert len(made) == len(rows)
-    assert same(made, read_back)
-    for first, second in ((made.numbers, read_back.numbers), (made.texts, read_back.texts)):
+    expected, read_back = parsed(rows), parse(to_csv(rows, trial_columns()).encode(), trial_columns())
+    assert len(expected) == len(rows)
+    assert are_equal(expected, read_back)
+    for first, second in ((expected.numbers, read_back.numbers), (expected.texts, read_back.texts)):
         assert [(name, column.dtype) for name, column in first.items()] == [
             (name, column.dtype) for name, column in second.items()
         ]
@@ -88,7 +88,7 @@ def test_any_split_into_files_gives_the_same_rows(cuts: list[int]) -> None:
     rows_read = read(
         [Path(str(n)) for n in range(len(parts))], trial_columns(), content=lambda path: contents[int(path.name)]
     )
-    assert same(rows_read, parsed(rows))
+    assert are_equal(rows_read, parsed(rows))
     assert aggregate(rows_read) == aggregate(parsed(rows))
 
 
@@ -107,7 +107,7 @@ def test_a_table_saved_by_a_spreadsheet_is_read(tmp_path: Path, spell: Callable[
     before = read(paths, trial_columns())
     paths[0].write_text(spell(paths[0].read_text(encoding="utf-8")), encoding="utf-8", newline="")
     rows_read = read(paths, trial_columns())
-    assert same(rows_read, before)
+    assert are_equal(rows_read, before)
     assert list(rows_read.texts["source"]) == list(before.texts["source"])
 
 
@@ -137,10 +137,10 @@ def test_the_error_of_a_damaged_line_names_file_and_line(
 def test_a_table_truncated_in_its_last_line_is_refused_or_lacks_that_line(tmp_path: Path) -> None:
     """A truncated last cell of a row can be another valid number: 1533679 of 15336791.6."""
     path = write(tmp_path / "a", repeats(ROW, 2))
-    whole = path.read_bytes()
-    last = whole.rindex(b"\n", 0, -1) + 1
-    for end in range(last, len(whole)):
-        path.write_bytes(whole[:end])
+    content = path.read_bytes()
+    last = content.rindex(b"\n", 0, -1) + 1
+    for end in range(last, len(content)):
+        path.write_bytes(content[:end])
         if end == last:
             assert len(read([path], trial_columns())) == 1
             continue
@@ -204,11 +204,11 @@ def test_a_large_table_is_read_block_by_block_to_the_same_rows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     table = write(tmp_path, [replace(ROW, repeat=1 + n, sender=f"robot {n}") for n in range(50)])
-    whole = read([table], trial_columns())
+    all_rows = read([table], trial_columns())
     monkeypatch.setattr(table_files, "_BATCH_BYTES", 1000)
     blocks = read([table], trial_columns())
-    assert same(blocks, whole)
-    assert (blocks.texts["source"] == whole.texts["source"]).all()
+    assert are_equal(blocks, all_rows)
+    assert (blocks.texts["source"] == all_rows.texts["source"]).all()
 
 
 def test_a_damaged_line_of_a_large_table_has_its_number_in_the_whole_file(

@@ -19,7 +19,7 @@ BURSTY = np.array([0, 0, 20, 1, 0, 0, 9, 0, 2, 0, 0, 0, 31, 0, 0, 4, 0, 0, 0, 0]
 SKEWED = np.random.default_rng(3).gamma(4, size=60)
 
 
-def there(interval: Interval | None) -> Interval:
+def not_none(interval: Interval | None) -> Interval:
     assert interval is not None
     return interval
 
@@ -56,7 +56,7 @@ def test_student_equals_scipy() -> None:
 @pytest.mark.parametrize("sent", [np.full(20, 36), np.arange(33, 53)], ids=["equal", "unequal"])
 def test_a_share_s_interval_contains_the_values_that_a_score_test_accepts(sent: np.ndarray) -> None:
     """The bounds solve |share - p| = t sqrt(p (1 - p) / trials), found here by bisection."""
-    interval = there(share(BURSTY, sent))
+    interval = not_none(share(BURSTY, sent))
     rate = BURSTY.sum() / sent.sum()
     off = BURSTY - rate * sent
     variance = np.var(off, ddof=1) * len(sent) / sent.sum() ** 2
@@ -72,7 +72,7 @@ def test_a_share_s_interval_contains_the_values_that_a_score_test_accepts(sent: 
 
 
 def test_bursts_make_the_interval_wider_than_wilsons() -> None:
-    bursty, spread = there(share(BURSTY, [36] * 20)), wilson(int(BURSTY.sum()), 720)
+    bursty, spread = not_none(share(BURSTY, [36] * 20)), wilson(int(BURSTY.sum()), 720)
     assert bursty.low < spread.low < spread.high < bursty.high
     assert bursty.high - bursty.low > 3 * (spread.high - spread.low)
 
@@ -80,7 +80,7 @@ def test_bursts_make_the_interval_wider_than_wilsons() -> None:
 def test_repeats_that_agree_give_nearly_wilsons_interval() -> None:
     """Only the squared ratio of the t quantile to the normal quantile remains as a difference."""
     lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
-    ours, theirs = there(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
+    ours, theirs = not_none(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
     assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-3)
 
 
@@ -92,7 +92,7 @@ def test_if_nothing_or_all_is_lost_a_repeat_is_one_trial(n: int) -> None:
 
 
 def test_one_repeat_that_lost_everything_gives_a_wide_interval() -> None:
-    interval = there(share([36] + [0] * 19, [36] * 20))
+    interval = not_none(share([36] + [0] * 19, [36] * 20))
     assert interval.value == 0.05
     assert 0 < interval.low < 0.005
     assert 0.3 < interval.high < 0.7
@@ -100,14 +100,14 @@ def test_one_repeat_that_lost_everything_gives_a_wide_interval() -> None:
 
 @pytest.mark.parametrize(("lost", "sent"), [(1, 36), (7, 157)])  # the second share is not exact in binary
 def test_two_equal_repeats_are_not_certain(lost: int, sent: int) -> None:
-    interval = there(share([lost, lost], [sent, sent]))
+    interval = not_none(share([lost, lost], [sent, sent]))
     assert interval.low < interval.value / 5
     assert interval.high > 5 * interval.value
 
 
 def test_many_small_repeats_and_a_large_one_count_as_few() -> None:
     """Kish: (30 + 19)^2 / (30^2 + 19) trials, not 20."""
-    interval = there(share([0] * 20, [30] + [1] * 19))
+    interval = not_none(share([0] * 20, [30] + [1] * 19))
     assert interval.high == pytest.approx(wilson(0, 1000).high * 1000 / (49**2 / 919), rel=0.7)
     assert interval.high > 2 * wilson(0, 20).high
 
@@ -115,16 +115,16 @@ def test_many_small_repeats_and_a_large_one_count_as_few() -> None:
 @given(repeats)
 def test_bounds_of_a_share_enclose_it(some: list[tuple[int, int]]) -> None:
     lost, sent = np.array(some).T
-    interval = there(share(lost, sent))
+    interval = not_none(share(lost, sent))
     assert 0 <= interval.low <= interval.value <= interval.high <= 1
-    kept = there(share(sent - lost, sent))
-    assert (1 - kept.high, 1 - kept.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
+    bound = not_none(share(sent - lost, sent))
+    assert (1 - bound.high, 1 - bound.low) == pytest.approx((interval.low, interval.high), abs=1e-9)
 
 
 @pytest.mark.parametrize("lost", [7, 15])
 def test_equal_repeats_are_not_distinguished_by_rounding(lost: int) -> None:
     """22 times a share of 15/22 is not exactly 15; the losses are then assumed to be independent."""
-    interval = there(share([lost] * 2, [22] * 2))
+    interval = not_none(share([lost] * 2, [22] * 2))
     assert interval.high - interval.low > 0.5
 
 
@@ -139,39 +139,39 @@ def test_shares_are_means_if_one_is_outside_of_0_to_1() -> None:
 
 
 def test_without_skewness_a_mean_has_students_interval() -> None:
-    interval = there(mean([1.0, -1.0] * 10))
+    interval = not_none(mean([1.0, -1.0] * 10))
     theirs = scipy.stats.t.interval(0.95, 19, 0, scipy.stats.sem([1.0, -1.0] * 10))
     assert (interval.low, interval.high) == pytest.approx(theirs, rel=1e-4)
 
 
 def test_a_mean_has_the_bootstrap_t_interval() -> None:
     """Computed here by resampling: the mean of each sample divided by its standard error."""
-    drawn = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
-    t = (drawn.mean(axis=1) - SKEWED.mean()) / scipy.stats.sem(drawn, axis=1)
+    samples = SKEWED[np.random.default_rng(4).integers(60, size=(40_000, 60))]
+    t = (samples.mean(axis=1) - SKEWED.mean()) / scipy.stats.sem(samples, axis=1)
     high, low = SKEWED.mean() - np.quantile(t, (0.025, 0.975)) * scipy.stats.sem(SKEWED)
-    interval = there(mean(SKEWED))
+    interval = not_none(mean(SKEWED))
     assert interval.value == SKEWED.mean()
     assert (interval.low, interval.high) == pytest.approx((low, high), abs=0.05 * (high - low))
 
 
 @given(values, st.floats(-100, 100), st.floats(0.01, 100))
 def test_a_mean_is_shifted_and_scaled_with_its_values(some: list[float], shift: float, factor: float) -> None:
-    plain, moved = there(mean(some)), there(mean(shift + factor * np.array(some)))
-    assert plain.low <= plain.value <= plain.high
+    original, moved = not_none(mean(some)), not_none(mean(shift + factor * np.array(some)))
+    assert original.low <= original.value <= original.high
     size = factor * (np.abs(some).max() + abs(shift) + 1)
-    ends = (shift + factor * plain.low, shift + factor * plain.high)
+    ends = (shift + factor * original.low, shift + factor * original.high)
     assert (moved.low, moved.high) == pytest.approx(ends, rel=1e-3, abs=1e-3 * size)
 
 
 def test_the_mean_of_tiny_values_has_a_tiny_interval() -> None:
-    tiny, plain = there(mean([0, 1e-170, 3e-170])), there(mean([0, 1, 3]))
-    assert (tiny.low, tiny.high) == pytest.approx((1e-170 * plain.low, 1e-170 * plain.high), rel=1e-9, abs=0)
+    tiny, original = not_none(mean([0, 1e-170, 3e-170])), not_none(mean([0, 1, 3]))
+    assert (tiny.low, tiny.high) == pytest.approx((1e-170 * original.low, 1e-170 * original.high), rel=1e-9, abs=0)
 
 
 @pytest.mark.parametrize("n", [6, 7, 20, 21, 400])
 def test_a_median_lies_between_the_two_nearest_order_intervals(n: int) -> None:
     ordered = np.arange(1.0, n + 1)
-    interval = there(median(ordered[::-1]))
+    interval = not_none(median(ordered[::-1]))
     outer = scipy.stats.quantile_test(ordered, p=0.5).confidence_interval(0.95)
     assert interval.value == np.median(ordered)
     assert outer.low <= interval.low < outer.low + 1
@@ -183,11 +183,11 @@ def test_a_median_lies_between_the_two_nearest_order_intervals(n: int) -> None:
 def test_few_repeats_have_students_interval_for_a_median_and_all_repeats_in_it(n: int) -> None:
     times = SKEWED[:n]
     low, high = scipy.stats.t.interval(0.95, n - 1, times.mean(), scipy.stats.sem(times))
-    interval = there(median(times))
+    interval = not_none(median(times))
     assert (interval.low, interval.high) == pytest.approx(
         (min(low, times.min()), max(high, times.max())), rel=1e-3, abs=1e-3
     )
-    assert there(median(times, least=0)).low == max(0, interval.low)
+    assert not_none(median(times, least=0)).low == max(0, interval.low)
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=30))
@@ -195,7 +195,7 @@ def test_few_repeats_have_students_interval_for_a_median_and_all_repeats_in_it(n
 @example([0.1] * 3)  # the sum of three is not three times the value
 @example([0.7] * 20)
 def test_bounds_enclose_a_median(some: list[float]) -> None:
-    interval = there(median(some))
+    interval = not_none(median(some))
     assert interval.low <= interval.value <= interval.high
 
 

@@ -24,27 +24,27 @@ GAP = (*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS)
 RTT = tuple(column for column in (*ping.COLUMNS, *ping.SENT_COLUMNS) if "median" in column.name)
 NAN = math.nan
 
-Known = float | None
+OptionalValue = float | None
 """A value, or None if it is missing."""
 
 
-def repeats_of(declared: Sequence[Column], **values: Sequence[Known]) -> Repeats:
+def repeats_of(declared: Sequence[Column], **values: Sequence[OptionalValue]) -> Repeats:
     """Return valid UDP repeats with these values by column."""
     n = len(next(iter(values.values())))
     numbers = {column.name: np.full(n, NAN) for column in declared}
-    numbers |= {name: np.array(given, dtype=np.float64) for name, given in values.items()}
+    numbers |= {name: np.array(repeat_values, dtype=np.float64) for name, repeat_values in values.items()}
     texts = {"protocol": np.full(n, "udp", np.object_), "status": np.full(n, ENDED[0], np.object_)}
     return Repeats(numbers, texts, tuple(declared))
 
 
-def gaps(ended: Sequence[float], still_open: Sequence[float] = (), missing: int = 0) -> Cell:
+def gaps(closed: Sequence[float], still_open: Sequence[float] = (), missing: int = 0) -> Cell:
     """Return the cell of repeats with an ended, an open or no longest gap."""
     none = [None] * missing
     (cell,) = aggregate(
         repeats_of(
             GAP,
-            rtt_gap_s=[*ended, *(None for _ in still_open), *none],
-            rtt_gap_at_least_s=[*(None for _ in ended), *still_open, *none],
+            rtt_gap_s=[*closed, *(None for _ in still_open), *none],
+            rtt_gap_at_least_s=[*(None for _ in closed), *still_open, *none],
         ),
         BY,
     )
@@ -69,8 +69,8 @@ def test_a_median_of_open_gaps_is_a_lower_bound() -> None:
     estimate = gaps([0.2] * 4, [2.0, 2.5, 2.8, 2.9, 3.0, 3.1]).estimates["rtt_gap_s"]
     assert (estimate.value, estimate.is_lower_bound) == (2.25, True)
     scale = wording.scale_of(estimate.quantity, [estimate.value])
-    shown = wording.with_interval(wording.amount(scale, estimate), scale, estimate)
-    assert shown == ">= 2250 ms [200, ...) (6 of 10 not ended)"
+    text = wording.with_interval(wording.amount(scale, estimate), scale, estimate)
+    assert text == ">= 2250 ms [200, ...) (6 of 10 not ended)"
 
 
 @given(
@@ -106,10 +106,10 @@ def test_missing_repeats_are_counted_in_all_outputs() -> None:
     result = judged("rtt_gap_s < 2 s", cell)
     assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
     assert wording.judgement_texts(result)[2] == "200 ms (8 of 10)"
-    shown = [Quantity.of(column) for column in GAP]
-    markdown = paper_tables.to_markdown(BY, [cell], [quantity for quantity in shown if quantity])
+    quantities = [Quantity.of(column) for column in GAP]
+    markdown = paper_tables.to_markdown(BY, [cell], [quantity for quantity in quantities if quantity])
     assert "(8 of 10)" in markdown
-    assert "(8 of 10)" in paper_tables.to_latex(BY, [cell], [quantity for quantity in shown if quantity])
+    assert "(8 of 10)" in paper_tables.to_latex(BY, [cell], [quantity for quantity in quantities if quantity])
     (written,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
     assert (written["n_valid"], written["estimates"]["rtt_gap_s"]["n"]) == (10, 8)
 
@@ -119,9 +119,9 @@ def test_open_gaps_are_in_every_table_format() -> None:
     (written,) = json.loads(result_tables.to_json(BY, [cell]))["cells"]
     estimate = written["estimates"]["rtt_gap_s"]
     assert (estimate["n_censored"], estimate["is_lower_bound"], estimate["high"]) == (5, True, None)
-    shown = [quantity for column in GAP if (quantity := Quantity.of(column))]
-    assert "| >= 1500 [200, ...) (5 of 7 not ended) |" in paper_tables.to_markdown(BY, [cell], shown)
-    assert r"$\geq$ 1500 [200, ...) (5 of 7 not ended)" in paper_tables.to_latex(BY, [cell], shown)
+    quantities = [quantity for column in GAP if (quantity := Quantity.of(column))]
+    assert "| >= 1500 [200, ...) (5 of 7 not ended) |" in paper_tables.to_markdown(BY, [cell], quantities)
+    assert r"$\geq$ 1500 [200, ...) (5 of 7 not ended)" in paper_tables.to_latex(BY, [cell], quantities)
     head, row, *_ = result_tables.to_csv(BY, [cell]).splitlines()
     by_name = dict(zip(head.split(","), row.split(","), strict=True))
     assert (by_name["high"], by_name["n_censored"], by_name["is_lower_bound"]) == ("", "5", "true")
@@ -137,23 +137,23 @@ TEXTS = [
 
 @given(st.lists(DELAYS, max_size=12), st.lists(DELAYS, max_size=4), st.integers(0, 4), st.sampled_from(TEXTS))
 def test_no_expectation_holds_on_missing_or_open_repeats(
-    ended: list[float], still_open: list[float], missing: int, text: str
+    closed: list[float], still_open: list[float], missing: int, text: str
 ) -> None:
-    if not (ended or still_open or missing):
+    if not (closed or still_open or missing):
         return
-    result = judged(text, gaps(ended, still_open, missing))
+    result = judged(text, gaps(closed, still_open, missing))
     if still_open or missing:
         assert not result.holds
         assert "of" in result.why
 
 
-def rtt(medians_s: Sequence[Known], of_sent_s: Sequence[Known]) -> Cell:
+def rtt(medians_s: Sequence[OptionalValue], of_sent_s: Sequence[OptionalValue]) -> Cell:
     (cell,) = aggregate(repeats_of(RTT, rtt_median_s=medians_s, rtt_median_sent_s=of_sent_s), BY)
     return cell
 
 
 @pytest.mark.parametrize(
-    ("of_sent_s", "ruling", "why"),
+    ("of_sent_s", "ruling", "reason"),
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
@@ -167,11 +167,11 @@ def rtt(medians_s: Sequence[Known], of_sent_s: Sequence[Known]) -> Cell:
     ],
 )
 def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
-    of_sent_s: list[Known], ruling: Ruling, why: str
+    of_sent_s: list[OptionalValue], ruling: Ruling, reason: str
 ) -> None:
     cell = rtt([0.1] * 10, of_sent_s)
     result = judged("rtt_median_s < 200 ms", cell, RTT)
-    assert (result.ruling, result.why) == (ruling, why)
+    assert (result.ruling, result.why) == (ruling, reason)
     assert result.estimate is not None
     assert (result.estimate.value, result.estimate.high) == (0.1, 0.1), "the figure itself is unchanged"
     assert judged("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS

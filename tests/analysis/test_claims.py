@@ -14,15 +14,15 @@ GAP = Quantity("rtt_gap_s", "longest gap", Kind.MEDIAN, "s")
 BACK = Quantity("link_down_recovered", "back after link-down", Kind.FLAG, "share")
 RATE = Quantity("goodput_bit_s", "goodput", Kind.MEDIAN, "bit/s")
 RETRIES = Quantity("retries", "retries", Kind.MEAN, "count")
-KNOWN = (PACKETS, GAP, BACK, RATE, RETRIES)
+QUANTITIES = (PACKETS, GAP, BACK, RATE, RETRIES)
 
 
 def warning(text: str, repeats: int) -> str:
-    return " ".join(sample_size.unmet_requirements([expectations.parse(text, KNOWN)], KNOWN, repeats))
+    return " ".join(sample_size.unmet_requirements([expectations.parse(text, QUANTITIES)], QUANTITIES, repeats))
 
 
 @pytest.mark.parametrize(
-    ("text", "repeats", "shown"),
+    ("text", "repeats", "message"),
     [
         (
             "90 % of rtt_gap_s < 300 ms",
@@ -74,12 +74,12 @@ def warning(text: str, repeats: int) -> str:
         ("retries < 3", 2, ""),
     ],
 )  # fmt: skip
-def test_the_needs_of_an_expectation_are_reported_before_a_trial(text: str, repeats: int, shown: str) -> None:
-    assert warning(text, repeats) == (shown and f"expected {text}: {shown}")
+def test_the_needs_of_an_expectation_are_reported_before_a_trial(text: str, repeats: int, message: str) -> None:
+    assert warning(text, repeats) == (message and f"expected {text}: {message}")
 
 
 @given(st.integers(1, 60), st.integers(1, 60))
 def test_without_a_warning_a_perfect_trial_holds_and_with_one_it_does_not(percent: int, repeats: int) -> None:
     for text in (f"ip_loss < {percent} %", f"{percent} % of ip_loss < 1 %"):
-        (judgement,) = judgements.judge([expectations.parse(text, KNOWN)], [losses(*[0] * repeats)])
+        (judgement,) = judgements.judge([expectations.parse(text, QUANTITIES)], [losses(*[0] * repeats)])
         assert (judgement.ruling is Ruling.HOLDS) is (warning(text, repeats) == "")

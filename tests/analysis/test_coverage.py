@@ -40,8 +40,8 @@ def lost_in_bursts(
     bad = random.random(shape) < rate
     lost = bad.astype(np.int64)
     for _ in range(packets - 1):
-        drawn = random.random(shape, dtype=np.float32)
-        bad = np.where(bad, drawn >= recovers, drawn < fails)
+        uniform = random.random(shape, dtype=np.float32)
+        bad = np.where(bad, uniform >= recovers, uniform < fails)
         lost += bad
     return lost
 
@@ -146,8 +146,8 @@ TIMES: Final[dict[str, tuple[Draw, float, float]]] = {
 def percentile_bootstrap(random: np.random.Generator, values: Floats) -> Intervals:
     """Return percentile bootstrap intervals of means; all cells share their 1,000 draws."""
     n = values.shape[1]
-    drawn = values @ random.multinomial(n, np.full(n, 1 / n), 1000).T / n
-    low, high = np.quantile(drawn, (0.025, 0.975), axis=1)
+    means = values @ random.multinomial(n, np.full(n, 1 / n), 1000).T / n
+    low, high = np.quantile(means, (0.025, 0.975), axis=1)
     return Intervals(values.mean(axis=1), low, high)
 
 
@@ -155,10 +155,10 @@ def percentile_bootstrap(random: np.random.Generator, values: Floats) -> Interva
 def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Callable[[str, object], None]) -> None:
     random = np.random.default_rng(14)
     draw, mean, middle = TIMES[name]
-    drawn = [draw(random, (CELLS, n)) for n in (5, 10, REPEATS)]
-    of_mean = [covered(means(values), mean) for values in drawn]
-    of_median = [covered(medians(values), middle) for values in drawn]
-    plain = covered(percentile_bootstrap(random, drawn[-1]), mean)
+    samples = [draw(random, (CELLS, n)) for n in (5, 10, REPEATS)]
+    of_mean = [covered(means(values), mean) for values in samples]
+    of_median = [covered(medians(values), middle) for values in samples]
+    plain = covered(percentile_bootstrap(random, samples[-1]), mean)
     record_property(
         "result", f"mean, {name}, 5, 10, 20 repeats: {rounded(of_mean)}, percentile bootstrap {plain:.1f}"
     )
@@ -174,10 +174,10 @@ def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Call
     random = np.random.default_rng(15)
     packets, rate = 215, 0.35
     middle = float(np.median(lost_in_bursts(random, rate, burst, (1, 100_000), packets))) / packets
-    drawn = [lost_in_bursts(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
-    of_mean = [covered(mean_shares(values), rate) for values in drawn]
-    of_median = [covered(medians(values), middle) for values in drawn]
-    plain = covered(percentile_bootstrap(random, drawn[-1]), rate)
+    shares = [lost_in_bursts(random, rate, burst, (CELLS, n), packets) / packets for n in (5, 10, REPEATS)]
+    of_mean = [covered(mean_shares(values), rate) for values in shares]
+    of_median = [covered(medians(values), middle) for values in shares]
+    plain = covered(percentile_bootstrap(random, shares[-1]), rate)
     record_property("result", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
     assert all(BAND[0] <= percentage <= BAND[1] for percentage in of_mean)
     assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)

@@ -42,7 +42,7 @@ def times(median: float, spread: float) -> Draw:
     return lambda random, shape: median * random.lognormal(0, spread, shape)
 
 
-def lost(values: Floats) -> Intervals:
+def loss_intervals(values: Floats) -> Intervals:
     return shares(values, np.full_like(values, PACKETS))
 
 
@@ -60,10 +60,10 @@ def mean(loss: float, length: float) -> float:
 @pytest.mark.parametrize(
     ("a", "b", "estimates", "true"),
     [
-        (drifting(0.08), drifting(0.05), lost, lambda: -0.03),
-        (drifting(0.30), drifting(0.10), lost, lambda: -0.20),
-        (bursts(0.05, 8), bursts(0.02, 8), lost, lambda: mean(0.02, 8) - mean(0.05, 8)),
-        (independent(0.05), bursts(0.05, 8), lost, lambda: mean(0.05, 8) - 0.05),
+        (drifting(0.08), drifting(0.05), loss_intervals, lambda: -0.03),
+        (drifting(0.30), drifting(0.10), loss_intervals, lambda: -0.20),
+        (bursts(0.05, 8), bursts(0.02, 8), loss_intervals, lambda: mean(0.02, 8) - mean(0.05, 8)),
+        (independent(0.05), bursts(0.05, 8), loss_intervals, lambda: mean(0.05, 8) - 0.05),
         (times(0.010, 0.5), times(0.013, 1.0), medians, lambda: 0.003),
         (times(0.010, 0.2), times(0.013, 1.2), medians, lambda: 0.003),
     ],
@@ -85,7 +85,7 @@ def test_an_interval_of_twenty_repeats_each_covers(
 
 @pytest.mark.parametrize(
     ("draw", "estimates"),
-    [(bursts(0.05, 8), lost), (drifting(0.05), lost), (times(0.01, 0.3), medians)],
+    [(bursts(0.05, 8), loss_intervals), (drifting(0.05), loss_intervals), (times(0.01, 0.3), medians)],
     ids=["bursts", "drift", "times"],
 )
 def test_twenty_comparisons_of_equal_runs_have_a_false_positive_in_5_percent(

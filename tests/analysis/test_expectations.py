@@ -19,7 +19,7 @@ LOSS = Quantity("up.file_loss", "up: file loss", Kind.MEAN, "share")
 RTT = Quantity("rtt_median_s", "RTT", Kind.MEDIAN, "s")
 SIGNAL = Quantity("signal_dbm", "signal", Kind.MEDIAN, "dBm")
 PACKETS = Quantity("ip_loss", "IP packet loss", Kind.COUNTED, "share", "ip_packets_received", "ip_packets_sent")
-KNOWN = (LOSS, RTT, SIGNAL, PACKETS)
+QUANTITIES = (LOSS, RTT, SIGNAL, PACKETS)
 
 
 def estimate(quantity: Quantity, value: float, low: float | None, high: float | None) -> Estimate:
@@ -45,7 +45,7 @@ def cell(protocol: str, *estimates: Estimate) -> Cell:
 def test_the_text_of_an_expectation_is_parsed(
     text: str, name: str, is_below: bool, bound: float, protocol: str | None
 ) -> None:
-    result = expectations.parse(text, KNOWN)
+    result = expectations.parse(text, QUANTITIES)
     assert (result.quantity, result.is_below, result.protocol) == (name, is_below, protocol)
     assert result.bound == pytest.approx(bound)
 
@@ -81,7 +81,7 @@ def test_the_text_of_an_expectation_is_parsed(
 )
 def test_an_invalid_text_is_an_error_with_a_remedy(text: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message) as caught:
-        expectations.parse(text, KNOWN)
+        expectations.parse(text, QUANTITIES)
     assert caught.value.remedy
 
 
@@ -96,7 +96,7 @@ def test_an_invalid_text_is_an_error_with_a_remedy(text: str, message: str) -> N
     ],
 )
 def test_the_whole_interval_decides(low: float | None, high: float | None, below: Ruling, above: Ruling) -> None:
-    demanded = [expectations.parse(f"up.file_loss {sign} 2 %", KNOWN) for sign in "<>"]
+    demanded = [expectations.parse(f"up.file_loss {sign} 2 %", QUANTITIES) for sign in "<>"]
     result = judgements.judge(demanded, [cell("tcp", estimate(LOSS, 0.01, low, high))])
     assert [item.ruling for item in result] == [below, above]
 
@@ -104,7 +104,7 @@ def test_the_whole_interval_decides(low: float | None, high: float | None, below
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1))
 def test_nothing_both_holds_and_fails(first: float, second: float, bound: float) -> None:
     low, high = sorted((first, second))
-    demanded = [expectations.parse(f"signal_dbm {sign} {bound:.6f} dBm", KNOWN) for sign in "<>"]
+    demanded = [expectations.parse(f"signal_dbm {sign} {bound:.6f} dBm", QUANTITIES) for sign in "<>"]
     cells = [cell("tcp", estimate(SIGNAL, low, low, high))]
     below, above = (item.ruling for item in judgements.judge(demanded, cells))
     assert not (below is Ruling.HOLDS and above is Ruling.HOLDS)
@@ -127,7 +127,7 @@ def test_nothing_both_holds_and_fails(first: float, second: float, bound: float)
     ],
 )
 def test_the_scope_of_an_expectation(text: str, scope: Scope, is_inclusive: bool, share: float | None) -> None:
-    result = expectations.parse(text, KNOWN)
+    result = expectations.parse(text, QUANTITIES)
     assert (result.scope, result.is_inclusive, result.share) == (scope, is_inclusive, share)
 
 
@@ -137,12 +137,12 @@ def losses(*lost: int, sent: int = 1250) -> Cell:
         replace(ROW, repeat=number, ip_packets_sent=sent, ip_packets_received=sent - item, ip_loss=item / sent)
         for number, item in enumerate(lost, 1)
     ]
-    (made,) = aggregate(parsed(rows), ("protocol",), quantities=[PACKETS])
-    return made
+    (cell,) = aggregate(parsed(rows), ("protocol",), quantities=[PACKETS])
+    return cell
 
 
 def ruling(text: str, cell_: Cell) -> Ruling:
-    (judgement,) = judgements.judge([expectations.parse(text, KNOWN)], [cell_])
+    (judgement,) = judgements.judge([expectations.parse(text, QUANTITIES)], [cell_])
     return judgement.ruling
 
 
@@ -155,7 +155,7 @@ def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     assert ruling(gate, losses(25, 25, 25, 25, 25, 25)) is Ruling.FAILS
     assert ruling("ip_loss <= 2 % of all packets", losses(25, 25, 25, 25, 25, 25)) is Ruling.OPEN
     assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
-    (few,) = judgements.judge([expectations.parse(gate, KNOWN)], [losses(0, 0, sent=100)])
+    (few,) = judgements.judge([expectations.parse(gate, QUANTITIES)], [losses(0, 0, sent=100)])
     assert wording.judgement_texts(few)[2:] == (
         "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, at least 1498 are needed",
     )  # fmt: skip
@@ -174,7 +174,7 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
 
 
 @pytest.mark.parametrize(
-    ("lost", "every", "most"),
+    ("lost", "every", "share"),
     [
         ([0] * 29, Ruling.HOLDS, Ruling.HOLDS),
         ([0] * 28, Ruling.HOLDS, Ruling.OPEN),
@@ -184,18 +184,18 @@ def test_fewer_losses_never_make_a_ruling_worse(pairs: list[tuple[int, int]], te
         ([25] * 29, Ruling.FAILS, Ruling.FAILS),
     ],
 )
-def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, most: Ruling) -> None:
+def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, share: Ruling) -> None:
     assert ruling("every ip_loss < 2 %", losses(*lost)) is every
-    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is most
+    assert ruling("90 % of ip_loss < 2 %", losses(*lost)) is share
 
 
 def test_the_measured_value_is_shown_for_each_scope() -> None:
     cells = losses(0, 0, 0, 50)
-    shown = {
-        text: wording.judgement_texts(judgements.judge([expectations.parse(text, KNOWN)], [cells])[0])[2:]
+    values = {
+        text: wording.judgement_texts(judgements.judge([expectations.parse(text, QUANTITIES)], [cells])[0])[2:]
         for text in ("max ip_loss < 5 %", "90 % of ip_loss < 5 %", "ip_loss < 5 % of all packets")
     }
-    assert shown == {
+    assert values == {
         "max ip_loss < 5 %": ("4.00 %", "", "holds"),
         "90 % of ip_loss < 5 %": (
             "4 of 4 repeats",
@@ -208,13 +208,13 @@ def test_the_measured_value_is_shown_for_each_scope() -> None:
 
 def test_only_one_protocol_is_judged_and_a_missing_figure_is_undecided() -> None:
     cells = [cell("tcp", estimate(RTT, 0.002, 0.001, 0.003)), cell("udp")]
-    (alone,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", KNOWN)], cells)
-    assert alone.holds
-    both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", KNOWN)], cells)
+    (single,) = judgements.judge([expectations.parse("tcp rtt_median_s < 5 ms", QUANTITIES)], cells)
+    assert single.holds
+    both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", QUANTITIES)], cells)
     assert [item.ruling for item in both] == [Ruling.HOLDS, Ruling.OPEN]
     assert [wording.judgement_texts(item)[1:] for item in both] == [
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "undecided: 0 of 5 repeats have a value"),
     ]
-    (judgement,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", KNOWN)], cells[:1])
+    (judgement,) = judgements.judge([expectations.parse("udp rtt_median_s < 5 ms", QUANTITIES)], cells[:1])
     assert judgement.ruling is Ruling.OPEN

@@ -34,7 +34,7 @@ COLUMNS = {column.name: column for column in trial_columns()}
 
 
 @pytest.mark.parametrize(
-    ("name", "text", "why"),
+    ("name", "text", "reason"),
     [
         ("ip_loss", "-38460", "not from 0 to 1"),
         ("file_loss", "5", "not from -1000 to 1"),
@@ -56,7 +56,7 @@ COLUMNS = {column.name: column for column in trial_columns()}
         ("goodput_bit_s", "-1", "not from 0 to 1e+15"),
     ],
 )
-def test_the_error_of_an_impossible_value_names_its_place(tmp_path: Path, name: str, text: str, why: str) -> None:
+def test_the_error_of_an_impossible_value_names_its_place(tmp_path: Path, name: str, text: str, reason: str) -> None:
     path = write(tmp_path, repeats(ROW, 4))
     with path.open(encoding="utf-8", newline="") as file:
         lines = list(csv.DictReader(file))
@@ -69,7 +69,7 @@ def test_the_error_of_an_impossible_value_names_its_place(tmp_path: Path, name: 
         read([path], trial_columns())
     assert caught.value.where == f"{path}:4"
     assert caught.value.what.startswith(f"{name} is '{text[:40]}")
-    assert caught.value.what.endswith(f", {why}")
+    assert caught.value.what.endswith(f", {reason}")
     assert "fieldkit rebuild TRIAL" in caught.value.remedy
 
 
@@ -269,8 +269,8 @@ NUMBERS = [column for column in trial_columns() if column.type is not str]
 
 @given(st.sampled_from(NUMBERS).flatmap(lambda column: st.tuples(st.just(column), likely(column))))
 @settings(max_examples=examples(60))
-def test_every_column_accepts_exactly_its_possible_values(drawn: tuple[Column, str]) -> None:
-    column, text = drawn
+def test_every_column_accepts_exactly_its_possible_values(column_and_cell: tuple[Column, str]) -> None:
+    column, text = column_and_cell
     line = dict.fromkeys(COLUMNS, "") | {"status": "valid", column.name: text}
     content = _text([line]).encode()
     problem = column.invalid_value_reason(text)

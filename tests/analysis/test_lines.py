@@ -33,18 +33,18 @@ def cells_of(table: Sequence[RepeatRow]) -> tuple[Cell, ...]:
     return aggregate(repeats.parse(rows.to_csv(table, trial_columns()).encode(), trial_columns()))
 
 
-def shown(cells: Sequence[Cell], chosen: Sequence[table_lines.TableLine]) -> dict[str, list[str]]:
+def texts_by_label(cells: Sequence[Cell], chosen: Sequence[table_lines.TableLine]) -> dict[str, list[str]]:
     return {line.label: [line.amount(cell, line.scale(cells)) for cell in cells] for line in chosen}
 
 
 def test_a_round_trip_time_has_the_payload_size() -> None:
-    figures = shown(cells := cells_of([TCP, PINGED]), table_lines.lines(cells))
+    figures = texts_by_label(cells := cells_of([TCP, PINGED]), table_lines.lines(cells))
     assert figures["RTT, 502-byte ping, median"] == ["10.00 ms", ""]
     assert figures["RTT, 8192-byte ping, median"] == ["", "10.00 ms"]
 
 
 def test_the_label_has_the_range_of_payload_sizes() -> None:
-    figures = shown(
+    figures = texts_by_label(
         cells := cells_of([PINGED, replace(PINGED, repeat=2, rtt_payload_bytes=56)]), table_lines.lines(cells)
     )
     assert [label for label in figures if "RTT" in label] == ["RTT, 56- to 8192-byte ping, median"]
@@ -52,15 +52,15 @@ def test_the_label_has_the_range_of_payload_sizes() -> None:
 
 @pytest.mark.parametrize("form", ["markdown", "latex"])
 def test_tables_for_papers_have_payload_size_and_number_of_repeats(form: str) -> None:
-    made = {"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex}[form]
+    to_text = {"markdown": paper_tables.to_markdown, "latex": paper_tables.to_latex}[form]
     table = [
         PINGED,
         *(replace(PINGED, repeat=2 + n, rtt_loss=1.0, rtt_received=0, rtt_median_s=None) for n in (0, 1)),
     ]
-    text = made(DEFAULT_BY, cells_of(table), quantities(trial_columns()))
+    text = to_text(DEFAULT_BY, cells_of(table), quantities(trial_columns()))
     assert "RTT, 8192-byte ping, median (ms)" in text
     assert "10.00 (1 of 3)" in text
-    text = made(DEFAULT_BY, cells_of(table[1:]), quantities(trial_columns()))
+    text = to_text(DEFAULT_BY, cells_of(table[1:]), quantities(trial_columns()))
     assert "none, 0 of 2" in text
 
 
@@ -76,10 +76,10 @@ def test_a_condition_without_any_reply_is_shown(tmp_path: Path, capsys: pytest.C
 
 def test_radio_losses_of_tcp_and_udp_are_one_line_unless_a_condition_has_both() -> None:
     cells = cells_of([TCP, PINGED])
-    figures = shown(cells, table_lines.with_radio_loss(table_lines.operator_lines(cells), cells))
+    figures = texts_by_label(cells, table_lines.with_radio_loss(table_lines.operator_lines(cells), cells))
     assert figures["radio loss"] == ["1.00 %", "4.63 %"]
     together = cells_of([replace(PINGED, tcp_byte_loss=0.01)])
-    labels = shown(together, table_lines.with_radio_loss(table_lines.operator_lines(together), together))
+    labels = texts_by_label(together, table_lines.with_radio_loss(table_lines.operator_lines(together), together))
     assert {"IP packet loss", "TCP byte loss before retransmission"} <= labels.keys()
     assert "radio loss" not in labels
 
@@ -114,8 +114,10 @@ def test_figures_of_equal_rank_are_in_the_order_of_columns() -> None:
 
 
 def test_all_lines_are_shown_if_none_is_for_an_operator() -> None:
-    bare = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
-    assert [line.label for line in table_lines.operator_lines(cells_of([bare]))] == ["transfer time, median"]
+    without_metrics = replace(ROW, file_loss=None, ip_loss=None, rtt_median_s=None, ip_packets_sent=None)
+    assert [line.label for line in table_lines.operator_lines(cells_of([without_metrics]))] == [
+        "transfer time, median"
+    ]
 
 
 def test_sent_packets_are_summed_over_all_valid_repeats() -> None:

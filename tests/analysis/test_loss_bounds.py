@@ -11,12 +11,12 @@ from tests.analysis.test_coverage import lost_in_bursts
 
 
 @given(st.integers(0, 200), st.integers(1, 200))
-def test_shares_of_repeats_equal_clopper_and_pearson(met: int, n: int) -> None:
-    assume(met <= n)
-    low = 0.0 if met == 0 else scipy.stats.beta.ppf(0.05, met, n - met + 1)
-    high = 1.0 if met == n else scipy.stats.beta.ppf(0.95, met + 1, n - met)
-    assert one_sided_bounds.share_low(met, n) == pytest.approx(low, abs=1e-9)
-    assert one_sided_bounds.share_high(met, n) == pytest.approx(high, abs=1e-9)
+def test_shares_of_repeats_equal_clopper_and_pearson(successes: int, n: int) -> None:
+    assume(successes <= n)
+    low = 0.0 if successes == 0 else scipy.stats.beta.ppf(0.05, successes, n - successes + 1)
+    high = 1.0 if successes == n else scipy.stats.beta.ppf(0.95, successes + 1, n - successes)
+    assert one_sided_bounds.share_low(successes, n) == pytest.approx(low, abs=1e-9)
+    assert one_sided_bounds.share_high(successes, n) == pytest.approx(high, abs=1e-9)
 
 
 @given(st.floats(0.001, 0.9999))
@@ -41,9 +41,9 @@ def test_the_loss_is_garwoods_bound_with_the_worst_repeat_as_burst_length(lost: 
 @given(st.lists(st.tuples(st.integers(0, 500), st.integers(0, 500)), min_size=1, max_size=20), st.integers(500, 5000))
 def test_fewer_losses_never_make_the_bound_larger(pairs: list[tuple[int, int]], sent: int) -> None:
     fewer, more = ([pick(pair) for pair in pairs] for pick in (min, max))
-    each = [sent] * len(pairs)
-    assert one_sided_bounds.loss_high(fewer, each) <= one_sided_bounds.loss_high(more, each) * (1 + 1e-12)
-    assert one_sided_bounds.loss_high([0] * len(pairs), each) <= one_sided_bounds.loss_high(fewer, each)
+    sizes = [sent] * len(pairs)
+    assert one_sided_bounds.loss_high(fewer, sizes) <= one_sided_bounds.loss_high(more, sizes) * (1 + 1e-12)
+    assert one_sided_bounds.loss_high([0] * len(pairs), sizes) <= one_sided_bounds.loss_high(fewer, sizes)
 
 
 def test_duplicates_are_no_negative_losses() -> None:
@@ -62,8 +62,8 @@ def test_the_number_of_packets_without_a_loss_is_minimal(bound: float) -> None:
 def test_the_bound_is_above_the_true_loss_in_95_percent_of_runs(burst: int, rate: float) -> None:
     """6 repeats of 1,250 datagrams on a Gilbert-Elliott link, as an iperf3 test of 3 s."""
     lost = lost_in_bursts(np.random.default_rng(21), rate, burst, (400, 6), 1250)
-    held = np.mean([one_sided_bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
-    assert held >= 0.94  # 95 % minus a standard error
+    coverage = np.mean([one_sided_bounds.loss_high(run, [1250] * 6) >= rate for run in lost])
+    assert coverage >= 0.94  # 95 % minus a standard error
 
 
 @pytest.mark.parametrize("bursts_per_run", [0.5, 3, 20])

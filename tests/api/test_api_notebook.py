@@ -19,9 +19,9 @@ def notebook(path: Path) -> Any:  # noqa: ANN401 (as nbformat has it)
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_runs(path: Path) -> None:
-    one = notebook(path)
-    NotebookClient(one, timeout=LIMIT_S, kernel_name="python3").execute(cwd=str(path.parent))
-    counts = [cell.execution_count for cell in one.cells if cell.cell_type == "code"]
+    document = notebook(path)
+    NotebookClient(document, timeout=LIMIT_S, kernel_name="python3").execute(cwd=str(path.parent))
+    counts = [cell.execution_count for cell in document.cells if cell.cell_type == "code"]
     assert counts == [*range(1, len(counts) + 1)]
 
 

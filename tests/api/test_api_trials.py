@@ -194,16 +194,16 @@ trials.repeats.to_pandas()
 
 
 @pytest.mark.parametrize(
-    ("repeat", "error", "what"),
+    ("repeat", "error", "message"),
     [
         ("udp-02", ConfigurationError, "there is no repeat 'udp-02'"),
         ("udp-01.void1", EvidenceError, "there are no complete captures of both ends"),
     ],
 )
 def test_unknown_attempts_and_transfers_are_rejected(
-    recorded_trial: Path, repeat: str, error: type[Exception], what: str
+    recorded_trial: Path, repeat: str, error: type[Exception], message: str
 ) -> None:
-    with pytest.raises(error, match=what):
+    with pytest.raises(error, match=message):
         fieldkit.load(recorded_trial).packets(repeat)
 
 
@@ -216,9 +216,9 @@ def test_a_repeat_of_several_trials_needs_its_trial() -> None:
 
 def test_packets_without_unchanged_evidence_are_rejected(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, trial := tmp_path / LOSSY.name)
-    alone = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")
+    table = shutil.copy(trial / store.TRIAL_CSV, tmp_path / "alone.csv")
     with pytest.raises(EvidenceError, match="evidence of udp-02 is not available"):
-        fieldkit.load(alone).packets("udp-02")
+        fieldkit.load(table).packets("udp-02")
     with (trial / store.REPEATS / "udp-02" / "receiver.pcap").open("ab") as capture:
         capture.write(b"more")
     with pytest.raises(EvidenceError, match="is not available"):
@@ -250,9 +250,11 @@ def test_a_damaged_table_is_rejected_with_its_line(tmp_path: Path) -> None:
         fieldkit.load(damaged)
 
 
-@pytest.mark.parametrize(("by", "quantities", "what"), [("protocl", None, "by: "), ("protocol", ["ip_los"], "quant")])
-def test_a_mistyped_column_is_rejected(by: str, quantities: list[str] | None, what: str) -> None:
-    with pytest.raises(ConfigurationError, match=what) as caught:
+@pytest.mark.parametrize(
+    ("by", "quantities", "message"), [("protocl", None, "by: "), ("protocol", ["ip_los"], "quant")]
+)
+def test_a_mistyped_column_is_rejected(by: str, quantities: list[str] | None, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         fieldkit.load(TRIALS).cells(by, quantities)
     assert caught.value.remedy.startswith("did you mean")
 
@@ -269,9 +271,9 @@ def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
 
 
 def test_rebuild_measures_the_evidence_again(recorded_trial: Path) -> None:
-    kept = fieldkit.load(recorded_trial).repeats
+    stored = fieldkit.load(recorded_trial).repeats
     (recorded_trial / store.TRIAL_CSV).unlink()
-    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(kept)
+    assert fieldkit.load(recorded_trial, rebuild=True).repeats.equals(stored)
 
 
 def test_the_package_imports_its_readers_lazily() -> None:
@@ -311,7 +313,7 @@ def test_the_interval_of_a_single_repeat_is_infinite(recorded_trial: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("condition", "what", "remedy"),
+    ("condition", "message", "remedy"),
     [
         (
             {},
@@ -322,8 +324,8 @@ def test_the_interval_of_a_single_repeat_is_infinite(recorded_trial: Path) -> No
         ({"protocl": "udp"}, "cell: there is no column 'protocl'", "did you mean 'protocol'?"),
     ],
 )
-def test_an_ambiguous_cell_is_rejected(condition: dict[str, str], what: str, remedy: str) -> None:
-    with pytest.raises(ConfigurationError, match=what) as caught:
+def test_an_ambiguous_cell_is_rejected(condition: dict[str, str], message: str, remedy: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         fieldkit.load(TRIALS).cell(**condition)
     assert remedy in caught.value.remedy
 

@@ -37,10 +37,10 @@ class RecordingOperator:
     """An operator that records the requests."""
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.prompts: list[str] = []
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        self.asked.append(request)
+        self.prompts.append(request)
         return DONE
 
     def enter(self, question: Question) -> str:
@@ -71,7 +71,7 @@ def test_robots_are_connected_and_placed_by_the_operator(tmp_path: Path, access:
         lab.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("30ft")))
         for shell in lab.shells.values():
             assert shell.run(("echo", "up"), deadline=Deadline.after(20)).stdout == b"up\n"
-    assert operator.asked == ["move turtlebot-1 to 30 ft (9.14 m) from duckiedrone-1, behind the wall"]
+    assert operator.prompts == ["move turtlebot-1 to 30 ft (9.14 m) from duckiedrone-1, behind the wall"]
 
 
 def test_changed_host_key_is_an_error(tmp_path: Path, access: str) -> None:
@@ -125,7 +125,7 @@ def test_robots_drive_automatically_only_if_allowed(tmp_path: Path, access: str)
         lab.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))
         lab.bring_back(Role.SENDER, has_returned=True)
         lab.bring_back(Role.SENDER, has_returned=False)
-    assert operator.asked == [
+    assert operator.prompts == [
         (
             "move turtlebot-1 to 5 m from duckiedrone-1, nothing between them; let turtlebot-1 face away from "
             "duckiedrone-1 with a clear path: it drives automatically"

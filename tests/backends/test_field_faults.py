@@ -14,11 +14,11 @@ class RecordingOperator:
     """An operator that fulfils and records each request."""
 
     def __init__(self) -> None:
-        self.asked: list[str] = []
+        self.prompts: list[str] = []
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         assert not may_skip, "a fault during a repeat cannot be postponed"
-        self.asked.append(request)
+        self.prompts.append(request)
         return DONE
 
     def enter(self, question: Question) -> str:
@@ -26,7 +26,7 @@ class RecordingOperator:
 
 
 @pytest.mark.parametrize(
-    ("fault", "asked", "lasted_s"),
+    ("fault", "requests", "lasted_s"),
     [
         (Fault(FaultKind.REBOOT, Role.RECEIVER), ["reboot turtlebot-2"], 0.0),
         (Fault(FaultKind.KILL, Role.SENDER, process="nc"), ["kill nc on turtlebot-1"], 0.0),
@@ -37,10 +37,10 @@ class RecordingOperator:
         ),
     ],
 )
-def test_request_and_duration_of_each_fault(fault: Fault, asked: list[str], lasted_s: float | None) -> None:
+def test_request_and_duration_of_each_fault(fault: Fault, requests: list[str], lasted_s: float | None) -> None:
     operator = RecordingOperator()
     assert FieldTestbed(CAST, {}, operator).inject(fault) == lasted_s
-    assert operator.asked == asked
+    assert operator.prompts == requests
 
 
 class SlowOperator(RecordingOperator):
@@ -65,10 +65,10 @@ def test_link_down_lasts_from_first_to_second_answer(monkeypatch: pytest.MonkeyP
     operator = SlowOperator()
     monkeypatch.setattr("fieldkit.backends.field.time", operator)
     assert FieldTestbed(CAST, {}, operator).inject(Fault(FaultKind.LINK_DOWN, Role.SENDER, 10.0)) == 12.0
-    assert operator.asked == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
+    assert operator.prompts == ["switch the Wi-Fi of turtlebot-1 off", "switch the Wi-Fi of turtlebot-1 on again"]
 
 
-AWAY = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
+MOVE = Move(Role.SENDER, (Leg(away_m=10.0), Leg(left_m=2.0)), 0.2)
 START_REQUEST = (
     "move turtlebot-1, as seen from {}: 10 m away, then 2 m left, at 0.2 m/s; answer when it starts to move"
 )
@@ -76,16 +76,16 @@ START_REQUEST = (
 
 def test_operator_moves_robot_and_brings_it_back() -> None:
     operator = RecordingOperator()
-    with FieldTestbed(CAST, {}, operator).moving(AWAY):
-        assert operator.asked == [START_REQUEST.format("duckiedrone-1")]
-    assert operator.asked[1:] == ["bring turtlebot-1 back to its place"]
+    with FieldTestbed(CAST, {}, operator).moving(MOVE):
+        assert operator.prompts == [START_REQUEST.format("duckiedrone-1")]
+    assert operator.prompts[1:] == ["bring turtlebot-1 back to its place"]
 
 
 @pytest.mark.parametrize("error", [RobotError("x", remedy="y"), KeyboardInterrupt()])
 def test_robot_is_brought_back_after_error_but_not_after_ctrl_c(error: BaseException) -> None:
     operator = RecordingOperator()
     direct: dict[Role, Robot] = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
-    with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(AWAY):
+    with pytest.raises(type(error)), FieldTestbed(direct, {}, operator).moving(MOVE):
         raise error
     back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
-    assert operator.asked == [START_REQUEST.format("turtlebot-2"), *back]
+    assert operator.prompts == [START_REQUEST.format("turtlebot-2"), *back]

@@ -67,12 +67,12 @@ def changes(tmp_path: Path, after: str, name: str = "test_a.py", before: str = B
 
 @pytest.mark.parametrize("name", ["test_a.py", "motion/test_b.py"])
 def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) -> None:
-    found = changes(tmp_path, RENAMED, name)
-    assert (found.has_differences, found.same, list(found.lines())) == (False, 2, [])
+    changed = changes(tmp_path, RENAMED, name)
+    assert (changed.has_differences, changed.same, list(changed.lines())) == (False, 2, [])
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "shown"),
+    ("old", "new", "expected"),
     [
         ("assert one < other", "assert one <= other", "assertion: test_a.py::test_two: line 22: assert one < other"),
         ("assert one < other", "assert one < one", "assertion: test_a.py::test_two: line 22: assert one < other"),
@@ -92,11 +92,11 @@ def test_names_imports_labels_and_files_may_change(tmp_path: Path, name: str) ->
         ("test_two() -> None:\n", "test_two() -> None:\n    return\n", "body: test_a.py::test_two: other statements"),
     ],
 )
-def test_a_changed_check_is_listed(tmp_path: Path, old: str, new: str, shown: str) -> None:
+def test_a_changed_check_is_listed(tmp_path: Path, old: str, new: str, expected: str) -> None:
     assert old in BEFORE
-    found = changes(tmp_path, BEFORE.replace(old, new, 1))
-    assert found.has_differences
-    assert any(line.startswith(shown) for line in found.lines()), list(found.lines())
+    changed = changes(tmp_path, BEFORE.replace(old, new, 1))
+    assert changed.has_differences
+    assert any(line.startswith(expected) for line in changed.lines()), list(changed.lines())
 
 
 def test_removed_copy_is_the_one_that_is_listed(tmp_path: Path) -> None:

@@ -53,7 +53,9 @@ def test_every_trial_occurs_once_in_blocks_within_the_walk(
 @given(trials, seeds)
 def test_equal_seeds_give_equal_orders_for_any_input_order(planned: set[PlannedTrial], seed: int) -> None:
     forwards = sorted(planned, key=str)
-    orders = {order.shuffled(given, seed=seed, limit_m=1e9) for given in (forwards, tuple(reversed(forwards)))}
+    orders = {
+        order.shuffled(input_order, seed=seed, limit_m=1e9) for input_order in (forwards, tuple(reversed(forwards)))
+    }
     assert len(orders) == 1
 
 

@@ -99,6 +99,6 @@ def test_reduced_values_are_reported_once_before_the_first_trial(
     text = LAWN.replace("[los, nlos]", "[driveaway]").replace("[master, masterless]", "[masterless]")
     Path("lawn.yaml").write_text(text, encoding="utf-8")
     assert main(["campaign", "lawn.yaml", "--dry-run", "--allow-motion"]) == 0
-    shown = capsys.readouterr().out
-    assert "driveaway 20ft masterless" in shown
-    assert shown.count(SHORTER) == 1
+    output = capsys.readouterr().out
+    assert "driveaway 20ft masterless" in output
+    assert output.count(SHORTER) == 1

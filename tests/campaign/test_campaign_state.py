@@ -47,19 +47,19 @@ def lawn(tmp_path: Path) -> Path:
 
 
 def begin(lawn: Path) -> tuple[CampaignPlan, CampaignJournal]:
-    asked, _ = plan.make_plan(lawn, "field")
-    return asked, CampaignJournal(lawn.parent / "campaign_lawn")
+    campaign_plan, _ = plan.make_plan(lawn, "field")
+    return campaign_plan, CampaignJournal(lawn.parent / "campaign_lawn")
 
 
 def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) -> None:
-    asked, journal = begin(lawn)
-    with journal.locked(asked):
+    campaign_plan, journal = begin(lawn)
+    with journal.locked(campaign_plan):
         lawn.write_text(f"# dry grass\n{LAWN}", encoding="utf-8")
-    again, document = plan.make_plan(lawn, "field")
-    frozen = plan.started_plan(journal.folder, again, document)
+    new_plan, document = plan.make_plan(lawn, "field")
+    frozen = plan.started_plan(journal.folder, new_plan, document)
     assert frozen is not None
-    assert frozen.order == asked.order
-    assert frozen.trials() == asked.trials()
+    assert frozen.order == campaign_plan.order
+    assert frozen.trials() == campaign_plan.trials()
 
 
 @pytest.mark.parametrize(
@@ -73,12 +73,12 @@ def test_the_frozen_plan_is_read_back_and_a_comment_changes_nothing(lawn: Path) 
     ],
 )
 def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str, line: int, named: str) -> None:
-    asked, journal = begin(lawn)
-    with journal.locked(asked):
+    campaign_plan, journal = begin(lawn)
+    with journal.locked(campaign_plan):
         lawn.write_text(LAWN.replace(old, new), encoding="utf-8")
-    again, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
+    new_plan, document = plan.make_plan(lawn, "emulated" if named == "backend" else "field")
     with pytest.raises(ConfigurationError) as caught:
-        plan.started_plan(journal.folder, again, document)
+        plan.started_plan(journal.folder, new_plan, document)
     assert caught.value.what == f"changed since the campaign started: {named}"
     assert caught.value.where == f"{lawn}:{line}"
     assert "campaign.yaml" in caught.value.remedy
@@ -86,8 +86,8 @@ def test_a_changed_file_is_rejected_with_the_key(lawn: Path, old: str, new: str,
 
 def test_a_changed_procedure_is_rejected(lawn: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(lawn.parent)
-    asked, journal = begin(lawn)
-    with journal.locked(asked):
+    campaign_plan, journal = begin(lawn)
+    with journal.locked(campaign_plan):
         Path("procedures").mkdir()
     shipped = ROOT / "procedures" / "los.yaml"
     changed = shipped.read_text(encoding="utf-8").replace("count: 10", "count: 11")
@@ -103,14 +103,14 @@ def test_an_impossible_walk_is_rejected_with_the_minimum(lawn: Path) -> None:
     assert caught.value.where == f"{lawn}:8"
     walk = caught.value.remedy.split("m ")[0].removeprefix("walk: ")
     lawn.write_text(LAWN.replace("333ft", f"{walk}m"), encoding="utf-8")
-    asked, _ = plan.make_plan(lawn, "field")
-    assert walk_m(asked.trials()) <= float(walk)
+    campaign_plan, _ = plan.make_plan(lawn, "field")
+    assert walk_m(campaign_plan.trials()) <= float(walk)
 
 
 def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
-    asked, journal = begin(lawn)
-    first, second, third, *_ = asked.trials()
-    with journal.locked(asked):
+    campaign_plan, journal = begin(lawn)
+    first, second, third, *_ = campaign_plan.trials()
+    with journal.locked(campaign_plan):
         for trial in (first, second, third):
             journal.add(trial, TrialProgress.STARTED, trial=f"trial of {trial}")
         journal.add(first, TrialProgress.PLACED, took_s=30.0, note="windy")
@@ -133,28 +133,28 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
     folder = tmp_path_factory.mktemp("lab")
     lawn = folder / "lawn.yaml"
     lawn.write_text(LAWN, encoding="utf-8")
-    asked, journal = begin(lawn)
-    trials = asked.trials()
-    with journal.locked(asked):
+    campaign_plan, journal = begin(lawn)
+    trials = campaign_plan.trials()
+    with journal.locked(campaign_plan):
         for trial in trials[:-1]:
             journal.add(trial, TrialProgress.ENDED, valid=1)
     path = journal.folder / JOURNAL_FILE
-    whole = path.read_bytes()
-    path.write_bytes(whole[: max(0, len(whole) - cut)])
-    kept = CampaignJournal(journal.folder)
-    complete = len(kept.ended())
+    content = path.read_bytes()
+    path.write_bytes(content[: max(0, len(content) - cut)])
+    reopened = CampaignJournal(journal.folder)
+    complete = len(reopened.ended())
     assert complete >= path.read_bytes().count(b"\n")
-    with kept.locked(asked):
-        kept.add(trials[-1], TrialProgress.ENDED, valid=1)
+    with reopened.locked(campaign_plan):
+        reopened.add(trials[-1], TrialProgress.ENDED, valid=1)
     assert list(CampaignJournal(journal.folder).ended()) == [*map(str, trials[:complete]), str(trials[-1])]
 
 
 def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None:
-    asked, journal = begin(lawn)
+    campaign_plan, journal = begin(lawn)
     with (
-        journal.locked(asked),
+        journal.locked(campaign_plan),
         pytest.raises(ConfigurationError, match="another fieldkit runs this campaign"),
-        CampaignJournal(journal.folder).locked(asked),
+        CampaignJournal(journal.folder).locked(campaign_plan),
     ):
         raise AssertionError("two at once")
     (journal.folder / JOURNAL_FILE).write_text('{"what": "lost"}\n{}\n', encoding="utf-8")
@@ -162,28 +162,28 @@ def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None
         CampaignJournal(journal.folder)
 
 
-def planned(asked: CampaignPlan, journal: CampaignJournal, backend: Backend) -> CampaignPlanned:
+def planned(campaign_plan: CampaignPlan, journal: CampaignJournal, backend: Backend) -> CampaignPlanned:
     events: list[Event] = []
-    CampaignRun(asked, journal, backend, events.append).announce()
+    CampaignRun(campaign_plan, journal, backend, events.append).announce()
     (event,) = events
     assert isinstance(event, CampaignPlanned)
     return event
 
 
 def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
-    asked, journal = begin(lawn)
+    campaign_plan, journal = begin(lawn)
     (lawn.parent / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     by_hand = load_backend("field", *load_site(lawn.parent / "fieldkit.yaml"))
     emulated_backend = load_backend("emulated", *load_site(lawn.parent / "fieldkit.yaml"))
-    work_s = planned(asked, journal, emulated_backend).left_s
+    work_s = planned(campaign_plan, journal, emulated_backend).left_s
     assert work_s > 8 * 3 * 2 * 66, "8 trials, 3 repeats of 2 protocols, recordings of 66 s"
-    assert planned(asked, journal, by_hand).left_s == pytest.approx(work_s + 8 * PLACING_S)
-    first, second, *_ = asked.trials()
-    with journal.locked(asked):
+    assert planned(campaign_plan, journal, by_hand).left_s == pytest.approx(work_s + 8 * PLACING_S)
+    first, second, *_ = campaign_plan.trials()
+    with journal.locked(campaign_plan):
         journal.add(first, TrialProgress.PLACED, took_s=10.0)
         journal.add(second, TrialProgress.PLACED, took_s=30.0)
         journal.add(first, TrialProgress.ENDED, valid=6)
-    event = planned(asked, journal, by_hand)
+    event = planned(campaign_plan, journal, by_hand)
     assert len(event.trials) == 7
     assert event.total == 8
     assert event.left_s == pytest.approx(work_s * 7 / 8 + 7 * 20.0)
@@ -191,9 +191,9 @@ def test_the_estimate_uses_measured_placing_times(lawn: Path) -> None:
 
 def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(lawn: Path) -> None:
     lawn.write_text(LAWN.replace("repeats: 3", "repeats: 100000"), encoding="utf-8")
-    asked, journal = begin(lawn)
+    campaign_plan, journal = begin(lawn)
     events: list[Event] = []
-    campaign = CampaignRun(asked, journal, load_backend("emulated", None, None), events.append)
+    campaign = CampaignRun(campaign_plan, journal, load_backend("emulated", None, None), events.append)
     with pytest.raises(ConfigurationError, match="GB are free"):
         campaign.run(Unattended(), Stop())
     assert [type(event) for event in events] == [CampaignEnded], "no robot was started"
@@ -201,25 +201,25 @@ def test_a_disk_too_small_for_the_evidence_is_reported_before_robots_are_placed(
 
 
 def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> None:
-    asked, journal = begin(lawn)
+    campaign_plan, journal = begin(lawn)
     backend = load_backend("emulated", None, None)
-    whole, failed, *_ = asked.trials()
-    with journal.locked(asked):
-        for trial, count in ((whole, 0), (failed, 2)):
+    complete, failed, *_ = campaign_plan.trials()
+    with journal.locked(campaign_plan):
+        for trial, count in ((complete, 0), (failed, 2)):
             journal.add(trial, TrialProgress.STARTED, trial=str(count))
             journal.add(trial, TrialProgress.ENDED, trial=str(count), failed=count)
-    assert str(failed) not in planned(asked, journal, backend).trials
+    assert str(failed) not in planned(campaign_plan, journal, backend).trials
     events: list[Event] = []
-    campaign = CampaignRun(asked, journal, backend, events.append, failed=True)
+    campaign = CampaignRun(campaign_plan, journal, backend, events.append, failed=True)
     campaign.announce()
     (event,) = events
     assert isinstance(event, CampaignPlanned)
     assert str(failed) in event.trials
-    assert str(whole) not in event.trials
-    with journal.locked(asked):
+    assert str(complete) not in event.trials
+    with journal.locked(campaign_plan):
         campaign._restart_failed()
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
-    for kept in (journal, CampaignJournal(journal.folder)):
-        assert set(kept.ended()) == {str(whole)}
-        assert kept.interrupted(failed) == journal.folder / "2"
+    for reopened in (journal, CampaignJournal(journal.folder)):
+        assert set(reopened.ended()) == {str(complete)}
+        assert reopened.interrupted(failed) == journal.folder / "2"

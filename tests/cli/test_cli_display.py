@@ -76,20 +76,20 @@ def test_a_title_longer_than_its_table_stays_one_line(capsys: pytest.CaptureFixt
 
 
 def test_reason_of_a_void_repeat_precedes_its_measurements() -> None:
-    ended = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
-    assert "".join(text for text, _ in event_words(ended)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
+    event = RepeatEnded("udp-07", 1, Status.VOID, "no message", "RTT 1.3 ms", done=0, total=2, left_s=0.0)
+    assert "".join(text for text, _ in event_words(event)) == "  0/2  udp-07  void   no message; measured: RTT 1.3 ms"
 
 
 def test_remedy_for_a_failed_step_is_below_its_repeat() -> None:
-    ended = RepeatEnded("udp-07", 1, Status.VOID, "too late", "", done=0, total=2, left_s=0, remedy="a larger idle")
-    _, below = "".join(text for text, _ in event_words(ended)).splitlines()
+    event = RepeatEnded("udp-07", 1, Status.VOID, "too late", "", done=0, total=2, left_s=0, remedy="a larger idle")
+    _, below = "".join(text for text, _ in event_words(event)).splitlines()
     assert below.split() == ["remedy:", "a", "larger", "idle"]
 
 
 def test_finished_campaign_shows_no_time_and_no_disk_space() -> None:
-    went = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
+    progress = CampaignWent("los 10ft master", done=2, total=2, left_s=0.0)
     planned = CampaignPlanned("small", (), 2, 2, walk_m=0.0, left_s=0.0, needed_bytes=0, free_bytes=1 << 30)
-    for event in (went, planned):
+    for event in (progress, planned):
         assert "".join(text for text, _ in event_words(event)) == "campaign: 2 of 2 trials are done"
 
 

@@ -49,10 +49,10 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_a_wrong_word_is_exit_2_with_a_remedy(words: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words.split()) == 2
-    shown = capsys.readouterr()
-    assert message in shown.err
-    assert "remedy:" in shown.err
-    assert "Traceback" not in shown.err
+    output = capsys.readouterr()
+    assert message in output.err
+    assert "remedy:" in output.err
+    assert "Traceback" not in output.err
 
 
 @pytest.mark.parametrize(("content", "message"), [(None, "No such file"), (b"float64 \xff", "it is not UTF-8")])
@@ -112,8 +112,8 @@ def test_two_robots_with_one_address_are_an_error(lab: Path, capsys: pytest.Capt
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
     words = ["trial", "los", "30ft", "--dry-run", "--topology", "masterless", "--backend"]
     assert main([*words, "field"]) == 2
-    said = "fieldkit.yaml:2: robots 'a' and 'b' have the same address on the radio, 192.0.2.1"
-    assert said in capsys.readouterr().err
+    message = "fieldkit.yaml:2: robots 'a' and 'b' have the same address on the radio, 192.0.2.1"
+    assert message in capsys.readouterr().err
     assert main([*words, "emulated"]) == 0, "which has addresses of its own"
 
 
@@ -144,9 +144,9 @@ def test_a_topology_without_roles_names_the_line_of_the_roles(
     robot = "{profile: turtlebot3_burger, host: 192.0.2.1, user: me, host_key: ssh-ed25519 AAAA}"
     (lab / "fieldkit.yaml").write_text(f"robots:\n  a: {robot}\nroles: {{}}\n", encoding="utf-8")
     assert main(["trial", "los", "30ft", "--dry-run", "--topology", "masterless", "--backend", backend]) == 2
-    shown = capsys.readouterr().err
-    assert "fieldkit.yaml:3: the site file gives no roles for topology masterless" in shown
-    assert shown.endswith("remedy: add roles.masterless\n")
+    error_text = capsys.readouterr().err
+    assert "fieldkit.yaml:3: the site file gives no roles for topology masterless" in error_text
+    assert error_text.endswith("remedy: add roles.masterless\n")
 
 
 def test_a_question_without_a_terminal_suggests_an_option() -> None:
@@ -164,9 +164,9 @@ def test_error_in_a_site_file_has_its_line(lab: Path, capsys: pytest.CaptureFixt
     site = f"backend: emulated\n{SITE}emulated: {{radio: {{los: 10%}}}}\n"
     (lab / "fieldkit.yaml").write_text(site, encoding="utf-8")
     assert main(["trial", "los", "30ft", "--dry-run"]) == 2
-    shown = capsys.readouterr().err
-    assert "fieldkit.yaml:7" in shown
-    assert "in emulated.radio: unknown key los; did you mean 'loss'?" in shown
+    error_text = capsys.readouterr().err
+    assert "fieldkit.yaml:7" in error_text
+    assert "in emulated.radio: unknown key los; did you mean 'loss'?" in error_text
 
 
 def test_junit_file_in_a_missing_folder_is_rejected_before_the_trial(capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,24 +16,24 @@ from fieldkit.core.model import Verdict
 from tests.helpers.paths import ROOT
 
 COMMAND = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;,\n`]*)")
-GIVEN = ("--site", "my lab.yaml", "--backend", "field")
+OPTIONS = ("--site", "my lab.yaml", "--backend", "field")
 
 
 def messages() -> Iterator[tuple[str, str, bool]]:
     """Yield the file, each text in the code except docstrings (`x` for values), and whether it is a command."""
     for path in sorted((*ROOT.glob("fieldkit/**/*.py"), *ROOT.glob("sim_backends/**/*.py"))):
-        where = str(path.relative_to(ROOT))
+        location = str(path.relative_to(ROOT))
         tree = ast.parse(path.read_text(encoding="utf-8"))
         excluded = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
         for node in ast.walk(tree):
             if isinstance(node, ast.JoinedStr):
                 excluded |= {id(part) for part in node.values}
                 parts = (part.value if isinstance(part, ast.Constant) else "x" for part in node.values)
-                yield where, "".join(map(str, parts)), False
+                yield location, "".join(map(str, parts)), False
             elif isinstance(node, ast.Call) and getattr(node.func, "id", "") == "typed":
-                yield where, shell_command(*(getattr(word, "value", "x") for word in node.args)), True
+                yield location, shell_command(*(getattr(word, "value", "x") for word in node.args)), True
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in excluded:
-                yield where, node.value, False
+                yield location, node.value, False
 
 
 def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
@@ -52,7 +52,7 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
 
 
 @pytest.mark.parametrize(
-    ("typed_before", "hint", "whole"),
+    ("typed_before", "hint", "expected"),
     [
         ("check los", "fieldkit abort", "fieldkit abort --site 'my lab.yaml' --backend field"),
         ("check los", "fieldkit enroll a --replace", "fieldkit enroll --site 'my lab.yaml' a --replace"),
@@ -77,15 +77,15 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
         ("lab up", "fieldkit lab down", "fieldkit lab down"),
     ],
 )
-def test_hints_include_the_options_given(typed_before: str, hint: str, whole: str) -> None:
+def test_hints_include_the_options_given(typed_before: str, hint: str, expected: str) -> None:
     top = parser()
     with hints.completing(top) as options:
-        options.read(top.parse_args((*typed_before.split(), *GIVEN)))
+        options.read(top.parse_args((*typed_before.split(), *OPTIONS)))
         completed = hints.completed(hint)
-    assert completed == whole.format(given=shlex.join(GIVEN))
+    assert completed == expected.format(given=shlex.join(OPTIONS))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
-        again = top.parse_args(shlex.split(completed)[1:])
-        assert getattr(again, "site", None) is None or str(again.site) == "my lab.yaml"
+        parsed = top.parse_args(shlex.split(completed)[1:])
+        assert getattr(parsed, "site", None) is None or str(parsed.site) == "my lab.yaml"
 
 
 def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture[str]) -> None:
@@ -99,11 +99,11 @@ def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture
             with showing_events(as_json=as_json) as sink:
                 sink(TrialStopped("my trials/a", 1, 2))
                 sink(finding)
-    shown = capsys.readouterr()
-    assert shown.err.endswith("remedy: fieldkit abort --site x.yaml\n")
-    assert "end it: fieldkit abort --site x.yaml\n" in shown.out
-    assert "to continue: fieldkit resume --site x.yaml 'my trials/a'\n" in shown.out
-    assert json.loads(shown.out.splitlines()[-1])["remedy"] == "wait, or end it: fieldkit abort --site x.yaml"
+    output = capsys.readouterr()
+    assert output.err.endswith("remedy: fieldkit abort --site x.yaml\n")
+    assert "end it: fieldkit abort --site x.yaml\n" in output.out
+    assert "to continue: fieldkit resume --site x.yaml 'my trials/a'\n" in output.out
+    assert json.loads(output.out.splitlines()[-1])["remedy"] == "wait, or end it: fieldkit abort --site x.yaml"
 
 
 def test_without_options_hints_are_unchanged() -> None:

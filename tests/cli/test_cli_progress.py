@@ -41,7 +41,7 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("width", "shown"),
+    ("width", "expected"),
     [
         (120, f"trial 3 of 6  {'━' * 4}{'─' * 20}  7/40  3 min 20 s left  udp-08 transfer  12 s left"),
         (80, f"trial 3 of 6  {'━' * 2}{'─' * 10}  7/40  3 min 20 s left  udp-08 transfer  12 s left"),
@@ -52,8 +52,8 @@ def stopped_clock(monkeypatch: pytest.MonkeyPatch) -> None:
         (5, "ud..."),
     ],
 )
-def test_line_fits_and_keeps_the_current_phase(width: int, shown: str) -> None:
-    assert line(width, *STARTED) == shown
+def test_line_fits_and_keeps_the_current_phase(width: int, expected: str) -> None:
+    assert line(width, *STARTED) == expected
 
 
 def test_the_line_is_never_wider_than_the_terminal() -> None:
@@ -63,7 +63,7 @@ def test_the_line_is_never_wider_than_the_terminal() -> None:
 
 
 def test_no_estimate_before_the_first_repeat_ends() -> None:
-    assert line(80, *STARTED[1:2], PhaseStarted("preflight")) == f"{'─' * 12}  0/40  preflight  for 0.0 s"
+    assert line(80, *STARTED[1:2], PhaseStarted("check")) == f"{'─' * 12}  0/40  check  for 0.0 s"
 
 
 def test_no_line_during_a_question_and_after_the_end() -> None:

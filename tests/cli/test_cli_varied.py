@@ -18,7 +18,7 @@ from tests.helpers import vendor_trials
 DISTANCES = {"10ft": 3.048, "30ft": 9.144}
 
 
-DRAWN = {"ip_loss", "ip_packets_sent", "ip_packets_received", "jitter_s", "rtt_payload_bytes", "rtt_median_s"}
+CHOSEN = {"ip_loss", "ip_packets_sent", "ip_packets_received", "jitter_s", "rtt_payload_bytes", "rtt_median_s"}
 """Columns of the named steps in the trials for reports; a report draws a panel for each quantity of each step."""
 
 
@@ -90,8 +90,8 @@ def test_tables_have_units_and_rounded_values(trials: Path, capsys: pytest.Captu
         in output_of(capsys, *words, "--format", "markdown")
     )
     assert r"probe: level, median (dBm)" in output_of(capsys, *words, "--format", "latex")
-    whole = json.loads(output_of(capsys, *words, "--format", "json"))
-    assert whole["cells"][0]["estimates"]["probe.level"]["unit"] == "dBm"
+    document = json.loads(output_of(capsys, *words, "--format", "json"))
+    assert document["cells"][0]["estimates"]["probe.level"]["unit"] == "dBm"
 
 
 def test_width_in_any_unit_gives_the_number_of_repeats_needed(
@@ -143,15 +143,15 @@ def test_exports_have_types_units_and_meanings_of_all_columns(
     output_of(capsys, "export", ".", "--format", "parquet", "-o", "all.parquet")
     table = pyarrow.parquet.read_table(trials / "all.parquet")
     for column in (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS):
-        kept = table.schema.field(column.name).metadata
-        assert (kept[b"unit"].decode(), kept[b"meaning"].decode()) == (column.unit, column.meaning)
+        metadata = table.schema.field(column.name).metadata
+        assert (metadata[b"unit"].decode(), metadata[b"meaning"].decode()) == (column.unit, column.meaning)
     assert table.column("probe.level").null_count == 0
     assert table.column("up.transfer_s").null_count == table.num_rows // 2
     output_of(capsys, "export", ".", "--format", "csv", "-o", "all.csv")
-    again = output_of(
+    second_output = output_of(
         capsys, "aggregate", "all.csv", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss"
     )
-    assert again == output_of(
+    assert second_output == output_of(
         capsys, "aggregate", ".", "--by", "distance", "--format", "csv", "--quantity", "up.ip_loss"
     ), "by the column name after the step name, without a plan"
 
@@ -159,7 +159,7 @@ def test_exports_have_types_units_and_meanings_of_all_columns(
 def test_report_draws_all_steps_together(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    columns = [column for column in vendor_trials.NAMED_STEP_COLUMNS if plain_name(column.name) in DRAWN]
+    columns = [column for column in vendor_trials.NAMED_STEP_COLUMNS if plain_name(column.name) in CHOSEN]
     trials = write_trials(tmp_path, columns)
     monkeypatch.chdir(trials)
     output_of(capsys, "report", ".", "-o", "page.html", "--quantity", "up.jitter_s")
@@ -183,9 +183,9 @@ def test_report_lists_the_quantities_that_it_does_not_draw(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
+    columns = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
     for distance, metres in DISTANCES.items():
-        plan = vendor_trials.plan(distance, distance=distance, metres=metres, columns=many)
+        plan = vendor_trials.plan(distance, distance=distance, metres=metres, columns=columns)
         vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=2))
     output_of(capsys, "report", ".", "-o", "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
@@ -198,9 +198,9 @@ def test_quantities_of_one_distance_do_not_displace_curves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    many = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
+    many_columns = [Column(f"a.m{n}", "V", "Voltage.", figure=Figure(f"a: m{n}", Kind.MEDIAN)) for n in range(15)]
     last = Column("b.level", "V", "Voltage.", figure=Figure("b: level", Kind.MEDIAN))
-    for (distance, metres), columns in zip(DISTANCES.items(), ((*many, last), (last,)), strict=True):
+    for (distance, metres), columns in zip(DISTANCES.items(), ((*many_columns, last), (last,)), strict=True):
         plan = vendor_trials.plan(distance, distance=distance, metres=metres, columns=columns)
         vendor_trials.write(tmp_path, plan, vendor_trials.valid_rows(plan, repeats=2))
     output_of(capsys, "report", ".", "-o", "page.html")

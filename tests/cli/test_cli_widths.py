@@ -42,8 +42,8 @@ def test_a_table_keeps_every_word_and_is_no_wider_than_the_terminal(data: st.Dat
     right = data.draw(st.lists(st.integers(0, size - 1), max_size=2))
     text = printed(width, head, rows, right)
     words = [word for row in rows for cell in row for word in cell.split()]
-    shown = text.split()
-    assert all(shown.count(word) >= words.count(word) for word in words)
+    printed_words = text.split()
+    assert all(printed_words.count(word) >= words.count(word) for word in words)
     longest = max([cell_len(word) for word in words], default=0) + max(map(len, head)) + 4
     assert all(cell_len(line) <= max(width, longest) for line in text.splitlines())
 
@@ -53,16 +53,16 @@ PARTS = st.lists(st.from_regex(r"[a-zA-Z]{1,15} (loss|RTT) [0-9]{1,4}\.[0-9] (%|
 
 @given(PARTS, st.integers(40, 200), st.sampled_from(ENDED), st.text("ab ", max_size=60))
 def test_line_of_a_repeat_is_complete_at_any_width(parts: list[str], width: int, status: Status, reason: str) -> None:
-    ended = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
-    text = "".join(part for part, _ in event_words(ended, width))
+    event = RepeatEnded("udp-07", 1, status, reason.strip(), ", ".join(parts), 7, 40, 0.0)
+    text = "".join(part for part, _ in event_words(event, width))
     assert all(len(line) <= width for line in text.splitlines())
-    wide = "".join(part for part, _ in event_words(ended))
+    wide = "".join(part for part, _ in event_words(event))
     assert text.split() == wide.split()
 
 
 def test_a_repeat_in_which_nothing_arrived_is_red() -> None:
-    ended = RepeatEnded("udp-07", 1, Status.VALID, "", f"{NOTHING_ARRIVED}, ping loss 100.0 %", 7, 40, 0.0)
-    assert [style for text, style in event_words(ended, 80) if NOTHING_ARRIVED in text] == ["red"]
+    event = RepeatEnded("udp-07", 1, Status.VALID, "", f"{NOTHING_ARRIVED}, ping loss 100.0 %", 7, 40, 0.0)
+    assert [style for text, style in event_words(event, 80) if NOTHING_ARRIVED in text] == ["red"]
 
 
 @given(WORD, WORD, st.integers(4, 120))

@@ -66,13 +66,15 @@ def test_commands_in_remedies_exist_and_accept_their_options() -> None:
             command, _ = parser_of(match[1], parser)
             if command is parser and match[1].split()[0] not in {"is", "runs", "itself", "reads", "with"}:
                 wrong.append((place, match[0], "no such command"))
-            taken = set(re.findall(r"--[a-z][a-z-]+", command.format_help()))
-            wrong += [(place, match[0], option) for option in OPTION.findall(match[2]) if option not in taken]
+            accepted_options = set(re.findall(r"--[a-z][a-z-]+", command.format_help()))
+            wrong += [
+                (place, match[0], option) for option in OPTION.findall(match[2]) if option not in accepted_options
+            ]
     assert wrong == []
 
 
 @pytest.mark.parametrize(
-    ("shown", "typed"),
+    ("message", "typed"),
     [
         ("add roles.master, or use --topology master", "add roles.master, or use --fieldkit-topology master"),
         ("fieldkit init, then fill it in; or by --site", "fieldkit init, then fill it in; or by --fieldkit-site"),
@@ -81,8 +83,8 @@ def test_commands_in_remedies_exist_and_accept_their_options() -> None:
         ("--fieldkit-yes", "--fieldkit-yes"),
     ],
 )
-def test_options_in_pytest_messages_have_the_pytest_prefix(shown: str, typed: str) -> None:
-    assert as_pytest_option(shown) == typed
+def test_options_in_pytest_messages_have_the_pytest_prefix(message: str, typed: str) -> None:
+    assert as_pytest_option(message) == typed
 
 
 @pytest.mark.parametrize("words", ["trial los -5m", "trial los 5m -3ft", "check --record -2s"])
@@ -95,8 +97,8 @@ def test_documented_command_copies_a_shipped_profile(tmp_path: Path) -> None:
     """The shell creates the empty file before fieldkit searches for the profile."""
     command = f"mkdir -p robots; {shlex.quote(sys.executable)} -m fieldkit robots show husky > robots/husky.yaml"
     subprocess.run(command, shell=True, cwd=tmp_path, check=True)
-    made = (tmp_path / "robots" / "husky.yaml").read_text(encoding="utf-8")
-    assert made == (ROOT / "robots" / "husky.yaml").read_text(encoding="utf-8")
+    copied = (tmp_path / "robots" / "husky.yaml").read_text(encoding="utf-8")
+    assert copied == (ROOT / "robots" / "husky.yaml").read_text(encoding="utf-8")
 
 
 def test_wrong_indentation_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.config.schema import Codec, Field
+from fieldkit.config.json_records import Codec
+from fieldkit.config.schema import Field
 
 
 class Colour(StrEnum):
@@ -33,7 +34,7 @@ class Record:
 
 
 CODEC = Codec(Record)
-WHOLE = {"number": 1, "paint": "red"}
+COMPLETE = {"number": 1, "paint": "red"}
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 parts = st.builds(Part, st.tuples(numbers, numbers), st.lists(st.text(), max_size=3).map(tuple))
@@ -53,18 +54,18 @@ def test_dumped_records_parse_to_equal_records(record: Record) -> None:
 
 
 def test_fields_are_dumped_with_their_alias() -> None:
-    assert CODEC.dump(Record(1, Colour.RED)) == {**WHOLE, "parts": [], "by_name": None, "excused": False}
+    assert CODEC.dump(Record(1, Colour.RED)) == {**COMPLETE, "parts": [], "by_name": None, "excused": False}
 
 
 @pytest.mark.parametrize(
     ("data", "message"),
     [
         ({}, "number: Field required"),
-        (WHOLE | {"number": "1"}, "number: Input should be a valid integer"),
-        (WHOLE | {"number": 1.5}, "number: Input should be a valid integer"),
-        (WHOLE | {"excused": 1}, "excused: Input should be a valid boolean"),
-        (WHOLE | {"paint": "green"}, "paint: Input should be 'red' or 'blue'"),
-        (WHOLE | {"parts": [{"at_m": [0, 1, 2]}]}, "parts.0.at_m: Tuple should have at most 2 items"),
+        (COMPLETE | {"number": "1"}, "number: Input should be a valid integer"),
+        (COMPLETE | {"number": 1.5}, "number: Input should be a valid integer"),
+        (COMPLETE | {"excused": 1}, "excused: Input should be a valid boolean"),
+        (COMPLETE | {"paint": "green"}, "paint: Input should be 'red' or 'blue'"),
+        (COMPLETE | {"parts": [{"at_m": [0, 1, 2]}]}, "parts.0.at_m: Tuple should have at most 2 items"),
         ([], "Input should be an object"),
         (None, "Input should be an object"),
     ],

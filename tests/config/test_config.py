@@ -151,9 +151,9 @@ def test_bags_of_two_robots_need_different_names() -> None:
     procedure = schema.validate(schema.parse(two, source="los.yaml"), Procedure)
     recorders = [placed.step for placed in procedure.walk() if isinstance(placed.step, Records)]
     assert {role for step in recorders for role in step.records_on()} == {Role.SENDER, Role.RELAY}
-    one = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
+    text = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
     with pytest.raises(ConfigurationError, match=r"there is already a file scan\.bag"):
-        schema.validate(schema.parse(one, source="los.yaml"), Procedure)
+        schema.validate(schema.parse(text, source="los.yaml"), Procedure)
 
 
 def test_a_transfer_without_a_file_needs_a_bag_of_its_sender() -> None:

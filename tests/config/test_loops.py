@@ -88,7 +88,7 @@ def test_file_without_loops_is_unchanged() -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "what", "line", "remedy"),
+    ("old", "new", "message", "line", "remedy"),
     [
         ('"p{bytes}"', '"p{size}"', "there is no variable size; the variables are: bytes", 4, "write {{size}} for"),
         ('"p{bytes}"', '"p{byte}"', "there is no variable byte; did you mean 'bytes'?", 4, "or use a variable"),
@@ -109,10 +109,10 @@ def test_file_without_loops_is_unchanged() -> None:
         ("8192]", "99999]", "Input should be less than or equal to 65507", 4, ""),
     ],
 )  # fmt: skip
-def test_error_in_a_loop_has_its_line_and_a_remedy(old: str, new: str, what: str, line: int, remedy: str) -> None:
+def test_error_in_a_loop_has_its_line_and_a_remedy(old: str, new: str, message: str, line: int, remedy: str) -> None:
     assert old in SWEEP
     error = error_of(SWEEP.replace(old, new))
-    assert what in error[0]
+    assert message in error[0]
     assert error[1] == line
     assert remedy in error[2]
 
@@ -134,18 +134,18 @@ SCALARS = st.one_of(st.integers(-9, 9), st.booleans(), st.text("abc", min_size=1
 
 
 @given(
-    each=st.dictionaries(
+    lists=st.dictionaries(
         st.text("abc", min_size=1, max_size=2), st.lists(SCALARS, min_size=1, max_size=3), min_size=1, max_size=3
     )
 )
-def test_order_equals_itertools_product_and_lines_are_those_of_the_loop(each: dict[str, list[Any]]) -> None:
-    step = {"step": {name: f"{{{name}}}" for name in each}}
+def test_order_equals_itertools_product_and_lines_are_those_of_the_loop(lists: dict[str, list[Any]]) -> None:
+    step = {"step": {name: f"{{{name}}}" for name in lists}}
     before = schema.Document(
-        {"steps": [{"for": {"each": each, "during": [step]}}, step]},
+        {"steps": [{"for": {"each": lists, "during": [step]}}, step]},
         "x.yaml",
         {(): 1, ("steps",): 1, ("steps", 0, "for", "during", 0): 7, ("steps", 1): 9},
     )
     after = loops.expand_loops(before, "steps")
-    combinations = [dict(zip(each, chosen, strict=True)) for chosen in itertools.product(*each.values())]
+    combinations = [dict(zip(lists, chosen, strict=True)) for chosen in itertools.product(*lists.values())]
     assert after.data["steps"] == [*({"step": values} for values in combinations), step]
     assert [after.lines["steps", index] for index in range(len(combinations) + 1)] == [7] * len(combinations) + [9]

@@ -115,19 +115,19 @@ PROFILES = sorted((ROOT / "robots").glob("*.yaml"))
 
 @pytest.mark.parametrize("path", PROFILES, ids=lambda path: path.stem)
 def test_every_key_outside_its_section_is_reported_with_the_section(path: Path) -> None:
-    whole = documents.read(path).data
+    document = documents.read(path).data
     fields = {field.alias or name: field.annotation for name, field in RobotProfile.model_fields.items()}
-    known = {**fields, **RobotProfile.section_types()}
+    sections = {**fields, **RobotProfile.section_types()}
     moved = [
         (section, key)
-        for section, value in whole.items()
-        if isinstance(value, dict) and hasattr(known[section], "model_fields")
+        for section, value in document.items()
+        if isinstance(value, dict) and hasattr(sections[section], "model_fields")
         for key in value
-        if key not in known
+        if key not in sections
     ]
     assert moved
     for section, key in moved:
-        data = copy.deepcopy(whole)
+        data = copy.deepcopy(document)
         slipped = data[section].pop(key)
         at = list(data).index(section) + 1
         items = list(data.items())

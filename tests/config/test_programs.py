@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from fieldkit.config import program_files, schema
-from fieldkit.config.program_files import LabProgram, NamedProgram
+from fieldkit.config.named_programs import NamedProgram
+from fieldkit.config.program_files import LabProgram
 from fieldkit.config.schema import Strict
 from fieldkit.core.errors import ConfigurationError
 
@@ -29,9 +30,9 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def put(name: str, source: str = "procedures/p.yaml") -> LabProgram:
-    held = schema.validate(schema.parse(f"# a comment\nput: {name}", source=source), Holder).put
-    assert held is not None
-    return held
+    value = schema.validate(schema.parse(f"# a comment\nput: {name}", source=source), Holder).put
+    assert value is not None
+    return value
 
 
 def write_program(path: str, content: bytes = SCRIPT, mode: int = 0o644) -> None:

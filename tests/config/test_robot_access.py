@@ -33,7 +33,7 @@ def test_access_equals_that_of_the_full_site_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("entry", "what"),
+    ("entry", "message"),
     [
         (f"{{host: h, user: u, port: 0, host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
         (f"{{host: h, user: u, port: '22', host_key: {KEY}}}", "port of bad must be a number from 1 to 65535"),
@@ -47,12 +47,12 @@ def test_access_equals_that_of_the_full_site_file(tmp_path: Path) -> None:
         ("nothing", "this entry is not a mapping"),
     ],
 )
-def test_error_of_one_robot_does_not_affect_the_others(entry: str, what: str) -> None:
+def test_error_of_one_robot_does_not_affect_the_others(entry: str, message: str) -> None:
     text = SITE.replace("robots:\n", f"robots:\n  bad: {entry}\n").replace("roles: {}", "rolls: 7\ncontrol: no such")
     accesses = robot_access.read_access(documents.parse(text, source="site.yaml"))
     error = accesses.pop("bad")
     assert isinstance(error, ConfigurationError)
-    assert (error.what, error.where) == (what, "site.yaml:3")
+    assert (error.what, error.where) == (message, "site.yaml:3")
     assert len(accesses) == 3
     assert all(isinstance(access, RobotAccess) for access in accesses.values())
 

@@ -43,8 +43,8 @@ def test_pinning_changes_nothing_else(text: str, tmp_path: Path) -> None:
     after = path.read_bytes().decode()
     before["robots"]["a"]["host_key"] = KEY
     assert yaml.safe_load(after) == before
-    bare, old = after.replace(KEY, ""), text.replace(f'"{OTHER}"', "").replace(OTHER, "")
-    changes = [change for change in difflib.ndiff(list(old), list(bare)) if not change.startswith("  ")]
+    without_key, old = after.replace(KEY, ""), text.replace(f'"{OTHER}"', "").replace(OTHER, "")
+    changes = [change for change in difflib.ndiff(list(old), list(without_key)) if not change.startswith("  ")]
     assert all(change.startswith("+ ") for change in changes), "nothing is removed"
     assert "".join(change[2:] for change in changes).strip(' ,:\r\n"') in {"", "host_key"}
 

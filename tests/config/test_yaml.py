@@ -1,9 +1,12 @@
 """YAML input: parsed as YAML 1.2 defines it, or rejected with line and remedy."""
 
+import re
 from collections.abc import Callable
+from operator import itemgetter
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -128,7 +131,7 @@ def test_devices_and_folders_are_rejected(path: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "where", "message"),
+    ("text", "location", "message"),
     [
         ("# lab\n\nbackend: field\n", "x:3", "required key 'robots' is missing"),
         ("", "x:1", "keys with values are needed here, and there are none"),
@@ -139,10 +142,10 @@ def test_devices_and_folders_are_rejected(path: str) -> None:
         (f"robots: {{a: {{profile: x}}}}\nroles: {{}}\npatience: {'9' * 15}s", "x:3", "too large"),
     ],
 )
-def test_error_in_a_site_file_has_message_and_line(text: str, where: str, message: str) -> None:
+def test_error_in_a_site_file_has_message_and_line(text: str, location: str, message: str) -> None:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(text, source="x"), Site)
-    assert (caught.value.where, message in caught.value.what) == (where, True), caught.value
+    assert (caught.value.where, message in caught.value.what) == (location, True), caught.value
 
 
 CAMPAIGN = """\
@@ -242,3 +245,40 @@ def test_damaged_files_cause_only_configuration_errors(file: tuple[str, type[sch
 def test_any_text_causes_only_configuration_errors(text: str) -> None:
     check_text(text, Site)
     check_text(f"robots: {text}", Site)
+
+
+def reading(text: str) -> tuple[str, object]:
+    """Return the document with its lines, or the error, as text."""
+    try:
+        document = documents.parse(text, source="x.yaml")
+    except ConfigurationError as error:
+        return str(error), error.remedy
+    return repr(document.data), document.lines
+
+
+TOKENS = (
+    *CHARACTERS,
+    "\n  ",
+    "\n- ",
+    ": ",
+    "- ",
+    "\n\n",
+    " #",
+    "\r",
+    "\x85",
+    "\u2028",
+    "é",
+    '"\\u2028"',
+    "---\n",
+    "%YAML 1.1\n",
+)
+YAML_TEXTS = st.lists(st.sampled_from(TOKENS), max_size=30).map("".join)
+
+
+@pytest.mark.skipif(not yaml.__with_libyaml__, reason="this PyYAML has no libyaml")
+@given(YAML_TEXTS | damaged().map(itemgetter(0)))
+def test_libyaml_and_the_parser_in_python_give_equal_results(text: str) -> None:
+    fast = reading(text)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(documents, "_DIFFERENT_IN_LIBYAML", re.compile(""))
+        assert reading(text) == fast

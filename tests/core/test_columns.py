@@ -22,8 +22,8 @@ def test_two_values_for_one_column_are_refused_even_if_they_are_equal() -> None:
 
 def test_a_value_replaces_a_missing_reason_on_either_side() -> None:
     value, missing = Measured({"a": 0}), Measured(missing={"a": "not captured", "b": "no ping"})
-    for both in (value | missing, missing | value):
-        assert both == Measured({"a": 0}, {"b": "no ping"})
+    for combined in (value | missing, missing | value):
+        assert combined == Measured({"a": 0}, {"b": "no ping"})
 
 
 def test_the_first_missing_reason_is_kept() -> None:
@@ -36,15 +36,15 @@ def test_a_union_keeps_all_columns_and_each_is_either_measured_or_missing(first:
         with pytest.raises(ValueError, match="measured twice"):
             first | second
         return
-    both = first | second
-    assert both.values == {**first.values, **second.values}
-    assert both.values.keys() | both.missing.keys() == {
+    combined = first | second
+    assert combined.values == {**first.values, **second.values}
+    assert combined.values.keys() | combined.missing.keys() == {
         *first.values,
         *first.missing,
         *second.values,
         *second.missing,
     }
-    assert not both.values.keys() & both.missing.keys()
+    assert not combined.values.keys() & combined.missing.keys()
     assert first | Measured() == first == Measured() | first
 
 

@@ -86,8 +86,8 @@ def test_one_of_many_processes_gets_the_lock(base: Path) -> None:
 
     def are_all_but_one_refused() -> bool:
         for pid in set(children) - codes.keys():
-            ended, status = os.waitpid(pid, os.WNOHANG)
-            codes.update({pid: os.waitstatus_to_exitcode(status)} if ended else {})
+            ended_pid, status = os.waitpid(pid, os.WNOHANG)
+            codes.update({pid: os.waitstatus_to_exitcode(status)} if ended_pid else {})
         return len(codes) >= len(children) - 1
 
     wait_until(are_all_but_one_refused, Deadline.after(60))

@@ -10,7 +10,7 @@ from fieldkit.core.text import escape_formula, json_text, one_line, sanitized, u
 
 
 @pytest.mark.parametrize(
-    ("text", "shown"),
+    ("text", "expected"),
     [
         ("plain 1.5\N{NO-BREAK SPACE}ms\nÄ 字", "plain 1.5\N{NO-BREAK SPACE}ms\nÄ 字"),
         ("a\x1b[31mb", "a?[31mb"),
@@ -19,8 +19,8 @@ from fieldkit.core.text import escape_formula, json_text, one_line, sanitized, u
         ("\a\r", "??"),
     ],
 )
-def test_terminal_control_characters_are_replaced(text: str, shown: str) -> None:
-    assert sanitized(text) == shown
+def test_terminal_control_characters_are_replaced(text: str, expected: str) -> None:
+    assert sanitized(text) == expected
 
 
 def is_shown(text: str) -> bool:

@@ -1,4 +1,5 @@
 import math
+from decimal import Decimal
 
 import pytest
 from hypothesis import given
@@ -52,6 +53,12 @@ def test_an_error_of_a_distance_has_a_remedy(text: str, message: str) -> None:
 def test_durations_scale_with_their_unit(value: float) -> None:
     text = f"{value:.6f}"
     assert math.isclose(parse_duration_s(f"{text}s"), 1000 * parse_duration_s(f"{text}ms"), rel_tol=1e-12)
+
+
+@given(st.decimals(min_value=0, max_value=10**9, places=6), st.sampled_from([("s", 0), ("ms", 3), ("us", 6)]))
+def test_a_duration_is_the_float_nearest_to_its_decimal(number: Decimal, unit: tuple[str, int]) -> None:
+    symbol, places = unit
+    assert parse_duration_s(f"{number:f}{symbol}") == float(f"{number:f}e-{places}")
 
 
 @given(st.text(max_size=12))

@@ -165,13 +165,13 @@ class Chaos:
         lab = self._field_robots.folder
         name = write_procedure(lab, PROCEDURE)
         words: tuple[str, ...] = ("trial", name, "5m", "--repeats", str(self._repeats), "--yes", "--json")
-        while (ended := self._run_once(*words)).code != 0 and self.tally.starts < MAX_STARTS:
+        while (result := self._run_once(*words)).code != 0 and self.tally.starts < MAX_STARTS:
             if self._unexplained():
                 break
-            if ended.code not in {3, -9}:
-                self.tally.problems.append(f"exit code {ended.code}: {ended.err}")
-            self.tally.stops.append(ended.err.strip())
-            if "holds it since" in ended.err and not self._trial_exists():
+            if result.code not in {3, -9}:
+                self.tally.problems.append(f"exit code {result.code}: {result.err}")
+            self.tally.stops.append(result.err.strip())
+            if "holds it since" in result.err and not self._trial_exists():
                 # fieldkit was killed after locking the robots and before creating its folder, so there is nothing to
                 # resume.
                 fieldkit(lab, "abort", "--yes")

@@ -67,12 +67,12 @@ def table(section: str) -> dict[str, Row]:
     rows_by_situation = {}
     for line in body[1].splitlines():
         if re.match(r"\| (?!what is wrong|---)", line):
-            situation, code, message, remedy = (_bare(cell) for cell in line.strip("| ").split(" | "))
+            situation, code, message, remedy = (_without_backticks(cell) for cell in line.strip("| ").split(" | "))
             rows_by_situation[situation] = Row(situation, int(code), message, remedy)
     return rows_by_situation
 
 
-def _bare(cell: str) -> str:
+def _without_backticks(cell: str) -> str:
     """Return a cell without the backticks that mark code."""
     bare = cell.strip()
     marks = len(bare) - len(bare.lstrip("`"))
@@ -87,7 +87,7 @@ def site(text: str = LAB, *changes: str, command: str = DRY) -> Setup:
     return setup
 
 
-def own(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
+def own_file(kind: Kind, name: str, *changes: str, command: str = DRY) -> Setup:
     def setup(lab: Path) -> str:
         labs.copy_shipped(lab, kind, name, *changes)
         return command
@@ -101,8 +101,8 @@ def campaign(*changes: str, started: bool = False) -> Setup:
         path = lab / "lawn.yaml"
         path.write_text(text, encoding="utf-8")
         if started:
-            asked, _ = plan.make_plan(path, "emulated")
-            with CampaignJournal(lab / "trials" / "campaign_lawn").locked(asked):
+            campaign_plan, _ = plan.make_plan(path, "emulated")
+            with CampaignJournal(lab / "trials" / "campaign_lawn").locked(campaign_plan):
                 pass
         for old, new in zip(changes[::2], changes[1::2], strict=True):
             assert old in text
@@ -214,31 +214,33 @@ WRITTEN: dict[str, Setup] = {
     "a robot without a host in the field": site(LAB, "backend: emulated", "backend: field"),
     "a password in the site file": site(LAB, "{profile: duckiedrone}", "{profile: duckiedrone, password: s3same}"),
     "a file that is not UTF-8": lambda lab: ((lab / "fieldkit.yaml").write_bytes(b"backend: \xff"), DRY)[1],
-    "an unknown kind of step": own("procedures", "los", "  - ping:", "  - pong:"),
-    "a step for a role that does not exist": own("procedures", "los", "{robot: sender", "{robot: senderr"),
-    "a payload that no packet can carry": own("procedures", "los", "udp: 8192", "udp: 65508"),
-    "a second step of a kind": own(
+    "an unknown kind of step": own_file("procedures", "los", "  - ping:", "  - pong:"),
+    "a step for a role that does not exist": own_file("procedures", "los", "{robot: sender", "{robot: senderr"),
+    "a payload that no packet can carry": own_file("procedures", "los", "udp: 8192", "udp: 65508"),
+    "a second step of a kind": own_file(
         "procedures", "los", "during:", "during:\n        - ping: {from: sender, to: receiver}"
     ),
-    "one robot that captures twice": own(
+    "one robot that captures twice": own_file(
         "procedures", "los", "robots: [sender, receiver]", "robots: [sender, sender]"
     ),
-    "an unknown variable": own(
+    "an unknown variable": own_file(
         "procedures",
         "los",
         "        - ping: {",
         "        - for: {each: {n: [1, 2]}, during: [ping: {name: 'p{m}'}]}\n        - ping: {",
     ),
-    "two transfers to one port in one capture": own(
+    "two transfers to one port in one capture": own_file(
         "procedures",
         "los",
         "        # The",
         "        - transfer: {name: more, from: sender, to: receiver}\n        # The",
     ),
-    "a received file named as the bag": own("procedures", "los", "into: recv.bag", "into: scan.bag"),
-    "a rate without a unit": own("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
-    "a profile whose name differs from its file": own("robots", "duckiedrone", "name: duckiedrone", "name: drone"),
-    "a record command without its topics": own("robots", "turtlebot3_burger", '"{topics}"]', "]"),
+    "a received file named as the bag": own_file("procedures", "los", "into: recv.bag", "into: scan.bag"),
+    "a rate without a unit": own_file("robots", "turtlebot3_burger", "rate: 5Hz", "rate: 5"),
+    "a profile whose name differs from its file": own_file(
+        "robots", "duckiedrone", "name: duckiedrone", "name: drone"
+    ),
+    "a record command without its topics": own_file("robots", "turtlebot3_burger", '"{topics}"]', "]"),
     "a campaign without a seed": campaign("seed: 7\n", ""),
     "one distance twice": campaign("20ft", "3.048m"),
     "an exception that matches no trial": campaign("seed: 7", "seed: 7\nexcept: [{distance: 55ft}]"),

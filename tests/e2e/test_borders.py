@@ -205,9 +205,9 @@ def test_a_procedure_with_a_section_of_the_removed_package_is_refused(run_in: Fi
 def test_the_permissions_of_the_removed_package_are_not_options(
     run_in: Fieldkit, tmp_path: Path, command: str
 ) -> None:
-    shown = run_in(tmp_path, command, "--help").out
-    assert "--yes" in shown
-    assert "--allow-" not in shown
+    help_text = run_in(tmp_path, command, "--help").out
+    assert "--yes" in help_text
+    assert "--allow-" not in help_text
 
 
 def write_procedure(folder: Path, name: str, text: str) -> None:

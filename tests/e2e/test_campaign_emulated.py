@@ -107,7 +107,7 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
         first, second = nothing.events("campaign_planned")[0]["trials"]
         run = answered(tmp_path, "s", "n rigged by Ann", "n wet grass", "", "")
         assert run.code == 0, run.err
-        asked = [event["text"] for event in run.events("request")]
+        questions = [event["text"] for event in run.events("request")]
         move = {
             "los 10ft master": "move turtlebot-1 and turtlebot-2 to 10 ft (3.05 m) from duckiedrone-1, "
             "on opposite sides of it, nothing between them",
@@ -119,7 +119,7 @@ def test_skipped_trials_are_offered_again_and_notes_are_kept(tmp_path: Path) -> 
             "los 10ft masterless": "set the robots up for topology masterless: "
             "turtlebot-1 as sender, duckiedrone-1 as receiver",
         }
-        assert asked == [move[first], rig[second], move[second], rig[first], move[first]]
+        assert questions == [move[first], rig[second], move[second], rig[first], move[first]]
         assert [event["may_skip"] for event in run.events("request")] == [True, False, True, False, True]
     noted, plain = ((trial / "trial.yaml").read_text(encoding="utf-8") for trial in trials(folder))
     assert "notes: campaign lawn; rigged by Ann; wet grass\n" in noted

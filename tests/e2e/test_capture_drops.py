@@ -49,22 +49,22 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
     plan = store.read_plan(trial)
-    (ended,) = journal.ended(journal.history(trial, plan))
-    return plan, store.attempt_folder(trial, ended.folder), ended
+    (entry,) = journal.ended(journal.history(trial, plan))
+    return plan, store.attempt_folder(trial, entry.folder), entry
 
 
 def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tuple[tuple[str, ...], Measured]:
     """Return the problems and columns of an attempt in which tcpdump reports 12 packets dropped by the kernel."""
-    plan, folder, ended = attempt
+    plan, folder, entry = attempt
     log = folder / f"{capture}-capture.log"
-    whole = log.read_text(encoding="utf-8")
+    text = log.read_text(encoding="utf-8")
     log.write_text(
-        re.sub(r"(?m)^0 packets dropped by kernel", "12 packets dropped by kernel", whole), encoding="utf-8"
+        re.sub(r"(?m)^0 packets dropped by kernel", "12 packets dropped by kernel", text), encoding="utf-8"
     )
     try:
-        judged = gates.judge(plan, ended.repeat, AttemptEvidence(folder))
+        judged = gates.judge(plan, entry.repeat, AttemptEvidence(folder))
     finally:
-        log.write_text(whole, encoding="utf-8")
+        log.write_text(text, encoding="utf-8")
     return judged.problems, judged.measured
 
 
@@ -85,8 +85,8 @@ def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journ
 
 
 def test_without_drops_nothing_is_withheld(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
-    plan, folder, ended = attempt
-    judged = gates.judge(plan, ended.repeat, AttemptEvidence(folder))
+    plan, folder, entry = attempt
+    judged = gates.judge(plan, entry.repeat, AttemptEvidence(folder))
     assert judged.problems == ()
     assert "topic_packet_loss" in judged.measured.values
     assert "topic_capture_withheld" not in judged.measured.values

@@ -50,14 +50,14 @@ def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
     folder = store.attempt_folder(trial, attempt.folder)
     for name in ("dds", "zenoh"):
         log = folder / f"{name}.receiver-topic.bin"
-        whole = log.read_bytes()
-        for changed, why in (
-            (shifted(whole, 50_000_000), "later than its capture for every sample"),
-            (shifted(whole, -5_000_000), "earlier than their packets in its capture"),
-            (whole[:-40] + struct.pack("<d", 1.5) + whole[-32:], "its checksum is wrong"),
+        content = log.read_bytes()
+        for changed, reason in (
+            (shifted(content, 50_000_000), "later than its capture for every sample"),
+            (shifted(content, -5_000_000), "earlier than their packets in its capture"),
+            (content[:-40] + struct.pack("<d", 1.5) + content[-32:], "its checksum is wrong"),
         ):
             log.write_bytes(changed)
             problems = gates.judge(plan, attempt.repeat, AttemptEvidence(folder)).problems
-            assert any(why in problem for problem in problems), problems
-        log.write_bytes(whole)
+            assert any(reason in problem for problem in problems), problems
+        log.write_bytes(content)
     assert gates.judge(plan, attempt.repeat, AttemptEvidence(folder)).problems == ()

@@ -86,7 +86,7 @@ def test_a_void_attempt_without_a_fault_is_unexplained(beside: Void) -> None:
 
 
 def test_a_fault_does_not_explain_all_later_attempts() -> None:
-    many = [void(0, 150 + number) for number in range(VOIDS_PER_FAULT + 3)]
-    assert unexplained(many, FAULTS_AT) == many[VOIDS_PER_FAULT:]
+    attempts = [void(0, 150 + number) for number in range(VOIDS_PER_FAULT + 3)]
+    assert unexplained(attempts, FAULTS_AT) == attempts[VOIDS_PER_FAULT:]
     late = void(0, RECOVERY_NS * 4)
-    assert unexplained([*many[:VOIDS_PER_FAULT], late], FAULTS_AT) == []
+    assert unexplained([*attempts[:VOIDS_PER_FAULT], late], FAULTS_AT) == []

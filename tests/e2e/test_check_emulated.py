@@ -28,7 +28,7 @@ def findings_by_check(run: Run) -> dict[tuple[str, str], dict[str, str]]:
 
 
 def failed(run: Run) -> set[tuple[str, str]]:
-    return {where for where, finding in findings_by_check(run).items() if finding["status"] == "fail"}
+    return {check for check, finding in findings_by_check(run).items() if finding["status"] == "fail"}
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_each_fault_is_reported_with_its_remedy_and_the_rest_is_checked(field_ro
         ("duckiedrone-1", "right to capture"),
         ("duckiedrone-1", "jobs"),
     }
-    assert all(findings[where]["remedy"] for where in failed(run))
+    assert all(findings[check]["remedy"] for check in failed(run))
     assert "nc.traditional -l -p 1234" in findings["duckiedrone-1", "jobs"]["detail"]
     assert findings["turtlebot-1", "topic /scan"]["status"] == "ok"
 

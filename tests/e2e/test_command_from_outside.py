@@ -47,12 +47,12 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
     )
     environment = os.environ | {"PYTHONPATH": f"{installed}{os.pathsep}{ROOT}"}
 
-    def run(*words: str, **asked: str) -> subprocess.CompletedProcess[str]:
+    def run(*words: str, **variables: str) -> subprocess.CompletedProcess[str]:
         command = (sys.executable, "-m", "fieldkit", *words)
         return subprocess.run(
             command,
             cwd=tmp_path,
-            env=environment | asked,
+            env=environment | variables,
             capture_output=True,
             text=True,
             check=False,
@@ -71,8 +71,8 @@ def test_the_command_runs_with_its_declared_options(fieldkit: Fieldkit) -> None:
 
 def test_its_help_and_errors_look_like_those_of_other_commands(fieldkit: Fieldkit, tmp_path: Path) -> None:
     assert "List the repeats of a trial with the largest loss." in fieldkit("worst", "--help").stdout
-    refused = fieldkit("worst", str(TRIAL), "--by", "rtt_los")
-    assert (refused.returncode, refused.stderr.count("did you mean 'rtt_loss'?")) == (2, 1), refused.stderr
+    result = fieldkit("worst", str(TRIAL), "--by", "rtt_los")
+    assert (result.returncode, result.stderr.count("did you mean 'rtt_loss'?")) == (2, 1), result.stderr
     missing = fieldkit("worst", str(tmp_path))
     assert (missing.returncode, missing.stderr.count("remedy: name a trial")) == (4, 1), missing.stderr
 
@@ -83,8 +83,8 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
     )
     answer = tmp_path / "answer"
     for line, words in (("fieldkit wor", ["worst "]), ("fieldkit worst x --b", ["--by "])):
-        asked = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
-        fieldkit(**asked, _ARGCOMPLETE_STDOUT_FILENAME=str(answer))
+        variables = {"_ARGCOMPLETE": "1", "COMP_LINE": line, "COMP_POINT": str(len(line)), "_ARGCOMPLETE_IFS": "\n"}
+        fieldkit(**variables, _ARGCOMPLETE_STDOUT_FILENAME=str(answer))
         assert answer.read_text(encoding="utf-8").split("\n") == words, line
 
 
@@ -98,10 +98,10 @@ def test_the_help_lists_it_and_the_tab_key_completes_it(fieldkit: Fieldkit, tmp_
     ],
 )
 def test_a_broken_package_is_named_when_its_command_is_used(fieldkit: Fieldkit, command: str, message: str) -> None:
-    refused = fieldkit(command)
-    assert refused.returncode == 2
-    assert refused.stderr.startswith(f"error: {message}")
-    assert "\n  remedy: " in refused.stderr
+    result = fieldkit(command)
+    assert result.returncode == 2
+    assert result.stderr.startswith(f"error: {message}")
+    assert "\n  remedy: " in result.stderr
 
 
 def test_other_commands_work_and_keep_their_names_despite_broken_packages(fieldkit: Fieldkit) -> None:

@@ -14,7 +14,7 @@ from fieldkit.config.site import load_site
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Unattended
 from fieldkit.core.units import parse_distance
-from fieldkit.remote.link import Timing
+from fieldkit.remote.sockets import Timing
 from fieldkit.remote.ssh import CONNECT_S
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.testbed import EmulatedTestbed
@@ -62,8 +62,8 @@ def emulated(folder: Path, control: str) -> Iterator[tuple[Cast, EmulatedTestbed
     site = folder / "fieldkit.yaml"
     text = DEFAULT_SITE.read_text(encoding="utf-8")
     options = "{ros: builtin, record_air: true, radio: {fading: false}}"
-    more = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {options}\n"
-    site.write_text(text + more, encoding="utf-8")
+    extra_keys = f"control: {control}\npatience: {PATIENCE_S:g}s\nemulated: {options}\n"
+    site.write_text(text + extra_keys, encoding="utf-8")
     backend = EmulatedBackend(*load_site(site))
     cast = backend.cast(TOPOLOGY)
     with backend.open(cast, seed=1, sink=lambda _: None, operator=Unattended()) as testbed:

@@ -168,8 +168,8 @@ def test_evidence_of_a_sender_that_was_out_of_range_is_fetched_and_nothing_runs_
     site.write_text(site.read_text(encoding="utf-8") + "control: radio\n", encoding="utf-8")
     monkeypatch.chdir(folder)
     observed = run_with_outage(folder, protocol, phase, is_under_way)
-    for what in ("lost", "open again"):
-        link_was_reported = any(f"link is {what}" in note for note in observed.notes)
+    for state in ("lost", "open again"):
+        link_was_reported = any(f"link is {state}" in note for note in observed.notes)
         # A TCP transfer is longer than the outage, and an idle connection is not affected by it.
         assert link_was_reported is (phase == "record" or protocol is Protocol.UDP)
     assert control_packets_during_transfer(folder / "radio.pcap") == []

@@ -304,8 +304,8 @@ def test_fieldkit_reads_simulations_like_trials(lab: Path) -> None:
     ]
     assert (cell["n_valid"], cell["backend"], cell["distance_m"]) == ("2", "cosim", "9.144")
     assert cell["procedure"] == "pass state/bob (scheduled 10 ms)"
-    both = run_here(lab, "compare", "scheduled", "sliding_window", "--format", "csv")
-    assert [row["n_b"] for row in rows(both.out) if is_loss_row(row)] == ["2"], both.err
+    comparison = run_here(lab, "compare", "scheduled", "sliding_window", "--format", "csv")
+    assert [row["n_b"] for row in rows(comparison.out) if is_loss_row(row)] == ["2"], comparison.err
     trial = run_here(
         lab, "compare", str(TRIAL), "scheduled", "--by", "scenario,distance_m,protocol", "--force", "--format", "csv"
     )

@@ -35,7 +35,7 @@ def test_every_policy_has_a_row_and_exact_ones_have_no_error(lab: Path) -> None:
     for policy in POLICIES[:2]:
         exact = {name: float(value) for name, value in rows_by_policy[policy].items() if "error" in name}
         # Positions are those of the last step of the physics.
-        position_errors_m = [exact.pop(f"position_error_{what}_m") for what in ("mean", "p95", "max")]
+        position_errors_m = [exact.pop(f"position_error_{statistic}_m") for statistic in ("mean", "p95", "max")]
         assert set(exact.values()) == {0.0}
         assert 0 < position_errors_m[0] <= position_errors_m[2] <= 1.0 * 0.001 + 1e-9, "1 m/s for a step of 1 ms"
     # Half a window of 10 ms: arrivals anywhere in a window wait for its end.
@@ -128,15 +128,17 @@ def test_followers_are_reported_with_their_distance_from_the_reference_path(lab:
 
 
 def test_a_run_reports_the_same_followers_as_its_recording(lab: Path) -> None:
-    ran = cosim(lab, "run", "convoy", "--duration", "1s", "--window", "7ms", "--policy", "scheduled", "--out", "sim")
-    assert "spacing (cm)" in ran.out
+    result = cosim(
+        lab, "run", "convoy", "--duration", "1s", "--window", "7ms", "--policy", "scheduled", "--out", "sim"
+    )
+    assert "spacing (cm)" in result.out
     assert len(list((lab / "sim" / "captures").iterdir())) == 3
     replayed = cosim(lab, "replay", "sim")
-    assert replayed.out.partition("followers\n")[2] == ran.out.partition("followers\n")[2], replayed.err
+    assert replayed.out.partition("followers\n")[2] == result.out.partition("followers\n")[2], replayed.err
     report = json.loads(cosim(lab, "replay", "sim", "--format", "json").out)
     assert report.keys() == {"flows", "followers"}
     (row,) = report["followers"]
-    assert f"{100 * row['spacing_mean_m']:.3g}" in ran.out.partition("followers\n")[2]
+    assert f"{100 * row['spacing_mean_m']:.3g}" in result.out.partition("followers\n")[2]
 
 
 def test_the_table_of_a_shootout_can_be_plotted_again(lab: Path) -> None:

@@ -133,7 +133,7 @@ def test_the_delays_of_simultaneous_transfers_are_measured(trial: Path) -> None:
     """Emulated robots share one clock; traffic in the other direction is used to measure the offset."""
     for _, _, values in attempts(trial, Protocol.UDP):
         for name in ("up", "down"):
-            offset_s, error_s = (values[f"{name}.clock_offset{what}_s"] for what in ("", "_error"))
+            offset_s, error_s = (values[f"{name}.clock_offset{suffix}_s"] for suffix in ("", "_error"))
             assert isinstance(offset_s, float)
             assert isinstance(error_s, float)
             assert abs(offset_s) <= error_s

@@ -60,7 +60,7 @@ class Command:
 
     text: str
     exit_code: int
-    shown: str
+    output: str
 
 
 def shape(output: str) -> list[str]:
@@ -73,20 +73,20 @@ def commands(page: Path) -> Iterator[Command]:
         lines = iter(block.splitlines())
         texts: list[list[str]] = []
         codes: list[int] = []
-        shown: list[list[str]] = []
+        outputs: list[list[str]] = []
         for line in lines:
             if line.startswith("$ "):
                 texts.append([line.removeprefix("$ ")])
                 codes.append(0)
-                shown.append([])
+                outputs.append([])
                 if line.endswith("<<'EOF'"):
                     while texts[-1][-1] != "EOF":
                         texts[-1].append(next(lines))
             elif announced := re.fullmatch(r"# exit code (\d+)", line):
                 codes[-1] = int(announced[1])
             else:
-                shown[-1].append(f"{line}\n")
-        for text, code, output in zip(texts, codes, shown, strict=True):
+                outputs[-1].append(f"{line}\n")
+        for text, code, output in zip(texts, codes, outputs, strict=True):
             yield Command("\n".join(text), code, "".join(output))
 
 
@@ -115,8 +115,8 @@ def run_commands(page: Path, folder: Path) -> None:
             check=False,
         )
         assert process.returncode == command.exit_code, f"$ {command.text}\n{process.stdout}"
-        if command.shown and REPRODUCIBLE.search(command.text):
-            assert shape(command.shown) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
+        if command.output and REPRODUCIBLE.search(command.text):
+            assert shape(command.output) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
 
 
 COMMAND_PAGES = sorted(

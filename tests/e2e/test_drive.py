@@ -287,13 +287,13 @@ def assert_held(field_robots: FieldRobots, reason: str) -> None:
     """Assert that the stopped motion is held, and that its repeat is void for the same reason."""
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
-    held = json.loads((trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()[-1])
-    assert reason in held["reason"]
+    last_entry = json.loads((trial / "motion.jsonl").read_text(encoding="utf-8").splitlines()[-1])
+    assert reason in last_entry["reason"]
     assert [(row["status"], row["reason"]) for row in rows(trial)] == [("void", reason)]
     stopped_m = place_m(field_robots)
     again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
-    assert f"rover-1: {held['reason']}" in again.err
+    assert f"rover-1: {last_entry['reason']}" in again.err
     assert place_m(field_robots) == pytest.approx(stopped_m, abs=0.01)
 
 

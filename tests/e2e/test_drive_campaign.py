@@ -40,9 +40,9 @@ OPTION = "--allow-motion-after-fault"
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RoverLab]:
-    with rover_lab(tmp_path_factory.mktemp("lawn"), fence_m=FENCE_M, lease_s=LEASE_S) as made:
-        (made.folder / "lawn.yaml").write_text(CAMPAIGN, encoding="utf-8")
-        yield made
+    with rover_lab(tmp_path_factory.mktemp("lawn"), fence_m=FENCE_M, lease_s=LEASE_S) as created_lab:
+        (created_lab.folder / "lawn.yaml").write_text(CAMPAIGN, encoding="utf-8")
+        yield created_lab
 
 
 def campaign(lab: RoverLab, out: str, *words: str) -> Run:
@@ -121,8 +121,8 @@ def test_a_robot_outside_its_fence_does_not_start_in_the_next_trial_of_a_campaig
         wait_for_end({process.pid}, within_s=60.0)
     lab.drive_forward(FENCE_M)
     since_ns = time.time_ns()
-    refused = campaign(lab, out, *site, *UNASKED, OPTION)
-    assert_unmoved(lab, refused, f"outside its fence of {FENCE_M:g} m", since_ns)
+    result = campaign(lab, out, *site, *UNASKED, OPTION)
+    assert_unmoved(lab, result, f"outside its fence of {FENCE_M:g} m", since_ns)
 
     # A person puts it back and confirms this: a new origin, which applies to both trials.
     lab.place_at("5m")

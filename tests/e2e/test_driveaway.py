@@ -59,9 +59,9 @@ def range_m() -> float:
     return near_m
 
 
-def frames(folder: Path, where: tuple[TrackPoint, ...]) -> list[tuple[float, str, bool]]:
+def frames(folder: Path, points: tuple[TrackPoint, ...]) -> list[tuple[float, str, bool]]:
     """Return the distance, mode and success of each attempt to reach the receiver."""
-    changes = track.distances_m(where, Role.SENDER, Role.RECEIVER)
+    changes = track.distances_m(points, Role.SENDER, Role.RECEIVER)
     distances = [(utc_ns, metres) for utc_ns, metres in changes if metres is not None]
     with (folder / "air.csv").open(encoding="ascii", newline="") as file:
         lines = [line for line in csv.DictReader(file) if line["receiver"] == "duckiedrone-1"]
@@ -80,21 +80,21 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     (folder,) = (trial / "repeats").glob("udp-01")
 
-    where = track.read(folder / "track.csv")
-    receiver_track = [point for point in where if point.role is Role.RECEIVER]
-    assert {point.position_m for point in where if point.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
+    points = track.read(folder / "track.csv")
+    receiver_track = [point for point in points if point.role is Role.RECEIVER]
+    assert {point.position_m for point in points if point.role is Role.SENDER} == {(3.0, 6.0, 0.2)}
     east_m = [point.position_m[0] for point in receiver_track if point.position_m is not None]
     assert (east_m[0], max(east_m), east_m[-1]) == (43.0, 43.0 + PATH_M, 43.0), "there, and back at its place"
-    assert all(here < there for here, there in pairwise(east_m[:-1]))
+    assert all(earlier < later for earlier, later in pairwise(east_m[:-1]))
     assert len(east_m) > PATH_M / 2, "positions along the whole path"
     assert {point.velocity_m_s for point in receiver_track[1:-2]} == {(SPEED_M_S, 0.0, 0.0)}
     assert receiver_track[-2].velocity_m_s == receiver_track[-1].velocity_m_s == (0.0, 0.0, 0.0)
 
     end_m = range_m()
     assert 60 < end_m < 40 + PATH_M, "the route leads out of range"
-    sent = frames(folder, where)
-    heard = [metres for metres, _, received in sent if received]
-    assert end_m - 10 < max(heard) <= end_m
+    sent = frames(folder, points)
+    received_m = [metres for metres, _, received in sent if received]
+    assert end_m - 10 < max(received_m) <= end_m
     nearest_m = min(metres for metres, _, _ in sent)  # the robot already drives while the programs start
     near, far = ([RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10))
     assert sum(near) / len(near) > 1.2 * sum(far) / len(far)

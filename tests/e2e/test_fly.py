@@ -71,8 +71,8 @@ def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     assert float(row["transfer_distance_max_m"]) > float(row["transfer_distance_start_m"]) + 0.5
     assert float(row["rtt_distance_max_m"]) > 8.0
     assert float(row["rtt_loss"]) > 0.1
-    where = track.read(trial / "repeats/tcp-01/track.csv")
-    flown_m = [point.position_m for point in where if point.role is Role.RECEIVER and point.position_m is not None]
+    points = track.read(trial / "repeats/tcp-01/track.csv")
+    flown_m = [point.position_m for point in points if point.role is Role.RECEIVER and point.position_m is not None]
     ground_m = flown_m[0][2]
     assert max(up_m for _, _, up_m in flown_m) == pytest.approx(ground_m + 1.0, abs=0.4)
     assert flown_m[-1][2] == pytest.approx(ground_m, abs=1e-6), "it landed"
@@ -148,12 +148,12 @@ def field_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FieldRobo
 def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(field_robots: FieldRobots) -> None:
     set_parameter(field_robots, Role.SENDER, "RTL_ALT", 100)
     set_parameter(field_robots, Role.SENDER, "WPNAV_RADIUS", 10)
-    process = flying(field_robots, Role.SENDER, how="return", lease="60s")
+    process = flying(field_robots, Role.SENDER, abort="return", lease="60s")
     wait_until(lambda: far_m(field_robots, Role.SENDER) > 1.5, Deadline.after(60))
     process.send_signal(signal.SIGINT)
     stopped = finish(process)
     assert stopped.code == 130
-    stops, comes, ground = map(
+    stop_line, return_line, ground_line = map(
         stopped.err.index,
         (
             "stopping: copter-1 returns automatically, if it is in the air: this takes up to about ",
@@ -161,7 +161,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(fie
             "copter-1: stopped (on the ground)",
         ),
     )
-    assert stops < comes < ground
+    assert stop_line < return_line < ground_line
     assert height_m(field_robots, Role.SENDER) < 1e-3, "confirmed when it is there"
     assert_landed(field_robots, Role.SENDER, "return: the job was cancelled")
     assert far_m(field_robots, Role.SENDER) < NEAR_M
@@ -170,7 +170,7 @@ def test_the_first_ctrl_c_lets_an_arducopter_return_and_waits_for_the_ground(fie
 
 def test_a_drone_continues_without_its_laptop_until_abort(field_robots: FieldRobots) -> None:
     """If fieldkit is killed, the drone lands when its lease ends; `fieldkit abort` ends its job before that."""
-    process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
+    process = flying(field_robots, Role.RECEIVER, abort="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
@@ -184,7 +184,7 @@ def test_a_drone_continues_without_its_laptop_until_abort(field_robots: FieldRob
 
 
 def test_a_second_ctrl_c_does_not_wait_for_the_landing(field_robots: FieldRobots) -> None:
-    process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
+    process = flying(field_robots, Role.RECEIVER, abort="land", lease="60s")
     assert process.stderr is not None
     process.send_signal(signal.SIGINT)
     assert any("duckiedrone-1: coming down (land)" in line for line in process.stderr)
@@ -197,7 +197,7 @@ def test_a_second_ctrl_c_does_not_wait_for_the_landing(field_robots: FieldRobots
 
 
 def test_stop_lands_a_drone_after_fieldkit_was_killed(field_robots: FieldRobots) -> None:
-    process = flying(field_robots, Role.RECEIVER, how="land", lease="60s")
+    process = flying(field_robots, Role.RECEIVER, abort="land", lease="60s")
     process.kill()
     process.communicate(timeout=60)
     stopped = run_here(field_robots.folder, "stop", "--all")
@@ -218,12 +218,12 @@ def set_parameter(field_robots: FieldRobots, role: Role, name: str, value: float
     field_robots.testbed.shells[role].run((sys.executable, "-c", program), deadline=Deadline.after(60))
 
 
-def flying(field_robots: FieldRobots, role: Role, *, how: str, lease: str) -> "subprocess.Popen[str]":
+def flying(field_robots: FieldRobots, role: Role, *, abort: str, lease: str) -> "subprocess.Popen[str]":
     """Wait for stopped motors after a landing; start a trial, and return when its drone is in the air."""
     field_robots.testbed.shells[role].run((sys.executable, "-c", STANDS), deadline=Deadline.after(60))
     (field_robots.folder / "procedures").mkdir(exist_ok=True)
     text = GIVEN_UP
-    for word, value in (("ROLE", role), ("HOW", how), ("LEASE", lease)):
+    for word, value in (("ROLE", role), ("HOW", abort), ("LEASE", lease)):
         text = text.replace(word, value)
     (field_robots.folder / "procedures/givenup.yaml").write_text(text, encoding="utf-8")
     process = start(field_robots.folder, "trial", "givenup", "5m", "--yes", "--allow-motion", "--json")
@@ -232,11 +232,11 @@ def flying(field_robots: FieldRobots, role: Role, *, how: str, lease: str) -> "s
     return process
 
 
-def assert_landed(field_robots: FieldRobots, role: Role, why: str) -> None:
+def assert_landed(field_robots: FieldRobots, role: Role, reason: str) -> None:
     """Wait until the drone is on the ground, and check the reason that its program reports for the landing."""
     wait_until(lambda: height_m(field_robots, role) < 1e-3, Deadline.after(60))
     shell = field_robots.testbed.shells[role]
-    assert why in shell.run(("sh", "-c", NEWEST), deadline=Deadline.after(30)).stdout.decode()
+    assert reason in shell.run(("sh", "-c", NEWEST), deadline=Deadline.after(30)).stdout.decode()
 
 
 def moved_m(field_robots: FieldRobots, role: Role) -> Vector:

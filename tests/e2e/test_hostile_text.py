@@ -31,9 +31,9 @@ BARE_PRINT = {"fieldkit/cli/display.py", "fieldkit/cli/terminal.py", "fieldkit/c
 def formats() -> Iterator[tuple[str, str]]:
     """Yield every command that has a choice of formats, with each format, including commands added later."""
     for command in ("aggregate", "compare", "export"):
-        known = parser().command(command)
-        assert known is not None
-        (choices,) = (action.choices for action in known._actions if "--format" in action.option_strings)
+        arguments = parser().command(command)
+        assert arguments is not None
+        (choices,) = (action.choices for action in arguments._actions if "--format" in action.option_strings)
         assert choices is not None
         yield from ((command, form) for form in choices)
 
@@ -129,9 +129,9 @@ def round_trip(row: RepeatRow) -> dict[str, object]:
 
 @given(st.tuples(*[st.text(st.characters(exclude_categories=["C", "Z"]), max_size=12)] * 3))
 def test_a_table_that_is_read_again_has_equal_texts(texts: tuple[str, str, str]) -> None:
-    own = dict(zip(("distance", "reason", "sender"), texts, strict=True))
-    own = {name: "" if text in {"nan", "NaN"} else text for name, text in own.items()}
-    assert round_trip(replace(ROW, **own)) == own
+    columns_read = dict(zip(("distance", "reason", "sender"), texts, strict=True))
+    columns_read = {name: "" if text in {"nan", "NaN"} else text for name, text in columns_read.items()}
+    assert round_trip(replace(ROW, **columns_read)) == columns_read
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)

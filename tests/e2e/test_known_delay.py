@@ -34,7 +34,7 @@ def test_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, st
 @pytest.mark.parametrize("delay_ms", [5, 20])
 def test_the_offset_of_a_clock_to_itself_is_zero(delayed: dict[str, list[dict[str, str]]], delay_ms: int) -> None:
     """Both robots use this machine's clock, so the true offset is 0; half a round trip is the delay of the link."""
-    own_s = most(delayed["0"], "rtt_median_s")
+    own_s = largest(delayed["0"], "rtt_median_s")
     for row in delayed[str(delay_ms)]:
         offset_s, error_s = float(row["clock_offset_s"]), float(row["clock_offset_error_s"])
         assert abs(offset_s) <= min(error_s, 0.5e-3 + own_s)
@@ -43,7 +43,7 @@ def test_the_offset_of_a_clock_to_itself_is_zero(delayed: dict[str, list[dict[st
         assert row["one_way_withheld"] == "the error is above a tenth of: min, median, mean, p95"
         assert row["one_way_median_s"] == "", "missing is empty"
         for name in ("delay_variation_p95_s", "jitter_s"):
-            assert float(row[name]) < 1e-3 + most(delayed["0"], name)
+            assert float(row[name]) < 1e-3 + largest(delayed["0"], name)
 
 
 @pytest.mark.parametrize("delay_ms", [5, 20])
@@ -61,5 +61,5 @@ def test_the_delay_on_the_air_is_that_of_the_link(delayed: dict[str, list[dict[s
         assert int(row["delay_packets"]) == pytest.approx(int(row["ip_packets_received"]), abs=2)
 
 
-def most(table: list[dict[str, str]], column: str) -> float:
+def largest(table: list[dict[str, str]], column: str) -> float:
     return max(float(row[column]) for row in table)

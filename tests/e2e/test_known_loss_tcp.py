@@ -72,7 +72,7 @@ def test_tcp_retransmits_mostly_lost_packets(lossy_tcp: dict[str, list[dict[str,
     paused = sum(row["tcp_retransmitted_segments"] != "0" for row in without_loss)
     assert paused <= len(without_loss) / 2, "a machine may be busy, but not in every repeat"
     spurious, retransmitted = (
-        sum(total(table, f"tcp_{what}_segments") for table in lossy_tcp.values())
-        for what in ("spurious", "retransmitted")
+        sum(total(table, f"tcp_{kind}_segments") for table in lossy_tcp.values())
+        for kind in ("spurious", "retransmitted")
     )
     assert spurious <= retransmitted / 2, (spurious, retransmitted)

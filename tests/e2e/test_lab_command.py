@@ -55,7 +55,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         assert fieldkit(lab_folder, "lab", "down").code == 0
 
 
-def plain(lab_folder: Path, *argv: str) -> str:
+def run_plain(lab_folder: Path, *argv: str) -> str:
     """Run a program without any of fieldkit's environment."""
     done = subprocess.run(
         argv,
@@ -98,22 +98,22 @@ def test_ps_shows_robots_roles_addresses_positions_and_programs(lab: Path) -> No
 
 
 def test_plain_ssh_scp_and_sftp_reach_the_robots(lab: Path) -> None:
-    assert plain(lab, "ssh", "-F", "ssh.conf", "ground-1", "hostname") == "ground-1\n"
-    assert plain(lab, "ssh", "-F", "ssh.conf", "air-1", "hostname") == "air-1\n"
+    assert run_plain(lab, "ssh", "-F", "ssh.conf", "ground-1", "hostname") == "ground-1\n"
+    assert run_plain(lab, "ssh", "-F", "ssh.conf", "air-1", "hostname") == "air-1\n"
     (lab / "there").write_bytes(os.urandom(300_000))
-    plain(lab, "scp", "-F", "ssh.conf", "there", "ground-1:")
+    run_plain(lab, "scp", "-F", "ssh.conf", "there", "ground-1:")
     (lab / "batch").write_text("get there back\n", encoding="utf-8")
-    plain(lab, "sftp", "-F", "ssh.conf", "-b", "batch", "ground-1")
+    run_plain(lab, "sftp", "-F", "ssh.conf", "-b", "batch", "ground-1")
     assert (lab / "back").read_bytes() == (lab / "there").read_bytes()
 
 
-STANDS: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
+DRIVE_SCRIPT: Final = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
 
 
 def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
     """The program has the driver's command line, by which `fieldkit stop` recognizes it in every case."""
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
-    argv = ("sh", "-c", STANDS, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
+    argv = ("sh", "-c", DRIVE_SCRIPT, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
     driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
     with lab_shells.opened(folder.of_directory(lab)) as shells:
         jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
@@ -134,8 +134,8 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
 def test_rsync_reaches_the_robots(lab: Path) -> None:
     (lab / "folder").mkdir(exist_ok=True)
     (lab / "folder" / "data").write_bytes(os.urandom(300_000))
-    plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "folder", "air-1:")
-    plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "air-1:folder/data", "fetched")
+    run_plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "folder", "air-1:")
+    run_plain(lab, "rsync", "-a", "-e", "ssh -F ssh.conf", "air-1:folder/data", "fetched")
     assert (lab / "fetched").read_bytes() == (lab / "folder" / "data").read_bytes()
 
 
@@ -175,8 +175,8 @@ def test_a_robot_that_is_moved_away_is_unreachable_until_it_is_back(lab: Path) -
 def ahead_m(lab: Path) -> float:
     """Return the median range of the beam ahead of ground-1, over 2 s of its laser."""
     record = "source /opt/ros/noetic/setup.bash && rosbag record --duration=2 -O scan /scan"
-    plain(lab, "ssh", "-F", "ssh.conf", "ground-1", record)
-    plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
+    run_plain(lab, "ssh", "-F", "ssh.conf", "ground-1", record)
+    run_plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
     with Reader(lab / "scan.bag") as bag:
         scans: list[Any] = [
             shipped().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan") for *_, data in bag.messages()
@@ -308,8 +308,8 @@ def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Pat
     os.kill(process, 9)
     wait_for_end(lived | {process}, within_s=WITHIN_S)
     untouched()
-    gone = run_here(tmp_path, "lab", "ps")
-    assert (gone.code, "remedy: fieldkit lab up" in gone.err) == (2, True)
+    listing = run_here(tmp_path, "lab", "ps")
+    assert (listing.code, "remedy: fieldkit lab up" in listing.err) == (2, True)
     assert fieldkit(tmp_path, "lab", "up").code == 0
     assert fieldkit(tmp_path, "lab", "down").code == 0
 

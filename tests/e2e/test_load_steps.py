@@ -78,20 +78,20 @@ Linux, of a test of 5 s."""
 @pytest.mark.parametrize("name", FLOWS)
 def test_iperf3_and_captures_agree_on_the_throughput(flows: dict[str, dict[str, str]], name: str) -> None:
     row = flows[name]
-    own, captured = (float(row[f"iperf3_{what}_bit_s"]) for what in ("throughput", "captured"))
-    assert captured == pytest.approx(own, rel=0.02 + (RTO_SHARE if name == "tcp-lossy" else 0.0))
+    reported, captured = (float(row[f"iperf3_{source}_bit_s"]) for source in ("throughput", "captured"))
+    assert captured == pytest.approx(reported, rel=0.02 + (RTO_SHARE if name == "tcp-lossy" else 0.0))
     if name == "tcp":
-        assert own == pytest.approx(4e6, rel=0.05)
+        assert reported == pytest.approx(4e6, rel=0.05)
     assert float(row["iperf3_interval_min_bit_s"]) <= float(row["iperf3_interval_median_bit_s"])
 
 
 @pytest.mark.parametrize("name", [name for name in FLOWS if name.startswith("udp")])
 def test_iperf3_and_captures_agree_on_the_loss(flows: dict[str, dict[str, str]], name: str) -> None:
     row = flows[name]
-    own, captured = float(row["iperf3_loss"]), float(row["iperf3_captured_loss"])
+    reported, captured = float(row["iperf3_loss"]), float(row["iperf3_captured_loss"])
     percent = {"udp-lossy": 10, "udp-reverse": 5}[name]
     # iperf3 does not count datagrams that are lost at the very end.
-    assert abs(own - captured) <= 0.02 * percent / 100 + 1e-9
+    assert abs(reported - captured) <= 0.02 * percent / 100 + 1e-9
     assert abs(captured - percent / 100) < 0.04
     assert row["iperf3_retransmits"] == ""
 

@@ -24,8 +24,8 @@ SHORTER = (
 
 def lab_with_one_master(folder: Path, ros: str = "debian") -> Path:
     """Write the site file of a lab: the paper's robots, the programs of ROS, the master on the drone."""
-    more = f"\nros_master: relay\nemulated: {{ros: {ros}, boot: 0.5s}}\n"
-    (folder / "fieldkit.yaml").write_text(DEFAULT_SITE.read_text(encoding="utf-8") + more, encoding="utf-8")
+    extra_keys = f"\nros_master: relay\nemulated: {{ros: {ros}, boot: 0.5s}}\n"
+    (folder / "fieldkit.yaml").write_text(DEFAULT_SITE.read_text(encoding="utf-8") + extra_keys, encoding="utf-8")
     return folder
 
 

@@ -56,7 +56,7 @@ def test_recommended_settings_are_written_with_their_evidence(measured: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("criterion", "why"),
+    ("criterion", "reason"),
     [
         (("--repeats", "9"), "undecided"),
         (("--repeats", str(REPEATS), "--max-loss", "20%", "--max-delay", "1us"), "failed|undecided"),
@@ -64,11 +64,11 @@ def test_recommended_settings_are_written_with_their_evidence(measured: Path) ->
         (("--repeats", str(REPEATS), "--max-loss", "20%", "--share", "90%"), "undecided.*\n.*29 repeats are needed"),
     ],
 )
-def test_without_evidence_nothing_is_written(measured: Path, criterion: tuple[str, ...], why: str) -> None:
+def test_without_evidence_nothing_is_written(measured: Path, criterion: tuple[str, ...], reason: str) -> None:
     out = measured / "nothing"
     run = run_here(measured, "middleware", "recommend", "trials", "-o", str(out), *criterion)
     assert run.code == 1, run.out + run.err
-    assert re.search(why, run.out), run.out
+    assert re.search(reason, run.out), run.out
     assert "passed:" not in run.out
     assert not out.exists()
 

@@ -45,7 +45,7 @@ def untested_commands(page: Path) -> Iterator[str]:
         yield END_OF_COMMAND.split(command)[0]
 
 
-def words(command: str) -> list[str]:
+def command_words(command: str) -> list[str]:
     return shlex.split(command, comments=True)[1:]
 
 
@@ -59,7 +59,7 @@ COMMANDS = [
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
-    arguments = words(command)
+    arguments = command_words(command)
     if arguments[0] in EXTERNAL:
         pytest.skip("a command of another package")
     cli.parser().parse_args(arguments)
@@ -67,7 +67,7 @@ def test_the_parser_accepts_commands_that_no_test_runs(command: str) -> None:
 
 def test_the_parser_refuses_a_wrong_option() -> None:
     with pytest.raises(ConfigurationError):
-        cli.parser().parse_args(words("fieldkit trial los 30ft --repeat 3x --nope"))
+        cli.parser().parse_args(command_words("fieldkit trial los 30ft --repeat 3x --nope"))
 
 
 @pytest.mark.parametrize("page", HAND_WRITTEN, ids=page_id)
@@ -104,18 +104,18 @@ def test_the_paper_is_introduced_where_it_is_first_mentioned(page: Path) -> None
 
 def labels() -> tuple[set[str], set[str]]:
     """Return the labels of all figures in the code; for labels with variable parts the longest constant part."""
-    whole, parts = set(), set()
+    all_labels, parts = set(), set()
     for path in (ROOT / "fieldkit").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Figure"):
                 continue
             match node.args:
                 case [ast.Constant(value=str(label)), *_]:
-                    whole.add(label)
+                    all_labels.add(label)
                 case [ast.JoinedStr(values=values), *_]:
                     texts = [value.value for value in values if isinstance(value, ast.Constant)]
                     parts.add(max((str(text) for text in texts), key=len).strip(" ,"))
-    return whole, parts
+    return all_labels, parts
 
 
 def test_the_glossary_has_every_row_of_tables() -> None:
@@ -123,9 +123,9 @@ def test_the_glossary_has_every_row_of_tables() -> None:
     page = "".join((DOCS / name).read_text(encoding="utf-8") for name in names)
     first_cells = [line.split(" | ")[0].removeprefix("| ") for line in page.splitlines() if line.startswith("| ")]
     rows = {row for cell in first_cells for row in cell.split("; ")}
-    whole, parts = labels()
-    assert len(whole) > 50
-    assert sorted(label for label in whole if label not in rows) == []
+    all_labels, parts = labels()
+    assert len(all_labels) > 50
+    assert sorted(label for label in all_labels if label not in rows) == []
     assert sorted(part for part in parts if not any(part in row for row in rows)) == []
 
 
@@ -136,4 +136,4 @@ def test_ci_files_of_the_installation_page_are_yaml(name: str) -> None:
     commands = [line[line.index("fieldkit trial") :] for line in text.splitlines() if "fieldkit trial" in line]
     assert commands
     for command in commands:
-        cli.parser().parse_args(words(command))
+        cli.parser().parse_args(command_words(command))

@@ -144,10 +144,10 @@ def test_satellite_positions_equal_the_true_positions(lab: Path) -> None:
     )
 
 
-def gpx(path: Path, where: tuple[TrackPoint, ...], late_s: float) -> None:
+def gpx(path: Path, places: tuple[TrackPoint, ...], late_s: float) -> None:
     """Write the path of the receiver like the phone of an accompanying person, whose clock is late."""
     points = []
-    for point, following in pairwise(point for point in where if point.role is Role.RECEIVER):
+    for point, following in pairwise(point for point in places if point.role is Role.RECEIVER):
         assert point.position_m is not None
         place = f'lat="{point.position_m[1] / EARTH_M[1]:.9f}" lon="{point.position_m[0] / EARTH_M[0]:.9f}"'
         for utc_ns in (*range(point.utc_ns, following.utc_ns - 1_000_000, 200_000_000), following.utc_ns - 1_000_000):
@@ -168,9 +168,9 @@ def test_gpx_of_an_accompanying_person_can_be_added_and_removed_later(lab: Path)
     trial = run_walk(lab)
     before, expected = tables(trial), true_separation(trial)
     assert_similar(separation_by_columns(trial), expected, within_m=1e-6)
-    where = track.read(trial / "repeats" / "udp-01" / "track.csv")
+    points = track.read(trial / "repeats" / "udp-01" / "track.csv")
     sender = f"sender={6 / EARTH_M[1]:.9f},{3 / EARTH_M[0]:.9f}"
-    gpx(lab / "walk.gpx", where, late_s=2.5)
+    gpx(lab / "walk.gpx", points, late_s=2.5)
 
     run = run_here(lab, "positions", str(trial), "receiver=walk.gpx", sender, "--offset", "2.5s")
     assert run.code == 0, run.err

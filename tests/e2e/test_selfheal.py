@@ -159,10 +159,10 @@ def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) ->
     assert row["out_of_range_recovered"] == "true"
     assert float(row["out_of_range_outage_s"]) >= CUT_S - 0.2
     noted = (trial / "repeats" / "tcp-01" / "fault-out-of-range-times.txt").read_text(encoding="ascii")
-    began_ns, ended_ns = (int(noted.split(f"{what}_utc_ns ")[1].split()[0]) for what in ("began", "ended"))
+    began_ns, ended_ns = (int(noted.split(f"{name}_utc_ns ")[1].split()[0]) for name in ("began", "ended"))
     cut_s = (ended_ns - began_ns) / 1e9
     for paced in ("soak", "load.iperf3", "topic"):
-        stalled = {what: float(row[f"{paced}_{what}_s"]) for what in ("stall", "out_of_range_outage")}
+        stalled = {name: float(row[f"{paced}_{name}_s"]) for name in ("stall", "out_of_range_outage")}
         assert abs(stalled["out_of_range_outage"] - cut_s) < AGREES_S, (paced, stalled, cut_s)
         assert abs(stalled["stall"] - cut_s) < AGREES_S, (paced, stalled, cut_s)
         assert 0 <= float(row[f"{paced}_out_of_range_recovery_s"]) < AGREES_S

@@ -74,8 +74,8 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fieldkit]:
 
 
 def test_its_columns_and_commands_are_available(fieldkit: Fieldkit) -> None:
-    shown = fieldkit("columns", "show", "route_device")
-    assert "Interface to the other robot" in shown.stdout, shown.stderr
+    output = fieldkit("columns", "show", "route_device")
+    assert "Interface to the other robot" in output.stdout, output.stderr
     planned = fieldkit("trial", "busy", "5m", "--dry-run")
     assert "route: ip -json route get 10.42.0.1 > route.txt 2> receiver-route.log" in planned.stdout, planned.stderr
 
@@ -83,10 +83,10 @@ def test_its_columns_and_commands_are_available(fieldkit: Fieldkit) -> None:
 def test_an_unknown_kind_is_rejected_with_the_available_ones(fieldkit: Fieldkit, tmp_path: Path) -> None:
     path = tmp_path / "procedures" / "busy.yaml"
     path.write_text(PROCEDURE.replace("route:", "rout:"), encoding="utf-8")
-    refused = fieldkit("trial", "busy", "5m", "--dry-run")
-    assert refused.returncode == 2
-    assert "procedures/busy.yaml:9" in refused.stderr
-    assert "did you mean 'route'? other kinds of step need a package that is not installed" in refused.stderr
+    result = fieldkit("trial", "busy", "5m", "--dry-run")
+    assert result.returncode == 2
+    assert "procedures/busy.yaml:9" in result.stderr
+    assert "did you mean 'route'? other kinds of step need a package that is not installed" in result.stderr
 
 
 @pytest.mark.emulated
@@ -174,10 +174,10 @@ def test_a_step_that_raises_in_every_call_is_an_error_before_the_trial(
     with (tmp_path / "installed" / "route_step.py").open("a", encoding="utf-8") as module:
         module.write(f"\n    def {signature} -> None:\n        raise KeyError('wlan0')\n")
     for options in ((), ("--dry-run",)):
-        refused = fieldkit("trial", "busy", "5m", *options)
-        assert (refused.returncode, "Traceback" in refused.stderr) == (2, False)
-        assert f"{line} (route_step.py, line" in refused.stderr
-    (log,) = re.findall(r"report it to the author of the step, with its traceback in (\S+\.log)", refused.stderr)
+        result = fieldkit("trial", "busy", "5m", *options)
+        assert (result.returncode, "Traceback" in result.stderr) == (2, False)
+        assert f"{line} (route_step.py, line" in result.stderr
+    (log,) = re.findall(r"report it to the author of the step, with its traceback in (\S+\.log)", result.stderr)
     assert "KeyError: 'wlan0'" in Path(log).read_text(encoding="utf-8")
     assert not (tmp_path / "trials").exists()
 
@@ -192,7 +192,7 @@ def test_the_package_of_a_step_is_part_of_the_trial(finished: tuple[Path, Fieldk
     changed = fieldkit("resume", str(folder))
     assert "the code of the step route (route-step 1.0) has changed since the trial started" in changed.stdout
     installed.rename(lab / "elsewhere")
-    refused = fieldkit("rebuild", str(folder))
-    assert (refused.returncode, "mend" in refused.stderr) == (2, False)
-    assert "step kind `route` from route-step 1.0 is not installed" in refused.stderr
-    assert "install that package with pip" in refused.stderr
+    result = fieldkit("rebuild", str(folder))
+    assert (result.returncode, "mend" in result.stderr) == (2, False)
+    assert "step kind `route` from route-step 1.0 is not installed" in result.stderr
+    assert "install that package with pip" in result.stderr

@@ -22,9 +22,9 @@ def trials(tmp_path: Path) -> Iterator[list[Path]]:
 
 def differing(trials: list[Path]) -> list[str]:
     """Return the outputs that differ from those of the version that ran the trials."""
-    made = dict(stored_trials.texts(trials))
-    assert made.keys() == {path.name for path in OUTPUTS.iterdir()}
-    return [name for name, text in made.items() if text != (OUTPUTS / name).read_text(encoding="utf-8")]
+    written = dict(stored_trials.texts(trials))
+    assert written.keys() == {path.name for path in OUTPUTS.iterdir()}
+    return [name for name, text in written.items() if text != (OUTPUTS / name).read_text(encoding="utf-8")]
 
 
 @pytest.mark.parametrize("name", STORED)
@@ -38,9 +38,9 @@ def test_rebuilt_tables_have_the_same_bytes(trials: list[Path], name: str) -> No
 @pytest.mark.parametrize("name", STORED)
 def test_every_file_equals_its_checksum(trials: list[Path], name: str) -> None:
     command_output("verify", f"trials/{name}")
-    kept = {path.relative_to(TRIALS / name) for path in (TRIALS / name).rglob("*") if path.is_file()}
+    stored_files = {path.relative_to(TRIALS / name) for path in (TRIALS / name).rglob("*") if path.is_file()}
     listed = {Path(line.split("  ", 1)[1]) for line in (TRIALS / name / "MANIFEST.sha256").read_text().splitlines()}
-    assert listed - kept == set(), "a name that git ignores?"
+    assert listed - stored_files == set(), "a name that git ignores?"
 
 
 def test_every_output_is_unchanged(trials: list[Path]) -> None:

@@ -90,8 +90,8 @@ def test_a_trial_ends_valid(tmp_path: Path, pair: Pair) -> None:
 
 
 def test_busybox_sends_and_receives_by_tcp(tmp_path: Path) -> None:
-    bare = "userland: busybox, ssh: dropbear, sftp: false"
-    run = trial(tmp_path, Pair(bare, bare), "--protocol", "tcp")
+    userland_keys = "userland: busybox, ssh: dropbear, sftp: false"
+    run = trial(tmp_path, Pair(userland_keys, userland_keys), "--protocol", "tcp")
     assert run.code == 0, run.out + run.err
     (row,) = rows(only_trial(tmp_path))
     assert (row["status"], row["hash_match"]) == ("valid", "true")
@@ -108,7 +108,7 @@ def test_busybox_sends_and_receives_by_tcp(tmp_path: Path) -> None:
 def test_unsuitable_tools_are_rejected_before_repeat_1(tmp_path: Path, pair: Pair, words: tuple[str, str]) -> None:
     run = trial(tmp_path, pair)
     assert run.code == 3, run.out + run.err
-    what, package = words
-    assert what in run.err
+    tool, package = words
+    assert tool in run.err
     assert f"  apt-get install {package}" in run.err, "root needs no sudo"
     assert rows(only_trial(tmp_path)) == [], "no repeat began"

@@ -80,8 +80,8 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
     assert fieldkit(tmp_path, "lab", "up").code == 0
     try:
         assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "3.5m", "18m").code == 0
-        refused = fieldkit(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
-        assert "robot-2 would be within wall" in refused.err
+        result = fieldkit(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
+        assert "robot-2 would be within wall" in result.err
         assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
 
         def east_m() -> float:

@@ -119,15 +119,15 @@ def test_a_simulation_of_the_same_trial_is_compared_without_options(lab_copy: Pa
     compared = run_here(lab_copy, "compare", "simulated", str(trial), "--format", "csv")
     assert compared.code == 0, compared.err
     assert "not comparable" not in compared.err
-    both = {
+    values = {
         (row["protocol"], row["quantity"]): (float(row["a"]), float(row["b"]))
         for row in csv.DictReader(compared.out.splitlines())
         if row["a"] and row["b"]
     }
     for protocol in ("tcp", "udp"):
         # The simulation has no processing time in programs and kernels.
-        assert both[protocol, "transfer_s"][0] < 1.2 * both[protocol, "transfer_s"][1]
-        assert both[protocol, "rtt_median_s"][0] < both[protocol, "rtt_median_s"][1]
+        assert values[protocol, "transfer_s"][0] < 1.2 * values[protocol, "transfer_s"][1]
+        assert values[protocol, "rtt_median_s"][0] < values[protocol, "rtt_median_s"][1]
 
 
 def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy: Path) -> None:
@@ -139,8 +139,8 @@ def test_verify_finds_one_flipped_byte_and_rebuild_gives_the_same_bytes(lab_copy
     (trial / "summary.csv").write_text("", encoding="utf-8")
     assert run_here(lab, "rebuild", str(trial)).code == 0
     assert before == {name: (trial / name).read_bytes() for name in before}
-    again = run_here(lab, "rebuild", str(trial))
-    assert "the same bytes as before" in again.out
+    rebuilt = run_here(lab, "rebuild", str(trial))
+    assert "the same bytes as before" in rebuilt.out
     pcap = trial / "repeats" / "tcp-02" / "receiver.pcap"
     content = bytearray(pcap.read_bytes())
     content[-1] ^= 0x10
@@ -155,8 +155,13 @@ def test_a_masterless_trial_behind_the_wall_prints_one_json_object_per_line(tmp_
     words = ("--topology", "masterless", "--repeats", "1", "--record", "1s", "--protocol", "tcp", "--json")
     run = run_here(tmp_path, "trial", "nlos", "5m", *words)
     assert run.code == 0, run.err
-    (ended,) = run.events("repeat_ended")
-    assert (ended["repeat"], ended["status"], ended["done"], ended["total"]) == ("tcp-01", "valid", 1, 1)
+    (event_data,) = run.events("repeat_ended")
+    assert (event_data["repeat"], event_data["status"], event_data["done"], event_data["total"]) == (
+        "tcp-01",
+        "valid",
+        1,
+        1,
+    )
     (over,) = run.events("trial_ended")
     assert Path(tmp_path / over["folder"]) == only_trial(tmp_path)
     assert {event["name"] for event in run.events("phase_started")} >= {"record", "transfer", "ping"}

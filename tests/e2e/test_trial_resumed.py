@@ -104,9 +104,9 @@ def test_kill_9_during_a_repeat_then_resume(tmp_path: Path) -> None:
     table = check_whole(tmp_path, REPEATS)
     assert [row["status"] for row in table] == ["valid", "void", "valid"]
     assert table[1]["reason"] == "fieldkit was killed during it"
-    again = resume(tmp_path)
-    assert again.code == 0, again.err
-    assert again.events("repeat_ended") == [], "nothing is redone"
+    second_run = resume(tmp_path)
+    assert second_run.code == 0, second_run.err
+    assert second_run.events("repeat_ended") == [], "nothing is redone"
 
 
 def test_two_fieldkits_cannot_run_one_trial(tmp_path: Path) -> None:

@@ -56,8 +56,8 @@ def test_a_damaged_trial_gives_an_error_with_a_remedy_or_a_complete_file(
 ) -> None:
     trial = tmp_path / LOSSY.name
     trial.mkdir()
-    for kept in (PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV, store.MANIFEST_FILE):
-        shutil.copy(LOSSY / kept, trial)
+    for file_name in (PLAN_FILE, JOURNAL_FILE, store.TRIAL_CSV, store.MANIFEST_FILE):
+        shutil.copy(LOSSY / file_name, trial)
     DAMAGES[damage](trial / name)
     exported(trial, form, capsys)
 

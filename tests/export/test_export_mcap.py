@@ -125,12 +125,12 @@ def test_the_log_is_the_journal(read_messages: list[Read], trial: Path) -> None:
 
 
 def test_each_packet_has_its_robots_time_and_its_fate(read_messages: list[Read]) -> None:
-    sent, came = of(read_messages, "/sender/packets"), of(read_messages, "/receiver/packets")
+    sent, received = of(read_messages, "/sender/packets"), of(read_messages, "/receiver/packets")
     first_ns = BEGIN_NS + 2 * SECOND_NS
     assert [message.time_ns for message in sent] == [first_ns + 1_000_000 * index for index in range(PACKETS)]
-    assert came[0].time_ns == first_ns + AHEAD_NS
+    assert received[0].time_ns == first_ns + AHEAD_NS
     assert [index for index, message in enumerate(sent) if message.content["lost"]] == list(LOST)
-    assert [message.content["copy"] for message in came] == [False] * (PACKETS - len(LOST)) + [True]
+    assert [message.content["copy"] for message in received] == [False] * (PACKETS - len(LOST)) + [True]
     assert sent[REPEATED].content == {
         "timestamp": {"sec": first_ns // SECOND_NS, "nsec": 1_000_000 * REPEATED},
         "repeat": "udp-01",
@@ -326,8 +326,8 @@ def test_added_positions_replace_the_testbeds_track(trial: Path) -> None:
 
 def test_link_samples_have_a_channel_per_robot(trial: Path) -> None:
     folder = trial / "repeats" / "udp-01"
-    known = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
-    samples = [LinkSample(BEGIN_NS, (known,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
+    station_sample = StationSample("turtlebot-2", -51.25, 65_000_000, None, 7, 5, 1, 0)
+    samples = [LinkSample(BEGIN_NS, (station_sample,), noise_dbm=-95.0, active_ns=2 * SECOND_NS, busy_ns=SECOND_NS)]
     (folder / link_samples.FILE).write_text(link_samples.text({Role.SENDER: samples}), encoding="ascii")
     (sample,) = of(messages(exported(trial)), "/sender/link")
     jsonschema.validate(sample.content, sample.schema)

@@ -32,11 +32,11 @@ def test_the_exported_csv_equals_the_trial_csv(trial: Path) -> None:
 
 
 def test_raw_evidence_measured_again_gives_the_same_bytes(trial: Path, tmp_path: Path) -> None:
-    kept = (trial / store.TRIAL_CSV).read_bytes()
+    table_bytes = (trial / store.TRIAL_CSV).read_bytes()
     (trial / store.TRIAL_CSV).unlink()
     out = tmp_path / "again.csv"
     assert main(["export", str(trial), "--rebuild", "--format", "csv", "-o", str(out)]) == 0
-    assert out.read_bytes() == kept
+    assert out.read_bytes() == table_bytes
 
 
 def test_tables_with_different_columns_are_combined(trial: Path, tmp_path: Path) -> None:
@@ -52,9 +52,9 @@ def test_tables_with_different_columns_are_combined(trial: Path, tmp_path: Path)
 
 
 def test_undeclared_columns_are_kept_as_text(trial: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, more = trial / store.TRIAL_CSV, ("soil_moisture,,note", "0.300,,wet", ",,")
+    path, extra = trial / store.TRIAL_CSV, ("soil_moisture,,note", "0.300,,wet", ",,")
     lines = path.read_text(encoding="utf-8").splitlines()
-    path.write_text("".join(f"{line},{end}\n" for line, end in zip(lines, more, strict=True)), encoding="utf-8")
+    path.write_text("".join(f"{line},{end}\n" for line, end in zip(lines, extra, strict=True)), encoding="utf-8")
     old = tmp_path / "old.csv"
     old.write_text("".join(f"{line}\n" for line in lines).replace(trial.name, "older"), encoding="utf-8")
     table = pa.parquet.read_table(exported(trial, old, kind="parquet"))

@@ -11,13 +11,13 @@ from typing import Final
 from fieldkit.core.columns import cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
-from fieldkit.measure.evidence import link, link_samples, program_output
+from fieldkit.measure.evidence import link, link_samples, program_output, robot_link_samples
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
 _IW: Final = DATA / "iw"
 _CLOCK: Final = "==> clock <==\n100.00 1700000100.000000000 100.00\n==> iw station dump <==\n"
-_OWN: Final = "".join(
+_SAMPLES_TEXT: Final = "".join(
     f"==> 101.{at:02d} {name} <==\n{path.read_text(encoding='utf-8')}"
     for name, pattern in (("link", "link-*"), ("survey", "survey-*"), ("station", "station*"), ("wireless", "wire*"))
     for at, path in enumerate(sorted(_IW.glob(f"{pattern}.txt")))
@@ -49,18 +49,18 @@ def _read_robot_samples(name: str, data: bytes, place: Path) -> None:
     """Read a robot's own link samples, with one mutated file and the others intact."""
     (place / "sender-before.txt").write_text(_CLOCK, encoding="utf-8")
     if "link" not in name:
-        (place / "sender-link.txt").write_text(_OWN, encoding="utf-8")
+        (place / "sender-link.txt").write_text(_SAMPLES_TEXT, encoding="utf-8")
     (place / name).write_bytes(data)
-    _measure(list(link_samples.read_robot(place, Role.SENDER)))
+    _measure(list(robot_link_samples.read(place, Role.SENDER)))
 
 
 def _parse_iw(data: bytes, _: Path) -> None:
     text = data.decode(errors="replace")
-    link_samples.parse_stations(text)
-    link_samples.parse_cell(text)
-    link_samples.parse_channel(text)
+    robot_link_samples.parse_stations(text)
+    robot_link_samples.parse_cell(text)
+    robot_link_samples.parse_channel(text)
     for line in text.split("\n"):
-        link_samples.parse_wireless(line)
+        robot_link_samples.parse_wireless(line)
 
 
 def _evaluate_path(data: bytes, place: Path) -> None:
@@ -81,13 +81,13 @@ def _match_expression(data: bytes, place: Path) -> None:
 
 def radio_targets() -> Iterator[Target]:
     """Yield the targets."""
-    samples = link_samples.parse(_OWN)
+    samples = robot_link_samples.parse(_SAMPLES_TEXT)
     testbeds = link_samples.text({Role.SENDER: samples, Role.RECEIVER: samples[:3]}).encode()
     yield Target("link-csv", (testbeds,), _read_testbed_samples)
     states = (_CLOCK + (_IW / "station-iwlwifi-6.txt").read_text(encoding="utf-8")).encode()
     for name, seed in (
-        ("sender-link.txt", _OWN.encode()),
-        ("sender-link.txt.gz", gzip.compress(_OWN.encode(), mtime=0)),
+        ("sender-link.txt", _SAMPLES_TEXT.encode()),
+        ("sender-link.txt.gz", gzip.compress(_SAMPLES_TEXT.encode(), mtime=0)),
         ("sender-before.txt", states),
     ):
         yield Target(f"own-{name}".replace(".", "_"), (seed,), partial(_read_robot_samples, name))

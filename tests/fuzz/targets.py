@@ -232,7 +232,7 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
         result = AttemptEvidence(attempt)
         protocol, _, number = folder.name.partition("-")
         scene = the_plan.scene(
-            RepeatId(next(known for known in the_plan.protocols if known == protocol), int(number)), ""
+            RepeatId(next(candidate for candidate in the_plan.protocols if candidate == protocol), int(number)), ""
         )
         for placed in the_plan.procedure.walk():
             view = View(scene, result, placed.within)
@@ -321,8 +321,8 @@ def _topic_logs() -> tuple[bytes, ...]:
         [*start_records, *samples, (5, 0, 0, 3, 0, start_ns), (7, 0, 0, 20, 0, start_ns)],
         [*start_records, *samples[::2]],
     )
-    whole, killed = (records.MAGIC + b"".join(records.RECORD.pack(*record) for record in log) for log in logs)
-    return whole, killed + bytes(500)
+    complete, killed = (records.MAGIC + b"".join(records.RECORD.pack(*record) for record in log) for log in logs)
+    return complete, killed + bytes(500)
 
 
 def _measure_tlog(path: Path) -> None:

@@ -13,7 +13,7 @@ from tests.fuzz.harness import Defect, Target
 from tests.fuzz.mutate import MAX_BYTES, mutated
 from tests.helpers.nightly import mark_nightly
 
-KEPT = Path(__file__).parent / "kept"
+SAVED_INPUTS = Path(__file__).parent / "kept"
 
 
 @pytest.mark.parametrize("inputs", mark_nightly([100, 3000]))
@@ -25,7 +25,7 @@ def test_a_short_search_finds_no_defect(inputs: int, tmp_path: Path) -> None:
 
 def test_inputs_found_earlier_break_no_reader() -> None:
     """In one process, because each process imports all readers."""
-    paths = sorted(KEPT.glob("*.*"))
+    paths = sorted(SAVED_INPUTS.glob("*.*"))
     assert paths
     failures = zip(paths, harness.replay(paths), strict=True)
     assert [(path.name, failure) for path, failure in failures if failure is not None] == []

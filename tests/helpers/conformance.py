@@ -92,9 +92,9 @@ def waiting_thread(shell: Shell) -> Iterator[Callable[[float], BaseException | N
     """
     with endless_command(shell, first="cat") as argv, ThreadPoolExecutor(1) as pool:
         session = shell.begin(argv, deadline=deadline_soon())
-        ended = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
+        closing = pool.submit(session.end, deadline=Deadline.after(2 * SOON_S))
         output_of(shell, "sh", "-c", "until [ -s endless ]; do sleep 0.05; done")
-        yield ended.exception
+        yield closing.exception
 
 
 def is_responsive(shell: Shell) -> bool:

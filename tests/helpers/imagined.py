@@ -360,7 +360,7 @@ def _fragments(ip_id: int, payload_bytes: int, sent: Sent) -> list[bytes]:
     for offset in range(0, datagram_bytes, 1480):
         size = min(1480, datagram_bytes - offset)
         udp_header = struct.pack(">HHHH", *sent.ports, datagram_bytes, 0) if offset == 0 else b""
-        more = offset + size < datagram_bytes
+        has_more = offset + size < datagram_bytes
         fragments.append(
             ipv4(
                 udp_header,
@@ -368,7 +368,7 @@ def _fragments(ip_id: int, payload_bytes: int, sent: Sent) -> list[bytes]:
                 size=size,
                 ip_id=ip_id,
                 offset=offset,
-                more=more,
+                more=has_more,
                 src=sent.source,
                 dst=sent.target,
             )

@@ -111,11 +111,11 @@ def _lost_evidence(folder: Path, witness: Witness) -> Iterator[str]:
     remaining = visible(folder)
     for path in folder.glob(f"*/{JOURNAL_FILE}"):
         try:
-            ended = journal.ended(journal.read(path.parent))
+            entries = journal.ended(journal.read(path.parent))
         except EvidenceError as error:
             yield error.what
             continue
-        for attempt in ended:
+        for attempt in entries:
             attempt_folder = path.parent / "repeats" / attempt.folder
             prefix = f"{attempt_folder.relative_to(folder).as_posix()}/"
             expected = {name: content[-1] for name, content in witness.versions.items() if name.startswith(prefix)}

@@ -69,10 +69,10 @@ def make_of(
     entries = [JournalEntry(START_NS - SECOND_NS, repeat.protocol, 1, 0, Status.PLANNED)]
     for attempt in (void, valid):
         started = JournalEntry(attempt.started_utc_ns, repeat.protocol, 1, attempt.number, Status.RUNNING)
-        ended = JournalEntry(
+        entry = JournalEntry(
             started.utc_ns + 5 * SECOND_NS, repeat.protocol, 1, attempt.number, attempt.status, attempt.reason
         )
-        entries += [started, ended]
+        entries += [started, entry]
     journal.append(folder, *entries)
     (folder / store.REPEATS / void.folder).mkdir()
     write_evidence(folder / store.REPEATS / valid.folder, valid.started_utc_ns, packets, lost)

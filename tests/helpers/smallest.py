@@ -107,7 +107,9 @@ def _two_commands(module: ModuleType, folder: Path) -> None:
 
 def _two_bridge_paths(module: ModuleType, folder: Path) -> None:
     del folder
-    replace(module, "PATHS", tuple(way for way in module.PATHS if way.name in {"ros1 plain", "ros1 bridged to dds"}))
+    replace(
+        module, "PATHS", tuple(path for path in module.PATHS if path.name in {"ros1 plain", "ros1 bridged to dds"})
+    )
 
 
 def _slow_iperf(module: ModuleType, folder: Path) -> None:

@@ -58,7 +58,7 @@ def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PL
     start_ns, matched_ns = START - 2 * SECOND, START - 600 * MS
     size = plan.size_bytes + plan.envelope_bytes
     start_rows = [(records.BEGUN, 0, 0, 0, start_ns), (records.MATCHED, 0, 0, 0, matched_ns)]
-    sent, came = (
+    sent, received = (
         [*start_rows],
         [
             (kind, row_size, number, 0, sample_ns - SECOND + AHEAD)
@@ -85,10 +85,10 @@ def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PL
             far.append(Frame(subscriber_ns, packet[:236], len(packet)))
             far.append(Frame(subscriber_ns + 50 * US, acknowledgement))
             near.append(Frame(subscriber_ns - AHEAD + 70 * US, acknowledgement))
-            came.append((records.SAMPLE, size, number, sample_ns, subscriber_ns + 200 * US))
+            received.append((records.SAMPLE, size, number, sample_ns, subscriber_ns + 200 * US))
     end_ns = START + plan.samples * PERIOD + SECOND
     near.append(Frame(end_ns, _acknowledgement(plan.samples, plan, tcp=tcp)))
-    return TopicAttempt(tuple(sent), tuple(came), tuple(near), tuple(far), plan)
+    return TopicAttempt(tuple(sent), tuple(received), tuple(near), tuple(far), plan)
 
 
 def _packet(number: int, at_ns: int, plan: TopicPlan, *, tcp: bool) -> bytes:
@@ -143,7 +143,7 @@ def write(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> 
 def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = True) -> tuple[list[str], Measured]:
     """The contradictions in an attempt, and its measured values."""
     write(topic_attempt, folder, signed=signed)
-    sent, came = (topic_samples.read_log(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
+    sent, received = (topic_samples.read_log(folder / f"{role}-topic.bin") for role in ("sender", "receiver"))
     flows, packets = [], []
     for role, address in (("sender", SENDER), ("receiver", RECEIVER)):
         path, is_publisher = folder / f"{role}.pcap", role == "sender"
@@ -164,11 +164,11 @@ def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = T
     captured = CapturedTopic(
         sender_flow, receiver_flow, complete=topic_captures.is_complete(sender_flow, receiver_flow)
     )
-    reasons = [f"{end.foreign} foreign" for end in (sent, came) if end.foreign]  # as the step reports it
-    reasons += topic_checks.check_logs(topic_attempt.plan, sent, came)
-    reasons += [] if reasons else topic_captures.check_captures(topic_attempt.plan, sent, came, captured)
-    measured = topic_columns.measure(TRAFFIC, sent, came, *packets)
-    arrived = topic_columns.first_arrivals(came)
+    reasons = [f"{end.foreign} foreign" for end in (sent, received) if end.foreign]  # as the step reports it
+    reasons += topic_checks.check_logs(topic_attempt.plan, sent, received)
+    reasons += [] if reasons else topic_captures.check_captures(topic_attempt.plan, sent, received, captured)
+    measured = topic_columns.measure(TRAFFIC, sent, received, *packets)
+    arrived = topic_columns.first_arrivals(received)
     withheld = topic_captures.withheld(
         measured.values, arrived, captured, reliable=topic_attempt.plan.reliable, deadline_s=TRAFFIC.deadline_s
     )

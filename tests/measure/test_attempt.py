@@ -57,9 +57,9 @@ def test_an_error_is_raised_again_without_another_read(tmp_path: Path) -> None:
         evidence.read(parser.words, "a.txt")
     (tmp_path / "a.txt").write_text("late", encoding="utf-8")
     assert evidence.read_or_none(parser.words, "a.txt") is None
-    with pytest.raises(EvidenceError) as again:
+    with pytest.raises(EvidenceError) as second_error:
         evidence.read(parser.words, "a.txt")
-    assert again.value is first.value
+    assert second_error.value is first.value
     assert parser.called == [("a.txt", 0)]
 
 
@@ -96,12 +96,12 @@ def test_a_damaged_capture_is_not_counted(tmp_path: Path) -> None:
     (tmp_path / capture_file(Role.SENDER)).write_bytes(data)
     (tmp_path / capture_file(Role.RECEIVER)).write_bytes(data[:-1])
     evidence = AttemptEvidence(tmp_path)
-    whole = evidence.whole_capture(capture_file(Role.SENDER))
-    assert whole is not None
-    assert (whole.frames, whole.damage) == (3, None)
+    frames = evidence.whole_capture(capture_file(Role.SENDER))
+    assert frames is not None
+    assert (frames.frames, frames.damage) == (3, None)
     assert (
         evidence.whole_capture(capture_file(Role.SENDER))
-        is whole
+        is frames
         is evidence.read(pcap.read, capture_file(Role.SENDER))
     )
     # The damaged capture can still be read explicitly, but not with `whole_capture`.

@@ -33,11 +33,11 @@ def test_the_true_offset_is_within_the_error(true_s: float, ways: list[tuple[int
     true_ns = round(true_s * S)
     exchanges = []
     request_ns = 1_700_000_000 * S
-    for there, back in ways:
-        read = request_ns + there + true_ns
+    for forward, back in ways:
+        read = request_ns + forward + true_ns
         robot_ns, resolution_ns = (read // S * S, S) if whole_seconds else (read, 0)
-        exchanges.append(Exchange(request_ns, robot_ns, request_ns + there + back, resolution_ns))
-        request_ns += there + back
+        exchanges.append(Exchange(request_ns, robot_ns, request_ns + forward + back, resolution_ns))
+        request_ns += forward + back
     estimate = offset(exchanges)
     assert abs(estimate.offset_s - true_ns / S) <= estimate.error_s + 1e-6
 

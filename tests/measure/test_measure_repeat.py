@@ -39,10 +39,10 @@ def _ping(payload_bytes: int, times_ms: list[float], sent: int) -> str:
     return "\n".join([*lines, f"{sent} packets transmitted, {len(times_ms)} received, 0% packet loss, time 1ms"])
 
 
-def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, taken: bytes = BAG) -> Path:
+def _folder(folder: Path, sent: list[Frame], received: list[Frame], ping: str, bag: bytes = BAG) -> Path:
     """A repeat with all its evidence; the sent file is not a bag."""
     (folder / "scan.bag").write_bytes(BAG)
-    (folder / "recv.bag").write_bytes(taken)
+    (folder / "recv.bag").write_bytes(bag)
     (folder / "sender.pcap").write_bytes(file_bytes(sent))
     (folder / "receiver.pcap").write_bytes(file_bytes(received))
     (folder / "sender-capture.log").write_text(LISTENING + COUNTERS.format(len(sent), 0), encoding="utf-8")
@@ -58,7 +58,7 @@ def _udp_folder(folder: Path) -> Path:
     sent = timed([packet for number in range(36) for packet in datagram(number, 8192)])
     received = [frame for index, frame in enumerate(sent) if index not in {6, 17}]
     times_ms = [14.0, 15.0, 16.0, 17.0, 18.0]
-    return _folder(folder, sent, received, _ping(8192, times_ms, sent=10), taken=BAG[:-2560])
+    return _folder(folder, sent, received, _ping(8192, times_ms, sent=10), bag=BAG[:-2560])
 
 
 def test_a_udp_repeat(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 ANNA = Holder("trial-a", "anna@one", "trial-a")
-STANDS = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
+DRIVE_SCRIPT = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
 LANDS = (
     "trap 'echo 1.0 land: told >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
 )
@@ -34,9 +34,9 @@ HANGS = "trap '' INT; echo up; while :; do sleep 0.05; done"
 def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
     home = tmp_path / "home"
     home.mkdir()
-    made = LocalShell(home, userland_path(request.param, tmp_path / "bin"), "turtlebot-1")
-    jobs.install(made, Deadline.after(30))
-    return made
+    shell = LocalShell(home, userland_path(request.param, tmp_path / "bin"), "turtlebot-1")
+    jobs.install(shell, Deadline.after(30))
+    return shell
 
 
 def start(robot: LocalShell, name: str, verb: str, script: str) -> None:
@@ -51,7 +51,7 @@ def runs(robot: LocalShell) -> list[str]:
 
 def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
-    start(robot, "drive", "drive", STANDS)
+    start(robot, "drive", "drive", DRIVE_SCRIPT)
     start(robot, "fly", "fly", LANDS)
     start(robot, "record", "mavlink", HANGS)
     halted = halting.halt(robot, "bert@two", Deadline.after(60))
@@ -67,10 +67,10 @@ def test_all_moving_programs_are_stopped_and_report_their_state(robot: LocalShel
         lambda: halting.poll_states(robot, names, Deadline.after(30)).state is MotionState.LANDED, Deadline.after(60)
     )
     assert "record" in runs(robot), "it does not move the robot"
-    again = halting.halt(robot, "bert@two", Deadline.after(60))
-    assert (again.programs, again.state) == ((), MotionState.NOTHING)
+    second_result = halting.halt(robot, "bert@two", Deadline.after(60))
+    assert (second_result.programs, second_result.state) == ((), MotionState.NOTHING)
     with pytest.raises(RobotError, match=r"the jobs of .* were ended by bert@two"):
-        start(robot, "later", "drive", STANDS)
+        start(robot, "later", "drive", DRIVE_SCRIPT)
     evidence.end_jobs(robot, FOLDER)
 
 
@@ -111,9 +111,9 @@ def test_program_that_confirms_nothing_is_killed_and_reported(robot: LocalShell)
 def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=lambda _: None):
         evidence.begin(robot, FOLDER, "sender", "lo", token=ANNA.token)
-        start(robot, "drive", "drive", STANDS)
-        own = halting.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
-        assert own.state is MotionState.STATIONARY
+        start(robot, "drive", "drive", DRIVE_SCRIPT)
+        result = halting.halt_attempt(robot, FOLDER, "the-operator", Deadline.after(60))
+        assert result.state is MotionState.STATIONARY
         other = jobs.work_folder("trial-a", "tcp-01-2")
         evidence.begin(robot, other, "sender", "lo", token=ANNA.token)  # an order for one attempt keeps the lock
         halting.halt(robot, "bert@two", Deadline.after(60))
@@ -125,8 +125,8 @@ def test_trial_with_the_lock_is_informed_and_starts_nothing(robot: LocalShell) -
 
 def test_unreachable_robot_does_not_prevent_the_stop_of_others(robot: LocalShell) -> None:
     evidence.begin(robot, FOLDER, "sender", "lo")
-    start(robot, "drive", "drive", STANDS)
-    gone = LinkError("no route", where="eve", remedy="")
-    halted = halting.halt_all({"eve": gone, "turtlebot-1": robot}, "bert@two", 60.0)
-    assert halted["eve"].error is gone
+    start(robot, "drive", "drive", DRIVE_SCRIPT)
+    link_error = LinkError("no route", where="eve", remedy="")
+    halted = halting.halt_all({"eve": link_error, "turtlebot-1": robot}, "bert@two", 60.0)
+    assert halted["eve"].error is link_error
     assert halted["turtlebot-1"].state is MotionState.STATIONARY

@@ -45,7 +45,7 @@ def real_frames() -> list[bytes]:
     text = d.MAVLink_statustext_message(4, b"\xfe\xfd" * 20)
     return [
         bytes(v1.MAVLink_attitude_message(1, 0.1, 0.2, 0.3, 0, 0, 0).pack(old)),
-        *(one.frame(message) for one in (new, signed) for message in (attitude, text, drones.beat())),
+        *(encoder.frame(message) for encoder in (new, signed) for message in (attitude, text, drones.beat())),
     ]
 
 
@@ -56,11 +56,11 @@ FRAMES = real_frames()
 def test_frames_are_complete_for_any_cut_of_the_stream(sent: list[bytes], cuts: list[int]) -> None:
     stream = b"".join(sent)
     edges = [0, *sorted(min(cut, len(stream)) for cut in cuts), len(stream)]
-    buffer, came = bytearray(), list[bytes]()
+    buffer, received = bytearray(), list[bytes]()
     for begin, end in pairwise(edges):
         buffer += stream[begin:end]
-        came += mavlink_frames.frames(buffer)
-    assert came == sent
+        received += mavlink_frames.frames(buffer)
+    assert received == sent
     assert not buffer
 
 
@@ -91,7 +91,7 @@ def test_created_frames_are_read_by_pymavlink() -> None:
     )
     assert (command.command, command.param1, command.param2) == (d.MAV_CMD_SET_MESSAGE_INTERVAL, 32, 100_000)
     assert (command.target_system, command.target_component) == (7, 1)
-    assert [one.get_seq() for one in (beat, command, other)] == [0, 1, 2]
+    assert [frame.get_seq() for frame in (beat, command, other)] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("old", [False, True])
@@ -131,14 +131,14 @@ def recording(program: Path, log: Path, connection: str, **arguments: object) ->
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stderr is not None
         assert process.stderr.readline().startswith(b"waiting for the heartbeat")
-        ended = Ended(-1, {}, log)
+        result = Ended(-1, {}, log)
         try:
             assert process.stderr.readline() == b"up, MAVLink\n"
-            yield ended
+            yield result
             process.send_signal(signal.SIGINT)
             output_text, errors = process.communicate(timeout=60)
             assert errors == b""
-            ended.code, ended.output_text = process.returncode, json.loads(output_text)
+            result.code, result.output_text = process.returncode, json.loads(output_text)
         finally:
             process.kill()
 
@@ -172,26 +172,26 @@ def over_tcp() -> Iterator[str]:
             accepted.join()
             return streams[0]
 
-        with _late(stream):
+        with _drone_answering(stream):
             yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
 
 
 @contextmanager
-def _late(stream: Callable[[], socket.socket]) -> Iterator[None]:
+def _drone_answering(stream: Callable[[], socket.socket]) -> Iterator[None]:
     """Let a drone answer on a stream when it is open."""
-    over, ready = threading.Event(), threading.Event()
+    finished, ready = threading.Event(), threading.Event()
 
     def fly() -> None:
-        with stream() as one, drones.flying(one.fileno(), one.sendall, one.recv):
+        with stream() as connection, drones.flying(connection.fileno(), connection.sendall, connection.recv):
             ready.set()
-            over.wait()
+            finished.wait()
 
     thread = threading.Thread(target=fly)
     thread.start()
     try:
         yield
     finally:
-        over.set()
+        finished.set()
         thread.join()
 
 
@@ -203,14 +203,14 @@ def over_udp() -> Iterator[str]:
 
 @contextmanager
 def over_udp_that_speaks_first() -> Iterator[str]:
-    there = ("127.9.9.9", 14_550)
+    address = ("127.9.9.9", 14_550)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as endpoint:
         endpoint.bind(("127.0.0.1", 0))
         with drones.flying(
-            endpoint.fileno(), lambda frame: endpoint.sendto(frame, there), endpoint.recv
+            endpoint.fileno(), lambda frame: endpoint.sendto(frame, address), endpoint.recv
         ) as autopilot:
             list(autopilot.receive(Sender(255, 190).frame(drones.beat()), ("gcs", 1), time.monotonic_ns()))
-            yield f"udpin:{there[0]}:{there[1]}"
+            yield f"udpin:{address[0]}:{address[1]}"
 
 
 @contextmanager
@@ -227,14 +227,14 @@ def over_a_serial_line() -> Iterator[str]:
 def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path, tmp_path: Path) -> None:
     with (
         connection_kind() as connection,
-        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as result,
     ):
-        wait_until_size(ended.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
-    assert ended.code == 0
-    types = kinds(ended.log)
-    read = tlog.read(ended.log, 0, ended.output_text["ended_us"])
-    assert ended.output_text["frames"] == read.frames == len(types)
-    assert (ended.output_text["refused"], ended.output_text["left_out"]) == ({}, 0)
+        wait_until_size(result.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
+    assert result.code == 0
+    types = kinds(result.log)
+    read = tlog.read(result.log, 0, result.output_text["ended_us"])
+    assert result.output_text["frames"] == read.frames == len(types)
+    assert (result.output_text["refused"], result.output_text["left_out"]) == ({}, 0)
     assert read.kinds == {kind: types.count(kind) for kind in set(types) - {"BAD_DATA"}}
     assert read.values["mavlink_loss"] == 0
     assert types.count("LOCAL_POSITION_NED") > 3 * types.count("ATTITUDE")
@@ -248,10 +248,10 @@ def test_peer_that_restarts_at_another_port_is_answered(monkeypatch: pytest.Monk
     with socket.socket(type=socket.SOCK_DGRAM) as first, socket.socket(type=socket.SOCK_DGRAM) as second:
         first.settimeout(60)
         second.settimeout(60)
-        for sends, heard_by in ((first, first), (second, first), (second, second)):
+        for source, heard_by in ((first, first), (second, first), (second, second)):
             if heard_by is second:
                 monkeypatch.setattr(devices, "_PEER_TIMEOUT_S", 0.0)
-            sends.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
+            source.sendto(Sender().frame(drones.beat()), ("127.0.0.1", port))
             select.select([device], [], [], 60)
             assert device.read()
             device.write(b"to whom it may concern")
@@ -312,9 +312,9 @@ class FakeLink:
         assert frame
 
 
-@pytest.mark.parametrize(("comes", "is_refused"), [(False, False), (True, False), (False, True)])
+@pytest.mark.parametrize(("arrives", "is_refused"), [(False, False), (True, False), (False, True)])
 def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
-    comes: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    arrives: bool, is_refused: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     clock, link, sender = FakeClock(), FakeLink(), Sender()
     monkeypatch.setattr(mavlink, "time", clock)
@@ -332,11 +332,11 @@ def test_requested_message_must_arrive_60_s_after_the_first_heartbeat(
     turn(500.0, drones.beat(), d.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0))
     turn(559.9, drones.beat())
     assert not recorder.ready
-    if comes:
+    if arrives:
         turn(559.95, d.MAVLink_local_position_ned_message(1, 0, 0, 0, 0, 0, 0))
     if is_refused:
         link.messages = {32: MessageRate(100_000, d.MAV_RESULT_DENIED, 0.0)}
-    if comes or is_refused:
+    if arrives or is_refused:
         turn(560.1, drones.beat())
         assert recorder.ready
         turn(2000.0)
@@ -390,12 +390,12 @@ def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
 ) -> None:
     damage = drones.damage_randomly(1)
     drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
-    with drone as where:
-        connection = f"{where}:115200" if serial else f"udpout:127.0.0.1:{where}"
-        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as ended:
-            wait_until_size(ended.log, 12_000)
-    assert ended.code == 0
-    read = tlog.read(ended.log, drones.SYSTEM, ended.output_text["ended_us"])
-    assert read.frames == ended.output_text["frames"]
+    with drone as address:
+        connection = f"{address}:115200" if serial else f"udpout:127.0.0.1:{address}"
+        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as result:
+            wait_until_size(result.log, 12_000)
+    assert result.code == 0
+    read = tlog.read(result.log, drones.SYSTEM, result.output_text["ended_us"])
+    assert read.frames == result.output_text["frames"]
     assert int(read.values["mavlink_damaged"]) > 10
     assert read.kinds["LOCAL_POSITION_NED"] > 5

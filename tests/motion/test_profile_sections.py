@@ -23,8 +23,8 @@ def drive_section(profile: RobotProfile) -> Drive:
     return drive
 
 
-def conflict(one: Robot, others: Iterable[Robot]) -> str | None:
-    return drive_section(one.profile).topic_conflict(one, others)
+def conflict(robot: Robot, others: Iterable[Robot]) -> str | None:
+    return drive_section(robot.profile).topic_conflict(robot, others)
 
 
 def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str | None = None) -> RobotProfile:
@@ -41,7 +41,7 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
 
 
 @pytest.mark.parametrize(
-    ("other", "why"),
+    ("other", "expected_reason"),
     [
         (robot("other"), None),
         (robot("other", master="10.42.0.4"), None),
@@ -53,16 +53,20 @@ def turtlebot(*, topic: str = "/cmd_vel", odometry: str = "/odom", domain: str |
         (robot("one", master=MASTER), None),
     ],
 )
-def test_conflicts_of_robots_with_one_master(other: Robot, why: str | None) -> None:
+def test_conflicts_of_robots_with_one_master(other: Robot, expected_reason: str | None) -> None:
     reason = conflict(robot("one", master=MASTER), [other])
-    assert reason == why if why is None else reason is not None and reason.startswith(why)
+    assert (
+        reason == expected_reason
+        if expected_reason is None
+        else reason is not None and reason.startswith(expected_reason)
+    )
 
 
-@pytest.mark.parametrize(("domain", "alone"), [("", False), ("0", False), ("7", True)])
-def test_conflicts_of_robots_with_ros2_domains(domain: str, alone: bool) -> None:
+@pytest.mark.parametrize(("domain", "is_valid"), [("", False), ("0", False), ("7", True)])
+def test_conflicts_of_robots_with_ros2_domains(domain: str, is_valid: bool) -> None:
     reason = conflict(robot("one", turtlebot(domain="")), [robot("other", turtlebot(domain=domain))])
-    assert (reason is None) is alone
-    assert alone or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
+    assert (reason is None) is is_valid
+    assert is_valid or reason == "other also subscribes to /cmd_vel of ROS domain 0 and would drive, too"
 
 
 def test_emulated_robots_implement_the_sections() -> None:

@@ -19,7 +19,7 @@ def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keep", "failed", "stays"),
+    ("keep", "failed", "remains"),
     [
         (Keep.FAILED, True, True),
         (Keep.FAILED, False, False),
@@ -27,12 +27,12 @@ def test_a_folder_is_created_on_first_use(tmp_path: Path) -> None:
         (Keep.NONE, True, False),
     ],
 )
-def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, failed: bool, stays: bool) -> None:
+def test_a_folder_remains_if_it_must_be_kept(tmp_path: Path, *, keep: Keep, failed: bool, remains: bool) -> None:
     folder = EvidenceFolder(tmp_path / "run" / "test_a")
     folder.add("heard")
     folder.has_failed = failed
     folder.remove_unless_kept(keep)
-    assert (folder.exists, (tmp_path / "run").exists()) == (stays, stays)
+    assert (folder.exists, (tmp_path / "run").exists()) == (remains, remains)
 
 
 def test_a_rerun_of_a_test_has_a_separate_folder(tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def ran(folder: Path) -> SuiteRun:
+def suite_run(folder: Path) -> SuiteRun:
     suites.write(folder, test_robots=SUITE)
     (folder / "procedures").mkdir()
     for name, text in (("short", SHORT), ("slow", SLOW)):
@@ -200,62 +200,63 @@ def part(output_text: str, title: str) -> str:
     return match[1]
 
 
-def test_tests_pass_fail_and_have_errors_of_the_lab(ran: SuiteRun) -> None:
-    assert ran.code == 1
-    failed = {name for name, how in ran.results.items() if how == "failure"}
-    errors = {name.partition("[")[0] for name, how in ran.results.items() if how == "error"}
-    assert failed == FAIL, ran.output
-    refused = ("test_uses_an_unknown", "test_uses_robots_missing", "test_passes_a_string")
-    assert errors == {name.partition("[")[0] for name in ran.results if name.startswith(refused)}
-    assert len(ran.results) == len(FAIL) + len([how for how in ran.results.values() if how == "error"]) + 10, (
-        ran.output
-    )
+def test_tests_pass_fail_and_have_errors_of_the_lab(suite_run: SuiteRun) -> None:
+    assert suite_run.code == 1
+    failed = {name for name, outcome in suite_run.results.items() if outcome == "failure"}
+    errors = {name.partition("[")[0] for name, outcome in suite_run.results.items() if outcome == "error"}
+    assert failed == FAIL, suite_run.output
+    rejected = ("test_uses_an_unknown", "test_uses_robots_missing", "test_passes_a_string")
+    assert errors == {name.partition("[")[0] for name in suite_run.results if name.startswith(rejected)}
+    assert (
+        len(suite_run.results)
+        == len(FAIL) + len([outcome for outcome in suite_run.results.values() if outcome == "error"]) + 10
+    ), suite_run.output
 
 
-def test_a_failure_is_reported_with_the_line_of_the_test(ran: SuiteRun) -> None:
-    output_text = part(ran.output, "test_fails_because_of_a_program")
+def test_a_failure_is_reported_with_the_line_of_the_test(suite_run: SuiteRun) -> None:
+    output_text = part(suite_run.output, "test_fails_because_of_a_program")
     assert '>       robots.sender.run(["sh", "-c", "echo broken >&2; exit 3"])' in output_text
     assert "rover: `sh -c 'echo broken >&2; exit 3'` exited with code 3: broken" in output_text
     assert "/fieldkit/" not in output_text, "no internals of fieldkit are shown"
-    assert "rover: `sleep 60` did not end in time" in part(ran.output, "test_fails_because_of_a_timeout")
+    assert "rover: `sleep 60` did not end in time" in part(suite_run.output, "test_fails_because_of_a_timeout")
     assert "where inf = CellFigure(name='file_loss', unit='share', n=1" in part(
-        ran.output, "test_fails_because_of_a_figure"
+        suite_run.output, "test_fails_because_of_a_figure"
     )
-    assert "rtt_median_s < 1 us TCP" in part(ran.output, "test_fails_because_of_an_expectation")
+    assert "rtt_median_s < 1 us TCP" in part(suite_run.output, "test_fails_because_of_an_expectation")
 
 
-def test_an_error_of_the_lab_is_reported_with_its_remedy(ran: SuiteRun) -> None:
-    output_text = part(ran.output, "ERROR at setup of test_uses_an_unknown_robot")
+def test_an_error_of_the_lab_is_reported_with_its_remedy(suite_run: SuiteRun) -> None:
+    output_text = part(suite_run.output, "ERROR at setup of test_uses_an_unknown_robot")
     assert "there is no robot 'sendr' in this lab\n  remedy: did you mean 'sender'?" in output_text
     assert "requested at test_robots.py:" in output_text
     assert "the site file gives no roles for topology master" in part(
-        ran.output, "ERROR at setup of test_uses_robots_missing_in_the_site"
+        suite_run.output, "ERROR at setup of test_uses_robots_missing_in_the_site"
     )
-    assert "remedy: write ['ping', '-c', '1', 'base']" in ran.output
+    assert "remedy: write ['ping', '-c', '1', 'base']" in suite_run.output
 
 
-def test_only_evidence_of_failures_is_kept(ran: SuiteRun, folder: Path) -> None:
-    (kept,) = (folder / "fieldkit-results").iterdir()
-    own = {path.name for path in (kept / "test_robots.py").iterdir()}
-    assert own - {"set-up"} >= FAIL - {"test_fails_because_of_a_figure"}, (
+def test_only_evidence_of_failures_is_kept(suite_run: SuiteRun, folder: Path) -> None:
+    (kept_folder,) = (folder / "fieldkit-results").iterdir()
+    names = {path.name for path in (kept_folder / "test_robots.py").iterdir()}
+    assert names - {"set-up"} >= FAIL - {"test_fails_because_of_a_figure"}, (
         "what that one is about was set up for several"
     )
-    assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in own if "asks" not in name)
-    log = (kept / "test_robots.py" / "test_fails_because_of_a_program" / "lab.log").read_text(encoding="utf-8")
+    assert not any(name.startswith(("test_a", "test_r", "test_t")) for name in names if "asks" not in name)
+    log = (kept_folder / "test_robots.py" / "test_fails_because_of_a_program" / "lab.log").read_text(encoding="utf-8")
     assert log.endswith("rover $ sh -c 'echo broken >&2; exit 3'\nbroken\nexit code 3\n")
     for name, trials in (("set-up", 1), ("test_fails_because_of_an_expectation", 1)):
-        tables = list((kept / "test_robots.py" / name / "trials").glob("*/trial.csv"))
+        tables = list((kept_folder / "test_robots.py" / name / "trials").glob("*/trial.csv"))
         assert len(tables) == trials
 
 
-def test_a_failed_test_names_its_evidence(ran: SuiteRun, folder: Path) -> None:
-    (kept,) = (folder / "fieldkit-results").iterdir()
-    own = kept / "test_robots.py" / "test_fails_because_of_a_program"
+def test_a_failed_test_names_its_evidence(suite_run: SuiteRun, folder: Path) -> None:
+    (kept_folder,) = (folder / "fieldkit-results").iterdir()
+    own = kept_folder / "test_robots.py" / "test_fails_because_of_a_program"
     assert f"fieldkit evidence -------------------------------\n{own}\n" in part(
-        ran.output, "test_fails_because_of_a_program"
+        suite_run.output, "test_fails_because_of_a_program"
     )
-    assert ("fieldkit_evidence", str(own)) in ran.properties["test_fails_because_of_a_program"]
-    assert not ran.properties["test_files_are_copied_in_both_directions"]
+    assert ("fieldkit_evidence", str(own)) in suite_run.properties["test_fails_because_of_a_program"]
+    assert not suite_run.properties["test_files_are_copied_in_both_directions"]
 
 
 def test_each_worker_has_a_lab_and_all_share_one_folder(tmp_path: Path) -> None:
@@ -263,9 +264,11 @@ def test_each_worker_has_a_lab_and_all_share_one_folder(tmp_path: Path) -> None:
     suites.write(tmp_path, **files)
     done = suites.run(tmp_path, "-n", "2", "--dist", "loadfile", "--fieldkit-keep", "all")
     assert (done.code, set(done.results.values())) == (0, {"passed"}), done.output
-    (kept,) = (tmp_path / "fieldkit-results").iterdir()
-    logs = sorted(str(path.relative_to(kept)) for path in kept.rglob("lab.log"))
-    assert logs == [f"test_{one}.py/{test}/lab.log" for one in "ab" for test in ("set-up", f"test_{one}", "test_one")]
+    (kept_folder,) = (tmp_path / "fieldkit-results").iterdir()
+    logs = sorted(str(path.relative_to(kept_folder)) for path in kept_folder.rglob("lab.log"))
+    assert logs == [
+        f"test_{letter}.py/{test}/lab.log" for letter in "ab" for test in ("set-up", f"test_{letter}", "test_one")
+    ]
 
 
 def test_nothing_remains_after_ctrl_c(tmp_path: Path) -> None:

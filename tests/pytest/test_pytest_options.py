@@ -13,7 +13,7 @@ from fieldkit.pytest.plugin_options import Keep, LabOptions
 from tests.helpers import suites
 from tests.helpers.sshd import free_port, make_key
 
-ASKS = "def test_asks(robots):\n    pass\n"
+TEST_WITH_ROBOTS = "def test_asks(robots):\n    pass\n"
 TOLD = """
 def test_told(lab_options, pytestconfig):
     from fieldkit.pytest import plugin_options
@@ -116,7 +116,7 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
 
 
 @pytest.mark.parametrize(
-    ("words", "what", "remedy"),
+    ("words", "message", "remedy"),
     [
         (("--fieldkit-backend", "emulatd"), "there is no backend 'emulatd'", "did you mean 'emulated'?"),
         (("--fieldkit-site", "gone.yaml"), "gone.yaml", "remedy: "),
@@ -124,20 +124,20 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
     ],
 )
 def test_an_invalid_lab_is_an_error_of_set_up(
-    pytester: pytest.Pytester, words: tuple[str, ...], what: str, remedy: str
+    pytester: pytest.Pytester, words: tuple[str, ...], message: str, remedy: str
 ) -> None:
-    suites.write(pytester.path, test_asks=ASKS)
+    suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
     done = run(pytester, *words)
     assert (done.ret, done.parseoutcomes()) == (1, {"errors": 1})
     output_text = done.stdout.str()
     assert "ERROR at setup of test_asks" in output_text
-    assert what in output_text
+    assert message in output_text
     assert remedy in output_text
     assert "/fieldkit/" not in output_text, "no internals of fieldkit are shown"
 
 
 def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None:
-    suites.write(pytester.path, test_asks=ASKS)
+    suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
     output_text = run(pytester, "--fieldkit-backend", "emulatd", "--tb=long").stdout.str()
     assert "fieldkit/backends/registry.py" in output_text
 
@@ -146,19 +146,19 @@ def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None
     "words", [("--fieldkit-keep", "som"), ("--fieldkit-topology", "mesh"), ("-o", "fieldkit_keep=som")]
 )
 def test_an_invalid_value_is_rejected_before_any_test(pytester: pytest.Pytester, words: tuple[str, ...]) -> None:
-    suites.write(pytester.path, test_asks=ASKS)
+    suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
     done = run(pytester, *words)
     assert done.ret == pytest.ExitCode.USAGE_ERROR
     assert "choose from" in done.stderr.str()
 
 
 def test_a_test_module_chooses_its_lab(pytester: pytest.Pytester) -> None:
-    suites.write(pytester.path, test_asks=CHOOSES + ASKS)
+    suites.write(pytester.path, test_asks=CHOOSES + TEST_WITH_ROBOTS)
     assert "there is no backend 'mars'" in run(pytester).stdout.str()
 
 
 def test_an_unreachable_robot_is_an_error_with_a_remedy(tmp_path: Path) -> None:
-    suites.write(tmp_path, site=field(tmp_path), test_asks=ASKS)
+    suites.write(tmp_path, site=field(tmp_path), test_asks=TEST_WITH_ROBOTS)
     done = suites.run(tmp_path)
     assert (done.code, done.results) == (1, {"test_asks": "error"}), done.output
     assert "near: connection: 127.0.0.1 cannot be reached for SSH" in done.output

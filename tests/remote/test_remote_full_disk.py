@@ -137,14 +137,14 @@ def test_job_that_fills_the_disk_is_stopped_by_abort_of_any_version(shell: Small
         wait_until(lambda: is_full(shell), Deadline.after(30))
         fill(shell)
         shell.run(("sh", "-c", "mv .fieldkit/job-*.sh .fieldkit/job-older.sh"), deadline=Deadline.after(30))
-        (ended,) = locks.abort({"robot": shell}, "bert@two").values()
-        assert len(ended.jobs) == 1
-        assert ended.error is not None
-        assert NO_SPACE in ended.error.what
-        assert "remove old trials" in ended.error.remedy
+        (aborted,) = locks.abort({"robot": shell}, "bert@two").values()
+        assert len(aborted.jobs) == 1
+        assert aborted.error is not None
+        assert NO_SPACE in aborted.error.what
+        assert "remove old trials" in aborted.error.remedy
         shell.run(("sh", "-c", f"rm -f .fieldkit/fill {FOLDER}/hole"), deadline=Deadline.after(30))
-        (ended,) = locks.abort({"robot": shell}, "bert@two").values()
-        assert (ended.locked, ended.jobs, ended.error) == (True, (), None)
+        (aborted,) = locks.abort({"robot": shell}, "bert@two").values()
+        assert (aborted.locked, aborted.jobs, aborted.error) == (True, (), None)
         jobs.install(shell, Deadline.after(30))
         with pytest.raises(LockLostError, match="aborted by bert@two"):
             evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")

@@ -132,15 +132,15 @@ def test_any_archive_stays_in_its_folder(entries: list[bytes], tail: bytes) -> N
 def test_archive_arrives_completely_or_not_at_all(files: dict[str, bytes], data: st.DataObject) -> None:
     sums = "".join(f"{hashlib.sha256(content).hexdigest()}  {name}\n" for name, content in files.items())
     sent = [(".sums-1", sums.encode()), *files.items()]
-    whole = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
+    archive = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
     if files:
         with tempfile.TemporaryDirectory() as folder:
-            fetching.fetch(Sender(Path(folder), whole), "x", "sender", "lo", Path(folder))
+            fetching.fetch(Sender(Path(folder), archive), "x", "sender", "lo", Path(folder))
             assert {name: Path(folder, name).read_bytes() for name in files} == files
-    hurt = bytearray(whole)
-    place = data.draw(st.integers(0, len(whole) - 1))
+    hurt = bytearray(archive)
+    place = data.draw(st.integers(0, len(archive) - 1))
     hurt[place] ^= data.draw(st.integers(1, 255))
-    for sent_instead in (bytes(hurt), whole[:place]):
+    for sent_instead in (bytes(hurt), archive[:place]):
         assert fetched(sent_instead) in (None, files)
 
 
@@ -266,9 +266,9 @@ def test_events_write_only_printable_characters_to_the_terminal(text: str) -> No
         RepeatEnded("udp-01", 1, Status.VOID, reason=text, summary=text, done=1, total=2, left_s=1),
     ]
     for event in events:
-        shown = display.event_text(event)
-        assert shown is not None
-        assert shown.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
+        printed = display.event_text(event)
+        assert printed is not None
+        assert printed.plain.replace("\n", "").replace("\N{NO-BREAK SPACE}", "").isprintable()
 
 
 @pytest.mark.parametrize("show", [display.show_error, lambda text: display.table(["x"], [[text]])])
@@ -276,9 +276,9 @@ def test_errors_and_tables_show_markup_and_escapes_literally(
     show: Callable[[str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     show("[bold]a[/bold] \x1b]52;c;QQ==\x07 \u202e b")
-    shown = "".join(capsys.readouterr())
-    assert "[bold]a[/bold] ?]52;c;QQ==" in shown
-    assert not set(shown) & set("\x1b\x07\u202e")
+    output = "".join(capsys.readouterr())
+    assert "[bold]a[/bold] ?]52;c;QQ==" in output
+    assert not set(output) & set("\x1b\x07\u202e")
 
 
 class Endless:

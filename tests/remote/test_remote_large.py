@@ -62,8 +62,8 @@ def into(tmp_path: Path) -> Path:
     return folder
 
 
-def fetch(robot: Flaky, into: Path, **more: object) -> None:
-    fetching.fetch(robot, FOLDER, "sender", "lo", into, **more)  # type: ignore[arg-type]
+def fetch(robot: Flaky, into: Path, **options: object) -> None:
+    fetching.fetch(robot, FOLDER, "sender", "lo", into, **options)  # type: ignore[arg-type]
 
 
 def names(folder: Path) -> set[str]:
@@ -96,7 +96,7 @@ def test_two_robots_cannot_use_the_same_file_name(robot: Flaky, into: Path, monk
     assert names(into) == WHOLE
 
 
-LIES = {
+FALSE_OUTPUTS = {
     "wc": [
         "",
         "exit 3",
@@ -110,7 +110,7 @@ LIES = {
 }
 
 
-@pytest.mark.parametrize(("tool", "lie"), [(tool, lie) for tool, lies in LIES.items() for lie in lies])
+@pytest.mark.parametrize(("tool", "lie"), [(tool, lie) for tool, lies in FALSE_OUTPUTS.items() for lie in lies])
 def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str, lie: str) -> None:
     home, into, tools = (tmp_path / name for name in ("home", "into", "bin"))
     for folder in (home, into, tools):

@@ -22,8 +22,8 @@ from paramiko.common import AUTH_FAILED, AUTH_SUCCESSFUL, OPEN_SUCCEEDED
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, LinkLostError, RobotError
 from fieldkit.remote.keys import read_private_key
-from fieldkit.remote.link import Timing
 from fieldkit.remote.shell import Completed
+from fieldkit.remote.sockets import Timing
 from fieldkit.remote.ssh import SshShell
 from tests.helpers.sshd import Server, wait_until
 
@@ -57,9 +57,9 @@ class Clock:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    made = Clock()
-    monkeypatch.setattr("fieldkit.core.deadline.time", made)
-    return made
+    fake_clock = Clock()
+    monkeypatch.setattr("fieldkit.core.deadline.time", fake_clock)
+    return fake_clock
 
 
 class HaltingServer(paramiko.ServerInterface):
@@ -98,7 +98,7 @@ class FakeServer:
 
     def __init__(self, serve: Callable[[socket.socket], object]) -> None:
         self.listener = socket.create_server(("127.0.0.1", 0))
-        self.kept: list[object] = []
+        self.transports: list[object] = []
         self.serve = serve
         threading.Thread(target=self.accept, daemon=True).start()
 
@@ -106,7 +106,7 @@ class FakeServer:
         with contextlib.suppress(OSError):
             while True:
                 stream, _ = self.listener.accept()
-                self.kept.append((stream, self.serve(stream)))
+                self.transports.append((stream, self.serve(stream)))
 
     def connect(self, timeout_s: float) -> socket.socket:
         return socket.create_connection(self.listener.getsockname(), timeout=timeout_s)
@@ -132,14 +132,14 @@ def pinned(key: paramiko.PKey) -> str:
 
 @pytest.fixture
 def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], FakeServer]]:
-    made: list[FakeServer] = []
+    servers: list[FakeServer] = []
 
     def make(serve: Callable[[socket.socket], object]) -> FakeServer:
-        made.append(FakeServer(serve))
-        return made[-1]
+        servers.append(FakeServer(serve))
+        return servers[-1]
 
     yield make
-    for fake in made:
+    for fake in servers:
         fake.listener.close()
 
 
@@ -423,9 +423,9 @@ def notices() -> list[str]:
 
 @pytest.fixture
 def shell(server: Server, line: CuttableLine, notices: list[str]) -> Iterator[SshShell]:
-    made = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
-    yield made
-    made.close()
+    test_shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
+    yield test_shell
+    test_shell.close()
 
 
 def is_up(shell: SshShell) -> bool:
@@ -436,8 +436,8 @@ def is_up(shell: SshShell) -> bool:
 
 @pytest.fixture
 def pool() -> Iterator[ThreadPoolExecutor]:
-    with ThreadPoolExecutor(2) as made:
-        yield made
+    with ThreadPoolExecutor(2) as new_pool:
+        yield new_pool
 
 
 class WaitingCommand:
@@ -465,9 +465,9 @@ class WaitingCommand:
 
 @pytest.fixture
 def waiting(tmp_path: Path) -> Iterator[WaitingCommand]:
-    made = WaitingCommand(tmp_path)
-    yield made
-    made.go.touch()
+    command = WaitingCommand(tmp_path)
+    yield command
+    command.go.touch()
 
 
 def test_command_whose_link_breaks_is_sent_again(
@@ -487,12 +487,12 @@ def test_command_whose_link_breaks_is_sent_again(
 def test_link_that_breaks_before_the_expected_output_is_not_an_end(
     shell: SshShell, line: CuttableLine, waiting: WaitingCommand, pool: ThreadPoolExecutor
 ) -> None:
-    begun = pool.submit(shell.begin, waiting.argv, deadline=soon(), until=b"part\nwhole\n")
+    command = pool.submit(shell.begin, waiting.argv, deadline=soon(), until=b"part\nwhole\n")
     waiting.wait_for_starts(1)
     line.cut()
     waiting.wait_for_starts(2)
     waiting.go.touch()
-    session = begun.result(SOON)
+    session = command.result(SOON)
     assert session.is_ready
     assert session.end(deadline=soon()).exit_code == 0
 
@@ -517,14 +517,14 @@ def test_link_that_is_interrupted_is_restored(
 def test_two_commands_that_lose_one_link_are_sent_again_with_one_notice(
     shell: SshShell, line: CuttableLine, notices: list[str], pool: ThreadPoolExecutor, tmp_path: Path
 ) -> None:
-    both = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
-    for command in both:
+    waiting_commands = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
+    for command in waiting_commands:
         command.go.parent.mkdir()
-    done = [pool.submit(shell.run, command.argv, deadline=soon()) for command in both]
-    for command in both:
+    done = [pool.submit(shell.run, command.argv, deadline=soon()) for command in waiting_commands]
+    for command in waiting_commands:
         command.wait_for_starts(1)
     line.cut()
-    for command in both:
+    for command in waiting_commands:
         command.wait_for_starts(2)
         command.go.touch()
     assert [command.result(SOON).stdout for command in done] == [b"part\nwhole\n"] * 2
@@ -535,13 +535,13 @@ def test_two_commands_that_lose_one_link_are_sent_again_with_one_notice(
 def test_later_detection_of_a_loss_uses_the_restored_link(
     shell: SshShell, line: CuttableLine, notices: list[str], tmp_path: Path
 ) -> None:
-    both = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
+    waiting_commands = [WaitingCommand(tmp_path / name) for name in ("a", "b")]
     sessions = []
-    for command in both:
+    for command in waiting_commands:
         command.go.parent.mkdir()
         sessions.append(shell.begin(command.argv, deadline=soon()))
     line.cut()
-    for command in both:
+    for command in waiting_commands:
         command.go.touch()
     for session in sessions:
         assert session.end(deadline=soon()).stdout == b"part\nwhole\n"
@@ -785,7 +785,7 @@ def test_close_ends_a_hanging_login(
     mute = fakes(lambda stream: None)
     shell = server.shell(connect=mute.connect)
     done = pool.submit(shell.run, ("true",), deadline=soon())
-    wait_until(lambda: len(mute.kept) == 1, soon())
+    wait_until(lambda: len(mute.transports) == 1, soon())
     assert "fieldkit closed the connection" in str(ends_soon(done, shell))
 
 

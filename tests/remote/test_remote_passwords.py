@@ -44,13 +44,13 @@ class Memory(KeyringBackend):
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self.held: dict[tuple[str, str], str] = {}
+        self.passwords: dict[tuple[str, str], str] = {}
 
     def get_password(self, service: str, username: str) -> str | None:
-        return self.held.get((service, username))
+        return self.passwords.get((service, username))
 
     def set_password(self, service: str, username: str, password: str) -> None:
-        self.held[service, username] = password
+        self.passwords[service, username] = password
 
 
 @pytest.fixture
@@ -70,8 +70,8 @@ def password_server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server
     )
     (folder / "shadow").write_text(f"root:{crypt.stdout.strip()}:20000:0:99999:7:::\nsshd:!:20000::::::\n")
     (folder / "shadow").chmod(0o640)
-    over = 'mount --bind "$0" /etc/shadow && exec "$@"'
-    within = ("unshare", "--mount", "--propagation", "private", "sh", "-c", over, str(folder / "shadow"))
+    command = 'mount --bind "$0" /etc/shadow && exec "$@"'
+    within = ("unshare", "--mount", "--propagation", "private", "sh", "-c", command, str(folder / "shadow"))
     with sshd(folder, within=within, PermitRootLogin="yes", PasswordAuthentication="yes") as server:
         yield server
 
@@ -84,8 +84,8 @@ def test_password_logs_in_and_is_stored_nowhere(
     shell = password_server.shell(private_key=None, password=SECRET)
     assert shell.run(("echo", "in"), deadline=Deadline.after(20)).stdout == b"in\n"
     shell.close()
-    shown = capfd.readouterr()
-    assert SECRET not in caplog.text + shown.out + shown.err + repr(vars(shell._connection))
+    output = capfd.readouterr()
+    assert SECRET not in caplog.text + output.out + output.err + repr(vars(shell._connection))
 
 
 @pytest.mark.emulated
@@ -99,10 +99,10 @@ def test_wrong_password_is_refused_and_not_shown(password_server: Server) -> Non
 
 @pytest.mark.emulated
 def test_field_backend_prompts_once_per_robot_and_run(password_server: Server, tmp_path: Path) -> None:
-    asked: list[tuple[str, str, str]] = []
+    prompts: list[tuple[str, str, str]] = []
 
     def answer(user: str, host: str, robot: str) -> str:
-        asked.append((user, host, robot))
+        prompts.append((user, host, robot))
         return SECRET
 
     path = tmp_path / "fieldkit.yaml"
@@ -115,7 +115,7 @@ def test_field_backend_prompts_once_per_robot_and_run(password_server: Server, t
             field.cast(Topology.MASTERLESS), seed=1, sink=lambda event: None, operator=Unattended()
         ) as lab:
             assert len(lab.shells) == 2
-    assert asked == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
+    assert prompts == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
 
 
 def test_keyring_entry_is_user_at_host(memory: Memory) -> None:

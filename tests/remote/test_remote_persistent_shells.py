@@ -65,11 +65,11 @@ class Robot:
         """Return the pid of the persistent shell when it is open."""
         found: list[int] = []
 
-        def same() -> bool:
+        def is_same_shell() -> bool:
             found.append(self.pid())
             return found[-2:-1] == found[-1:]
 
-        wait_until(same, soon())
+        wait_until(is_same_shell, soon())
         return found[-1]
 
 
@@ -338,10 +338,10 @@ def test_login_shell_with_a_greeting_uses_separate_sessions(tmp_path: Path) -> N
 
 @pytest.mark.emulated
 def test_missing_script_is_reported_each_time(tmp_path: Path) -> None:
-    with robot(tmp_path) as bare:
-        (bare.home / SCRIPT_PATH).unlink()
+    with robot(tmp_path) as plain_robot:
+        (plain_robot.home / SCRIPT_PATH).unlink()
         for _ in range(3):
-            assert SCRIPT_PATH.encode() in bare.run(":", check=False).stderr
+            assert SCRIPT_PATH.encode() in plain_robot.run(":", check=False).stderr
 
 
 class ReceivedChannel:
@@ -399,10 +399,10 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
     end = NONCE + f" {code}\n".encode()
     begin = stray + NONCE + b"\n"
     channel = ReceivedChannel(split(begin + out[0] + end + stray, out[1]), split(begin + err[0] + end, err[1]))
-    taken = threading.Lock()
-    taken.acquire()
+    lock = threading.Lock()
+    lock.acquire()
     try:
-        running_command = wait_for_start(cast("Channel", channel), NONCE, taken)
+        running_command = wait_for_start(cast("Channel", channel), NONCE, lock)
         into = BytesIO()
         assert running_command is not None
         assert wait_for_output(running_command, out[0][:3], deadline=soon(), robot="robot")
@@ -411,7 +411,7 @@ def test_output_and_exit_code_are_separated_for_any_pieces(
     finally:
         os.close(channel.event)
     assert (into.getvalue(), done) == (out[0][3:], (code, err[0]))
-    assert not taken.locked()
+    assert not lock.locked()
     assert not channel.closed
 
 

@@ -26,9 +26,9 @@ SOON = 60.0
 
 @pytest.fixture
 def shell(server: Server) -> Iterator[SshShell]:
-    made = server.shell()
-    yield made
-    made.close()
+    test_shell = server.shell()
+    yield test_shell
+    test_shell.close()
 
 
 def soon() -> Deadline:

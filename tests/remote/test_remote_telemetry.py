@@ -133,9 +133,11 @@ def test_failed_sample_does_not_stop_the_sampler(shell: LocalShell, tmp_path: Pa
     # A station that is lost between the two requests of `iw link` is unknown to the kernel.
     give_iw(tmp_path)
     iw, lost = tmp_path / "bin" / "iw", tmp_path / "lost"
-    fails = "{ echo 'command failed: No such file or directory (-2)' >&2; exit 254; }"
+    failing_command = "{ echo 'command failed: No such file or directory (-2)' >&2; exit 254; }"
     text = iw.read_text(encoding="utf-8")
-    iw.write_text(text.replace("case $3", f"[ ! -e {shlex.quote(str(lost))} ] || {fails}\ncase $3"), encoding="utf-8")
+    iw.write_text(
+        text.replace("case $3", f"[ ! -e {shlex.quote(str(lost))} ] || {failing_command}\ncase $3"), encoding="utf-8"
+    )
     written = begin(shell)
     lost.touch()
     looks = written.read_text().count(" link <==")

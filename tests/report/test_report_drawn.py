@@ -103,9 +103,9 @@ def test_a_figure_is_equal_to_one_that_matplotlib_draws_twice(form: Format, monk
     series = [Series("sent", Style("blue", "o"), x, y), Series("received", Style("red", "s"), x, y)]
     panel = Panel("a long title that needs several lines in a figure of one column", "distance", "ms", series, "")
     chart = Chart("a", "A", "", [panel])
-    drawn = figures.paper(chart, form)
+    figure = figures.paper(chart, form)
     monkeypatch.setattr(figures, "_Figure", Figure)
-    assert figures.paper(chart, form) == drawn
+    assert figures.paper(chart, form) == figure
 
 
 def test_broken_line_is_drawn_in_segments() -> None:
@@ -200,8 +200,8 @@ def test_distances_have_the_labels_that_the_operator_typed() -> None:
 def test_a_cross_is_drawn_with_its_text(lanes: tuple[str, ...], is_high: bool) -> None:
     edge = EdgeMark(0.0, "nothing arrived: 3 of 3", "blue", is_high)
     series = Series("", Style("blue", "o", "none"), [1.0], [0.0], [0.5], [2.0], join="none")
-    drawn = figures.panel_svg(Panel("", "", "", [series], "", top=3.0, right=3.0, lanes=lanes, edges=[edge]))
-    assert "nothing arrived: 3 of 3" in drawn
+    figure = figures.panel_svg(Panel("", "", "", [series], "", top=3.0, right=3.0, lanes=lanes, edges=[edge]))
+    assert "nothing arrived: 3 of 3" in figure
 
 
 def test_lower_bound_is_an_open_marker_that_breaks_the_line(tmp_path: Path) -> None:
@@ -225,9 +225,9 @@ def test_lower_bound_is_an_open_marker_that_breaks_the_line(tmp_path: Path) -> N
     assert series.notes[3] == "5 of 6 not ended"
     assert {2, 3} <= set(series.breaks)
     assert "a lower bound" in chart.caption
-    drawn = figures.panel_svg(chart.panels[0])
+    figure = figures.panel_svg(chart.panels[0])
     closed = without_bounds(chart.panels[0])
-    assert drawn.count("<path") > figures.panel_svg(closed).count("<path")
+    assert figure.count("<path") > figures.panel_svg(closed).count("<path")
 
 
 def without_bounds(panel: Panel) -> Panel:

@@ -1,7 +1,10 @@
 """Reports with raw evidence: a small synthetic trial whose packets and replies are all known."""
 
 import math
+import os
 import re
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +14,7 @@ from fieldkit.cli import main
 from fieldkit.config import schema
 from fieldkit.core.model import Role, TrackPoint
 from fieldkit.measure.evidence import track
-from fieldkit.report import distribution, packet_rasters, timeline
+from fieldkit.report import distribution, packet_rasters, page, timeline, trial_folders
 from fieldkit.report.contents import build_contents, repeat_to_draw
 from fieldkit.report.series import Identities
 from fieldkit.report.trial_folders import load_evidence
@@ -40,6 +43,45 @@ def test_links_lead_to_existing_folders(trial: Path, monkeypatch: pytest.MonkeyP
     assert {link for link in links if not (lab / "out" / link).exists()} == {
         f"../trials/{trial.name}/MANIFEST.sha256"
     }
+
+
+def copied(trial: Path, name: str) -> Path:
+    """Copy a trial under another name."""
+    copy = trial.with_name(name)
+    shutil.copytree(trial, copy)
+    for file in ("trial.csv", PLAN_FILE):
+        text = (copy / file).read_text(encoding="utf-8")
+        (copy / file).write_text(text.replace(trial.name, name), encoding="utf-8")
+    return copy
+
+
+def test_a_trial_that_the_filter_removes_is_not_opened(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = trial.parent.parent
+    monkeypatch.chdir(lab)
+    os.mkfifo(copied(trial, "other") / store.REPEATS / "pipe")
+    pages = []
+    for options in ((), ("--where", 'trial != "other"')):
+        assert main(["report", "trials", "-o", "report.html", *options]) == 0
+        pages.append((lab / "report.html").read_text(encoding="utf-8"))
+    assert "other/repeats/pipe" in pages[0]
+    assert "other" not in pages[1].replace("--where", "").replace("!= &#34;other&#34;", "")
+
+
+def test_the_evidence_of_many_trials_is_limited(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    copied(trial, "other")
+    monkeypatch.setattr(trial_folders, "MAX_TRIALS", 1)
+    repeats = sources.find([trial.parent], print).read()
+    for name in (trial.name, "other"):
+        contents = build_contents(
+            repeats, title="", repeat=f"{name}/udp-01", command=["fieldkit", "report", "trials"], paths=["trials"]
+        )
+        assert contents.evidence.verified == {str(trial.parent / name)}
+        assert any("of 1 of 2 trials" in warning.text for warning in contents.warnings)
+        assert len(contents.evidence.plans) == 2
+    text = page.render(replace(contents, max_trials=1), trial / "report.html")
+    assert text.count('<th scope="row"><a href=') == 1
+    assert "The first 1 of 2 trials" in text
+    assert "fieldkit export trials --format csv" in text
 
 
 def test_lost_packets_are_marked_at_their_positions(trial: Path) -> None:

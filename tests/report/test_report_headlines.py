@@ -22,8 +22,8 @@ LOST = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_loss": 1.0, "rtt_med
 def lines(rows: Sequence[RepeatRow], unmeasured: Sequence[str] = ()) -> dict[str, list[str]]:
     """Return the lines of each headline by its subject."""
     evidence = load_evidence(parsed(rows))
-    shown = headlines(aggregate(evidence.repeats), evidence, unmeasured)
-    return {headline.subject: texts(headline) for headline in shown}
+    result = headlines(aggregate(evidence.repeats), evidence, unmeasured)
+    return {headline.subject: texts(headline) for headline in result}
 
 
 def texts(headline: Headline) -> list[str]:
@@ -70,8 +70,8 @@ def test_void_failed_and_planned_conditions_are_counted() -> None:
 
 
 def test_void_attempt_of_a_repeated_repeat_is_not_missing() -> None:
-    again = lawns.row(1, attempt=2, started_utc_ns=1_795_262_500_000_000_000)
-    assert lines([lawns.row(1, status="void", reason="no capture"), again])["Repeats"] == ["1 of 1 valid"]
+    second_row = lawns.row(1, attempt=2, started_utc_ns=1_795_262_500_000_000_000)
+    assert lines([lawns.row(1, status="void", reason="no capture"), second_row])["Repeats"] == ["1 of 1 valid"]
 
 
 def test_value_of_only_some_repeats_shows_their_number() -> None:
@@ -102,8 +102,8 @@ def test_everything_lost_if_all_losses_are_total(losses: dict[str, float | None]
 
 def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
     rows = [lawns.row(1), lawns.row(2, **(LOST | {"rtt_loss": None})), lawns.row(3, rtt_median_s=None)]
-    shown = lines(rows)["RTT with UDP"]
-    assert shown[:2] == ["nothing arrived 10ft (1 of 3)", "no value 10ft (1 of 3)"]
+    values = lines(rows)["RTT with UDP"]
+    assert values[:2] == ["nothing arrived 10ft (1 of 3)", "no value 10ft (1 of 3)"]
 
 
 def evidence_with(folder: Path, *expected: str) -> Evidence:
@@ -126,12 +126,13 @@ def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:
     evidence = evidence_with(tmp_path)
     plan = next(iter(evidence.plans.values()))
     assert plan.repeats == 1
-    more = Evidence(
+    other_evidence = Evidence(
         evidence.repeats,
         {source: plan.model_copy(update={"repeats": 5}) for source in evidence.plans},
         (),
         frozenset(),
+        evidence.verified,
     )
-    shown = texts(next(iter(headlines(aggregate(evidence.repeats), more))))
-    assert shown[0] == "1 of 5 valid"
-    assert any(line.startswith("4 repeats not run") for line in shown)
+    result = texts(next(iter(headlines(aggregate(evidence.repeats), other_evidence))))
+    assert result[0] == "1 of 5 valid"
+    assert any(line.startswith("4 repeats not run") for line in result)

@@ -18,20 +18,20 @@ def test_names_at_the_edges_stay_inside_the_world(
     corners = ((0.0, 0.0), (east_m, 0.0), (0.0, north_m), area_m)
     robots = {f"{letter}-{'long' * 7}": place_m for letter, place_m in zip("abcd", corners, strict=True)}
     links = [LabLink(ends, 30.0, True, ("concrete", "foliage")) for ends in itertools.combinations(robots, 2)]
-    drawn: list[Figure] = []
+    figures_drawn: list[Figure] = []
 
     def keep_figure(figure: Figure, form: str, *, transparent: bool) -> bytes:
         figure.draw_without_rendering()
-        drawn.append(figure)
+        figures_drawn.append(figure)
         return b""
 
     monkeypatch.setattr(figures, "_to_bytes", keep_figure)
     figures.overview(Overview("a world with a long name " * 4, area_m, [], robots, links), "png")
-    axes = drawn[0].axes[0]
+    axes = figures_drawn[0].axes[0]
     world = axes.get_window_extent()
     names = [text for text in axes.texts if isinstance(text, Annotation)]
     assert {text.get_text() for text in names} >= robots.keys()
     for text in names:
         extent = text.get_window_extent()
         assert world.x0 - 1 <= extent.x0 <= extent.x1 <= world.x1 + 1, text
-    assert axes.title.get_window_extent().x1 <= drawn[0].bbox.x1
+    assert axes.title.get_window_extent().x1 <= figures_drawn[0].bbox.x1

@@ -159,6 +159,16 @@ def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
     assert strip.marks[-1].title == "udp-2400, void: no capture, UDP datagram loss 5.56 %"
 
 
+def test_the_void_marks_of_a_page_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strips, "MAX_OTHER_MARKS", 30)
+    rows = [lawns.row(number, status="void" if number % 2 else "valid") for number in range(1, 101)]
+    evidence = load_evidence(table(tmp_path, rows))
+    cells = aggregate(evidence.repeats)
+    ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
+    assert sum(mark.status == "void" for mark in strip.marks) == 30
+    assert (strip.left_out, strip.others_left_out) == (0, 20)
+
+
 @pytest.mark.parametrize(("loss", "expected"), [(0.0, "none"), (0.125, "full height 12.5 %")])
 def test_strip_states_its_scale(tmp_path: Path, loss: float, expected: str) -> None:
     evidence = load_evidence(
@@ -183,15 +193,15 @@ def test_strip_shows_a_loss_that_its_repeats_have(tmp_path: Path) -> None:
 def test_empty_series_does_not_change_the_panel() -> None:
     series = Series("sent", Style("blue", "o", "none"), [1.0, 2.0], [3.0, 4.0])
     empty = Series("lost", Style("lost", "x", "none"), [], [])
-    panels = [Panel("packets", "time", "place", kept, "") for kept in ([series], [series, empty])]
+    panels = [Panel("packets", "time", "place", series_list, "") for series_list in ([series], [series, empty])]
     assert figures.panel_svg(panels[0]) == figures.panel_svg(panels[1])
     assert Chart("packets", "packets", "", [panels[1]]).legend == {}
 
 
 def test_logarithmic_axis_is_labelled_with_powers_of_ten() -> None:
     series = Series("a", Style("blue", "o"), [1, 2], [3.0, 400.0])
-    drawn = figures.panel_svg(Panel("", "", "ms", [series], "", bottom=1.0, top=1000.0, log=True))
-    texts = re.findall(r"<text[^>]*>([^<]*)</text>", drawn)
+    figure = figures.panel_svg(Panel("", "", "ms", [series], "", bottom=1.0, top=1000.0, log=True))
+    texts = re.findall(r"<text[^>]*>([^<]*)</text>", figure)
     assert {"1", "10", "100", "1000"} <= set(texts)
     assert not {"200", "500"} & set(texts)
 
@@ -205,15 +215,15 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
     ]
     evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
-    shown = [(warning.text, list(map(plain, warning.reasons))) for warning in summary.warnings(cells, evidence)]
-    assert shown[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
-    assert shown[1] == ("1 attempt failed.", ["no answer (1)"])
-    assert shown[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
-    assert shown[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
-    assert "2 repeats give 50 %" in plain(shown[3][0])
-    assert shown[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
-    assert shown[5][0].startswith("Different versions of fieldkit")
-    assert len(shown) == 6
+    listed = [(warning.text, list(map(plain_text, warning.reasons))) for warning in summary.warnings(cells, evidence)]
+    assert listed[0] == ("1 attempt void.", ["tcpdump dropped 3 packets (1)"])
+    assert listed[1] == ("1 attempt failed.", ["no answer (1)"])
+    assert listed[2] == ("No valid repeat in 1 condition.", ["UDP, 20ft"])
+    assert listed[3][0].startswith("* 95\N{NO-BREAK SPACE}% interval assuming a normal distribution")
+    assert "2 repeats give 50 %" in plain_text(listed[3][0])
+    assert listed[4] == ("One-way delay withheld, all or in part, in 1 valid repeat.", ["the clock drifts (1)"])
+    assert listed[5][0].startswith("Different versions of fieldkit")
+    assert len(listed) == 6
 
 
 def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
@@ -292,10 +302,10 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
 def ends(headline: headlines.Headline) -> list[str]:
     """Return one text per end of a headline."""
     lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
-    return [plain(" ".join(parts)) for parts in lines]
+    return [plain_text(" ".join(parts)) for parts in lines]
 
 
-def plain(text: str) -> str:
+def plain_text(text: str) -> str:
     return text.replace("\N{NO-BREAK SPACE}", " ")
 
 

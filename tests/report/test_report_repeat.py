@@ -24,24 +24,24 @@ FAR = replace(TCP, distance="55ft", distance_m=16.764)
 class PartialEvidence(Evidence):
     """A table with evidence for some of its rows."""
 
-    kept: frozenset[int] = frozenset()
+    rows_with_evidence: frozenset[int] = frozenset()
 
     def attempt(self, row: int) -> AttemptEvidence | None:
-        return AttemptEvidence(Path("repeats")) if row in self.kept else None
+        return AttemptEvidence(Path("repeats")) if row in self.rows_with_evidence else None
 
 
 def selected_row(rows: Sequence[RepeatRow], *missing: int) -> int | None:
     """Return the row selected for the time line if evidence exists for all rows except some."""
     table = parsed([replace(row, repeat=1 + number) for number, row in enumerate(rows)])
-    kept = frozenset(range(len(rows))).difference(missing)
-    return repeat_to_draw(aggregate(table), PartialEvidence(table, {}, (), frozenset(), kept), "")
+    remaining = frozenset(range(len(rows))).difference(missing)
+    return repeat_to_draw(aggregate(table), PartialEvidence(table, {}, (), frozenset(), frozenset(), remaining), "")
 
 
-def each(row: RepeatRow, name: str, *values: float) -> list[RepeatRow]:
+def rows_with(row: RepeatRow, name: str, *values: float) -> list[RepeatRow]:
     return [replace(row, **{name: value}) for value in values]
 
 
-LOST = [*each(TCP, "tcp_byte_loss", 0.3, 0.2, 0.1), *each(FAR, "tcp_byte_loss", 0.6, 0.0, 0.9, 0.7, 0.0)]
+LOST = [*rows_with(TCP, "tcp_byte_loss", 0.3, 0.2, 0.1), *rows_with(FAR, "tcp_byte_loss", 0.6, 0.0, 0.9, 0.7, 0.0)]
 
 
 @pytest.mark.parametrize(
@@ -50,12 +50,24 @@ LOST = [*each(TCP, "tcp_byte_loss", 0.3, 0.2, 0.1), *each(FAR, "tcp_byte_loss", 
         (LOST, (), 6),  # condition of most loss, median of 0.6, 0.7 and 0.9; repeats without loss are excluded
         (LOST, (5,), 3),  # the lower one of two
         (LOST, (3, 5, 6), 1),  # no evidence of repeats with loss in that condition
-        (each(TCP, "tcp_byte_loss", 0.0, 0.0) + each(FAR, "rtt_loss", 0.1), (), None),  # a share without its counts
-        (each(TCP, "transfer_s", 1.0, 3.0, 2.0) + each(FAR, "transfer_s", 5.0, 4.0, 9.0), (), 3),  # nothing lost
-        (each(replace(TCP, tcp_byte_loss=0.0), "rtt_median_s", 0.3, 0.1, 0.2), (), 2),
+        (
+            rows_with(TCP, "tcp_byte_loss", 0.0, 0.0) + rows_with(FAR, "rtt_loss", 0.1),
+            (),
+            None,
+        ),  # a share without its counts
+        (
+            rows_with(TCP, "transfer_s", 1.0, 3.0, 2.0) + rows_with(FAR, "transfer_s", 5.0, 4.0, 9.0),
+            (),
+            3,
+        ),  # nothing lost
+        (rows_with(replace(TCP, tcp_byte_loss=0.0), "rtt_median_s", 0.3, 0.1, 0.2), (), 2),
         (LOST, range(len(LOST)), None),
         ([replace(LOST[0], status="void"), *LOST[1:3]], (), 2),
-        ([replace(LOST[0], file_loss=0.5), *each(TCP, "file_loss", 0.9)], (), 0),  # TCP byte loss takes precedence
+        (
+            [replace(LOST[0], file_loss=0.5), *rows_with(TCP, "file_loss", 0.9)],
+            (),
+            0,
+        ),  # TCP byte loss takes precedence
     ],
 )
 def test_default_is_the_repeat_of_median_loss_in_the_condition_of_most_loss(

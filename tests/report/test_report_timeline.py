@@ -61,10 +61,10 @@ def bars(panel: Panel) -> dict[str, tuple[float, float]]:
 def test_jobs_have_bars_and_panels_share_one_axis(trial: Path) -> None:
     jobs(trial, capture=(1.0, 6.0), ping=(2.9, 5.0))
     all_panels = panels(trial)
-    shown = bars(all_panels[0])
-    assert shown["capture"][1] - shown["capture"][0] == pytest.approx(5.0, abs=0.02)
-    assert shown["ping"][1] - shown["ping"][0] == pytest.approx(2.1, abs=0.02)
-    assert shown["send"][0] - shown["capture"][0] == pytest.approx(1.0, abs=0.02)
+    drawn_bars = bars(all_panels[0])
+    assert drawn_bars["capture"][1] - drawn_bars["capture"][0] == pytest.approx(5.0, abs=0.02)
+    assert drawn_bars["ping"][1] - drawn_bars["ping"][0] == pytest.approx(2.1, abs=0.02)
+    assert drawn_bars["send"][0] - drawn_bars["capture"][0] == pytest.approx(1.0, abs=0.02)
     assert len({(panel.left, panel.right) for panel in all_panels}) == 1
     assert [panel.x_label for panel in all_panels] == [""] * (len(all_panels) - 1) + ["time [s]"]
     assert all_panels[0].left == 0
@@ -80,12 +80,12 @@ def test_fault_has_a_bar_for_its_cause_and_one_for_the_time_without_replies(tria
     (folder / "fault-link-down-ping.txt").write_text(
         "\n".join(["PING 10.0.0.2 (10.0.0.2) 56(84) bytes of data.", *replies]), encoding="utf-8"
     )
-    shown = bars(panels(trial)[0])
-    cause, silence = shown["fault link-down"], shown["no answer link-down"]
+    drawn_bars = bars(panels(trial)[0])
+    cause, silence = drawn_bars["fault link-down"], drawn_bars["no answer link-down"]
     assert cause[1] - cause[0] == pytest.approx(2.0, abs=0.02)
     assert silence[1] - silence[0] == pytest.approx(4.0, abs=0.02)
     assert cause[0] - silence[0] == pytest.approx(1.0, abs=0.02)
-    assert "fault-link-down" not in shown
+    assert "fault-link-down" not in drawn_bars
 
 
 def test_move_has_a_bar_from_its_first_to_its_last_position(trial: Path) -> None:

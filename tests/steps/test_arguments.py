@@ -76,9 +76,9 @@ def test_values_are_not_expanded_again(value: str) -> None:
     ],
 )
 def test_misspelled_variable_is_refused_with_suggestion(word: str, suggested: str) -> None:
-    why = arguments.problem(f"--x={word}", has_program=True)
-    assert why is not None
-    assert f"there is no variable {word}; did you mean '{suggested}'? write {{{word}}} for the text {word}" == why
+    reason = arguments.problem(f"--x={word}", has_program=True)
+    assert reason is not None
+    assert f"there is no variable {word}; did you mean '{suggested}'? write {{{word}}} for the text {word}" == reason
     assert fill_in(f"{{{word}}}") == word, "the remedy works when it is typed"
 
 

@@ -34,13 +34,13 @@ steps:
 """
 
 
-def procedure(kind: str, keys: str, away: str = "2m") -> Procedure:
-    text = TEXT.replace("KIND", kind).replace("KEYS", keys).replace("AWAY", away)
+def procedure(kind: str, keys: str, distance: str = "2m") -> Procedure:
+    text = TEXT.replace("KIND", kind).replace("KEYS", keys).replace("AWAY", distance)
     return schema.validate(schema.parse(text, source="x.yaml"), Procedure)
 
 
-def resolved_step(kind: str, keys: str, away: str = "2m") -> Any:  # noqa: ANN401 (a step of the kind)
-    return list(procedure(kind, keys, away).resolved(CAST).walk())[-1].step
+def resolved_step(kind: str, keys: str, distance: str = "2m") -> Any:  # noqa: ANN401 (a step of the kind)
+    return list(procedure(kind, keys, distance).resolved(CAST).walk())[-1].step
 
 
 @pytest.mark.motion
@@ -48,14 +48,14 @@ def test_each_kind_lasts_as_long_as_the_path() -> None:
     ping = resolved_step("ping", f"{ENDS}, along: true, interval: 300ms")
     assert isinstance(ping, PingStep)
     assert (ping.count, ping.along) == (34, False), "10 s are more than 33 intervals"
-    assert resolved_step("ping", f"{ENDS}, along: true", away="1cm").count == 1
+    assert resolved_step("ping", f"{ENDS}, along: true", distance="1cm").count == 1
     wait = resolved_step("wait", "along: true")
     assert isinstance(wait, WaitStep)
     assert wait.duration == 10.0
     topics = resolved_step("topics", f"{ENDS}, along: true")
     assert isinstance(topics, TopicsStep)
     assert topics.duration == 10.0
-    iperf3 = resolved_step("iperf3", f"{ENDS}, along: true, limit: 30s", away="2.1m")
+    iperf3 = resolved_step("iperf3", f"{ENDS}, along: true, limit: 30s", distance="2.1m")
     assert isinstance(iperf3, Iperf3Step)
     assert (iperf3.duration, iperf3.limit) == (11.0, 41.0), "whole seconds"
     assert resolved_step("ping", f"{ENDS}, count: 7").count == 7

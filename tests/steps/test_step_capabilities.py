@@ -9,7 +9,7 @@ import pytest
 from fieldkit.backends.protocols import Cast
 from fieldkit.core.model import Protocol
 from fieldkit.ros.steps.record import RecordStep
-from fieldkit.steps import capabilities
+from fieldkit.steps import base, capabilities
 from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES, HasNeeds, Listens, Prepares, Records, Restarts
 from fieldkit.steps.kinds.send import SendStep
@@ -78,6 +78,6 @@ def test_kind_that_has_a_part_of_a_capability_lacks_its_other_methods() -> None:
 
 def test_step_without_listener_is_run_when_it_has_been_prepared() -> None:
     step, scene = WaitStep.model_validate({"duration": "1s"}), Scene(Protocol.TCP, {}, "f")
-    started = capabilities.prepare(step, scene, testbed := IdleTestbed({}))
+    started = base.prepare(step, scene, testbed := IdleTestbed({}))
     assert isinstance(started, partial)
     assert (started.func, started.args) == (step.run, (scene, testbed))

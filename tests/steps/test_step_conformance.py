@@ -183,21 +183,21 @@ class Bench:
             self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=sink
         ):
             runner.begin(plan, self.testbed, self.out, sink, Stop())
-        return self.ended(plan)
+        return self.last_attempt(plan)
 
     def resume(self, plan: Plan) -> tuple[str, str, Path]:
         with locks.locked_exclusively(
             self.testbed.shells, Holder(plan.session, runtime.user_at_host(), plan.trial), sink=lambda event: None
         ):
             resumption.continue_trial(self.out / plan.trial, self.testbed, lambda event: None, Stop())
-        return self.ended(plan)
+        return self.last_attempt(plan)
 
-    def ended(self, plan: Plan) -> tuple[str, str, Path]:
+    def last_attempt(self, plan: Plan) -> tuple[str, str, Path]:
         folder = self.out / plan.trial
         attempt = journal.ended(journal.read(folder))[-1]
         return attempt.status, attempt.reason, store.attempt_folder(folder, attempt.folder)
 
-    def left(self) -> list[str]:
+    def running_jobs(self) -> list[str]:
         """Return the jobs that still run on the robots."""
         return [
             line for shell in self.testbed.shells.values() for line in jobs.list_running(shell, Deadline.after(30))
@@ -372,7 +372,7 @@ def kill_tool(kind: str, role: Role, name: str, bench: Bench, monkeypatch: pytes
     session.end(deadline=Deadline.after(30))
     assert status == "failed", name
     assert reason
-    assert not bench.left()
+    assert not bench.running_jobs()
 
 
 @pytest.mark.parametrize("kind", mark_nightly(KINDS, in_ci=("capture", "together")))
@@ -387,7 +387,7 @@ def test_interrupted_trial_is_resumed(kind: str, bench: Bench) -> None:
     with pytest.raises(KeyboardInterrupt):
         bench.run(plan, interrupt)
     assert started.is_set()
-    assert not bench.left()
+    assert not bench.running_jobs()
     assert bench.resume(plan)[:2] == ("valid", "")
 
 
@@ -402,4 +402,4 @@ def test_hanging_tool_is_stopped_at_its_limit(kind: str, bench: Bench, monkeypat
     status, reason, _ = bench.run(plan)
     if hanging not in EXAMPLES[kind].outlives:
         assert (status, bool(reason)) == ("failed", True)
-    assert not bench.left()
+    assert not bench.running_jobs()

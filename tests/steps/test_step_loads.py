@@ -40,7 +40,7 @@ def lines(step: Step, protocol: Protocol) -> list[tuple[Role, str]]:
 
 
 SERVER = "iperf3 -s -1 -p 5201 -i 1 --json > receiver-iperf3.json 2> receiver-iperf3.log"
-KEPT = "-i 1 --json > sender-iperf3.json 2> sender-iperf3.log"
+IPERF3_OUTPUT = "-i 1 --json > sender-iperf3.json 2> sender-iperf3.log"
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ KEPT = "-i 1 --json > sender-iperf3.json 2> sender-iperf3.log"
 )
 def test_command_lines_of_both_ends(keys: str, protocol: Protocol, options: str) -> None:
     step = step_of(f"iperf3: {{from: sender, to: receiver{keys}}}")
-    client = f"iperf3 -c 10.42.0.2 -p 5201 {options} {KEPT}"
+    client = f"iperf3 -c 10.42.0.2 -p 5201 {options} {IPERF3_OUTPUT}"
     assert lines(step, protocol) == [(Role.RECEIVER, SERVER), (Role.SENDER, client)]
     server, _ = step.jobs(Scene(protocol, CAST, "f"))
     assert server.job.ready == "tcp:1451", "its control connection uses TCP"
@@ -76,7 +76,7 @@ def test_soak_runs_around_the_steps_inside() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "why"),
+    ("text", "reason"),
     [
         ("iperf3: {from: sender, to: sender}", "sender cannot send to itself"),
         ("iperf3: {from: sender, to: receiver, size: 1MB, duration: 3s}", "leave one out"),
@@ -92,8 +92,8 @@ def test_soak_runs_around_the_steps_inside() -> None:
         ),
     ],
 )
-def test_invalid_keys_are_refused_with_line(text: str, why: str) -> None:
-    with pytest.raises(ConfigurationError, match=why) as caught:
+def test_invalid_keys_are_refused_with_line(text: str, reason: str) -> None:
+    with pytest.raises(ConfigurationError, match=reason) as caught:
         procedure(text)
     assert caught.value.where == "x.yaml:8"
 

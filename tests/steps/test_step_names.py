@@ -159,7 +159,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "what"),
+    ("old", "new", "message"),
     [
         (
             "ping: {name: up, ",
@@ -180,11 +180,11 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
         ("robots: [sender]", "robots: [sender, sender]", "a robot is named twice"),
     ],
 )
-def test_ambiguous_steps_are_refused(old: str, new: str, what: str) -> None:
+def test_ambiguous_steps_are_refused(old: str, new: str, message: str) -> None:
     assert old in STEPS
     with pytest.raises(ConfigurationError) as caught:
         load(STEPS.replace(old, new))
-    assert what in caught.value.what
+    assert message in caught.value.what
 
 
 @pytest.mark.parametrize("file", ["imu", "imu.bag"])
@@ -203,7 +203,7 @@ def test_refusal_of_unknown_file_lists_recorded_files() -> None:
 def test_summary_starts_with_gap_of_ping() -> None:
     ping = "{ping: {from: sender, to: receiver, gap: true}}"
     plan = plan_of(f"  - fault: {{name: cut, robot: sender, kind: link-down, for: 7s, during: [{ping}]}}\n")
-    outage_s, recovered = (fault_column_name(FaultKind.LINK_DOWN, what) for what in ("outage_s", "recovered"))
+    outage_s, recovered = (fault_column_name(FaultKind.LINK_DOWN, suffix) for suffix in ("outage_s", "recovered"))
     fault_values = {f"cut.{outage_s}": 7.2, f"cut.{recovered}": True}
     text = rows.describe(plan, {**fault_values, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
     assert text == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: gone for 7.2 s"

@@ -76,7 +76,7 @@ def replace_captures(monkeypatch: pytest.MonkeyPatch, code: int) -> list[str]:
     def start(shell: Shell, job: Job) -> None:
         calls.append(f"start {job.log}")
 
-    def stop(shell: Shell, job: Job, **how: object) -> int:
+    def stop(shell: Shell, job: Job, **options: object) -> int:
         calls.append(f"stop {job.log}")
         return code
 

@@ -114,12 +114,12 @@ def test_tools_of_the_paper_are_not_refused() -> None:
 
 
 def test_busybox_netcat_is_refused_for_udp() -> None:
-    refused = los_plan().refusals(on_both(netcat=Netcat.BUSYBOX))
-    assert [(refusal.role, refusal.what) for refusal in refused] == [
+    refusals = los_plan().refusals(on_both(netcat=Netcat.BUSYBOX))
+    assert [(refusal.role, refusal.what) for refusal in refusals] == [
         (Role.SENDER, "busybox nc has no UDP"),
         (Role.RECEIVER, "busybox nc has no UDP"),
     ]
-    assert all("apt-get install netcat-traditional" in refusal.remedy for refusal in refused)
+    assert all("apt-get install netcat-traditional" in refusal.remedy for refusal in refusals)
     assert los_plan(protocols=(Protocol.TCP,)).refusals(on_both(netcat=Netcat.BUSYBOX)) == ()
 
 
@@ -135,7 +135,7 @@ def test_dry_run_shows_refusals(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sender", "receiver", "refused"),
+    ("sender", "receiver", "roles"),
     [
         (Netcat.OPENBSD, Netcat.TRADITIONAL, [Role.RECEIVER]),
         (Netcat.OPENBSD, Netcat.OPENBSD, []),
@@ -147,9 +147,9 @@ def test_dry_run_shows_refusals(capsys: pytest.CaptureFixture[str]) -> None:
         (Netcat.BUSYBOX, Netcat.TRADITIONAL, [Role.SENDER]),
     ],
 )
-def test_pair_without_udp_is_refused_once(sender: Netcat, receiver: Netcat, refused: list[Role]) -> None:
+def test_pair_without_udp_is_refused_once(sender: Netcat, receiver: Netcat, roles: list[Role]) -> None:
     detected = {Role.SENDER: replace(DEFAULT, netcat=sender), Role.RECEIVER: replace(DEFAULT, netcat=receiver)}
-    assert [refusal.role for refusal in los_plan().refusals(detected)] == refused
+    assert [refusal.role for refusal in los_plan().refusals(detected)] == roles
 
 
 @pytest.mark.parametrize(
@@ -194,16 +194,16 @@ def test_short_interval_of_old_iputils_needs_root(
     plan = los_plan()
     (ping,) = steps_of(plan.procedure, PingStep)
     scene = plan.scene(RepeatId(Protocol.TCP, 1), "f", on_both(**changes))
-    refused = list(ping.model_copy(update={"interval": interval_s}).refusals(scene))
-    assert [refusal.role for refusal in refused] == [Role.SENDER] * is_refused
-    assert all("an interval of 100 ms" in refusal.what for refusal in refused)
+    refusals = list(ping.model_copy(update={"interval": interval_s}).refusals(scene))
+    assert [refusal.role for refusal in refusals] == [Role.SENDER] * is_refused
+    assert all("an interval of 100 ms" in refusal.what for refusal in refusals)
 
 
 MCAP = "--storage mcap > {name}/{name}_0.mcap"
 
 
 @pytest.mark.parametrize(
-    ("text", "detected", "what"),
+    ("text", "detected", "message"),
     [
         (MCAP, Recorder.MCAP, None),
         (MCAP, Recorder.NONE, "its record command cannot write ros2-mcap"),
@@ -214,10 +214,10 @@ MCAP = "--storage mcap > {name}/{name}_0.mcap"
         ),
     ],
 )
-def test_recorder_with_wrong_format_is_refused(text: str, detected: Recorder, what: str | None) -> None:
-    refused = ros2_plan(text).refusals(on_both(recorder=detected))
-    assert [refusal.what for refusal in refused] == ([] if what is None else [what])
-    assert all(isinstance(item, Refusal) and item.role is Role.SENDER and item.remedy for item in refused)
+def test_recorder_with_wrong_format_is_refused(text: str, detected: Recorder, message: str | None) -> None:
+    refusals = ros2_plan(text).refusals(on_both(recorder=detected))
+    assert [refusal.what for refusal in refusals] == ([] if message is None else [message])
+    assert all(isinstance(item, Refusal) and item.role is Role.SENDER and item.remedy for item in refusals)
 
 
 @pytest.mark.parametrize(

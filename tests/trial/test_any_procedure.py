@@ -37,7 +37,7 @@ PORTS = st.sampled_from([1234, 1234, 2222])
 NAMES = st.sampled_from(["up", "down", "recv", "n{n}", "n{n}"])
 
 
-def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+def _optional_keys(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
     """Return a strategy for mappings from which each key may be missing."""
     return st.fixed_dictionaries({}, optional=keys)
 
@@ -45,12 +45,12 @@ def _given(**keys: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
 RECORD = st.builds(
     lambda robot, name: {"record": {"robot": robot, "topics": ["/scan"], "duration": "2s", **name}},
     st.sampled_from(["sender"] * 3 + ["receiver", "relay"]),
-    _given(name=st.sampled_from(["scan", "lidar", "recv"])),
+    _optional_keys(name=st.sampled_from(["scan", "lidar", "recv"])),
 )
 TRANSFER = st.builds(
     lambda ends, more: {"transfer": {"from": ends[0], "to": ends[1], **more}},
     ENDS,
-    _given(
+    _optional_keys(
         name=NAMES,
         file=st.sampled_from(["scan", "scan.bag", "lidar.bag", "none.bin"]),
         into=st.sampled_from(["recv.bag", "other.bag", "scan.bag", "ping.txt", "sender.pcap", "track.csv"]),
@@ -60,14 +60,14 @@ TRANSFER = st.builds(
 PING = st.builds(
     lambda ends, more: {"ping": {"from": ends[0], "to": ends[1], "count": 4, **more}},
     ENDS,
-    _given(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
+    _optional_keys(name=NAMES, payload_bytes=st.sampled_from([{"tcp": 502, "udp": 8192}, {"tcp": 8, "udp": 100}])),
 )
 
 
 IPERF3 = st.builds(
     lambda ends, more: {"iperf3": {"from": ends[0], "to": ends[1], "duration": "1s", **more}},
     ENDS,
-    _given(
+    _optional_keys(
         name=NAMES,
         protocol=st.sampled_from(["tcp", "udp"]),
         reverse=st.booleans(),
@@ -82,15 +82,18 @@ ROBOTS = st.sampled_from(
 
 
 def _capture(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
-    keys = _given(name=NAMES, robots=ROBOTS, port=PORTS)
+    keys = _optional_keys(name=NAMES, robots=ROBOTS, port=PORTS)
     return st.builds(lambda more, steps: {"capture": {**more, "during": steps}}, keys, during)
 
 
 def _move(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
-    way = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
-    keys = _given(name=NAMES)
+    path_keys = {"path": [{"away": "5m"}], "speed": "0.1m/s"}
+    keys = _optional_keys(name=NAMES)
     return st.builds(
-        lambda robot, more, steps: {"move": {"robot": robot, **way, **more, "during": steps}}, ROLES, keys, during
+        lambda robot, more, steps: {"move": {"robot": robot, **path_keys, **more, "during": steps}},
+        ROLES,
+        keys,
+        during,
     )
 
 
@@ -100,7 +103,7 @@ def _fault(during: st.SearchStrategy[list[Any]]) -> st.SearchStrategy[Any]:
         lambda robot, kind, more, steps: {"fault": {"robot": robot, **kind, **more, "during": steps}},
         ROLES,
         st.sampled_from(kinds),
-        _given(name=NAMES),
+        _optional_keys(name=NAMES),
         during,
     )
 
@@ -137,9 +140,9 @@ def usual(seed: int) -> list[Any]:
     transfer |= draw.choice([{}, {}, {}, {"port": 2222}, {"file": f"{name}.bag"}, {"file": "none.bin"}])
     inside: list[Any] = [{"transfer": transfer}]
     if draw.random() < 0.7:
-        asked = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
+        options = draw.choice([{}, {"payload_bytes": {"tcp": 8, "udp": 100}}])
         ends = draw.choice([(source, target)] * 3 + [(target, source)])
-        inside.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **asked}})
+        inside.append({"ping": {"from": ends[0], "to": ends[1], "count": 4, **options}})
     inside = _more(draw, inside, source, target)
     if draw.random() < 0.3:
         move = {"robot": draw.choice([source, "relay"]), "path": [{"away": "5m"}], "speed": "0.1m/s"}
@@ -249,16 +252,16 @@ def _compare(
     assert len(set(declared)) == len(declared)
     assert set(declared) <= values.keys() | missing.keys()
     assert all(missing.get(name, "for a reason") for name in declared)
-    for name, (asked, answered) in truth.pings.items():
+    for name, (requests, answered) in truth.pings.items():
         assert (values[step_prefixed(name, "rtt_sent")], values[step_prefixed(name, "rtt_received")]) == (
-            asked,
+            requests,
             answered,
         )
-    for name, (sent, came) in truth.loads.items():
-        for end, packets in (("sent", sent), ("received", came)):
+    for name, (sent, received) in truth.loads.items():
+        for end, packets in (("sent", sent), ("received", received)):
             assert values[step_prefixed(name, f"iperf3_{end}_bytes")] == 1400 * packets
         loss, cookie_bytes = step_prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
-        sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, came))
+        sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, received))
         assert loss in missing or values[loss] == 1 - came_bytes / sent_bytes
         SEEN["valid, iperf3 captured"] += loss in values
     SEEN["valid, two pings or more"] += len(truth.pings) > 1
@@ -306,7 +309,9 @@ def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None
     if not SEEN:
         pytest.fail("this runs behind the test above, in one process")
     record_property("result", f"random procedures: {dict(sorted(SEEN.items()))}")
-    assert min(SEEN[what] for what in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 20
-    assert min(SEEN[what] for what in ("valid, two pings or more", "valid, two transfers or more")) >= 8
-    assert min(SEEN[what] for what in ("valid, at the same time", "valid, iperf3 captured")) >= 10
+    assert (
+        min(SEEN[outcome] for outcome in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 20
+    )
+    assert min(SEEN[outcome] for outcome in ("valid, two pings or more", "valid, two transfers or more")) >= 8
+    assert min(SEEN[outcome] for outcome in ("valid, at the same time", "valid, iperf3 captured")) >= 10
     assert SEEN["valid, UDP of several to one"] >= 5

@@ -171,7 +171,7 @@ def test_bytes_that_are_consistent_in_their_file_are_compared_with_captures(
         (tmp_path / name).unlink()
         (tmp_path / name).write_bytes(content)
     actual = gates.judge(stored_one.plan, stored_one.repeat, AttemptEvidence(tmp_path)).problems
-    assert any("capture" in one for one in actual), actual
+    assert any("capture" in reason for reason in actual), actual
 
 
 def lines(keep: Callable[[str], bool]) -> Change:
@@ -227,7 +227,7 @@ def test_changed_ping_times_with_a_consistent_summary(tmp_path: Path) -> None:
         return re.sub(r"= ([0-9./]+) ms", "= " + _summary(text) + " ms", text).encode()
 
     def _summary(text: str) -> str:
-        times = [float(one) for one in re.findall(r"time=([0-9.]+)", text)]
+        times = [float(number) for number in re.findall(r"time=([0-9.]+)", text)]
         return f"{min(times):.3f}/{sum(times) / len(times):.3f}/{max(times):.3f}/0.1"
 
     require_problem(Protocol.TCP, "ping.txt", longer, tmp_path, "ms longer than in the sender's capture")

@@ -33,15 +33,15 @@ def test_the_first_estimate_assumes_a_good_link_and_has_the_time_with_a_dead_lin
 
 
 def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
-    here, elsewhere = at("30ft"), at("10ft")
+    condition, elsewhere = at("30ft"), at("10ft")
     finished = [
-        FinishedRepeat(here, TCP, 130.0),
-        FinishedRepeat(here, TCP, 150.0),
+        FinishedRepeat(condition, TCP, 130.0),
+        FinishedRepeat(condition, TCP, 150.0),
         FinishedRepeat(elsewhere, TCP, 9.0),
-        FinishedRepeat(here, UDP, 8.0),
+        FinishedRepeat(condition, UDP, 8.0),
     ]
-    assert of_repeats(here, TCP, 3, finished) == TimeEstimate(3 * 140.0, 3 * 150.0)
-    assert of_repeats(here, UDP, 3, finished) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
+    assert of_repeats(condition, TCP, 3, finished) == TimeEstimate(3 * 140.0, 3 * 150.0)
+    assert of_repeats(condition, UDP, 3, finished) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
 
 
 def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
@@ -119,6 +119,12 @@ def test_an_upper_end_is_never_below_what_is_expected(
     finished: list[tuple[str, Protocol, float]], distance: str, count: int
 ) -> None:
     estimate = of_repeats(
-        at(distance), TCP, count, [FinishedRepeat(at(where), what, took_s) for where, what, took_s in finished]
+        at(distance),
+        TCP,
+        count,
+        [
+            FinishedRepeat(at(trial_distance), trial_protocol, took_s)
+            for trial_distance, trial_protocol, took_s in finished
+        ],
     )
     assert 0 <= estimate.likely_s <= estimate.most_s * (1 + 1e-9)

@@ -25,19 +25,19 @@ def placed() -> list[PlacedStep]:
 
 
 def test_every_column_of_a_step_has_a_row() -> None:
-    bare = {
+    sources = {
         (step.kind, column.name)
         for step in placed()
         for column in step.step.output_columns()
         if not evidence_sources.covers(step.kind, column.name)
     }
-    bare |= {
+    sources |= {
         (kind, column.name)
         for kind, step in base.step_types().items()
         for column in step.columns
         if not evidence_sources.covers(kind, column.name)
     }
-    assert bare == set()
+    assert sources == set()
 
 
 def test_a_check_without_a_second_source_is_unchecked() -> None:

@@ -52,13 +52,13 @@ def pipe(path: Path) -> None:
 
 
 def unix_socket(path: Path) -> None:
-    here = Path.cwd()
+    working_directory = Path.cwd()
     os.chdir(path.parent)  # a socket path is limited to 108 characters
     try:
-        with socket.socket(socket.AF_UNIX) as one:
-            one.bind(path.name)
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(path.name)
     finally:
-        os.chdir(here)
+        os.chdir(working_directory)
 
 
 PLACES = [
@@ -181,7 +181,7 @@ RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Stat
 
 
 @pytest.mark.parametrize(
-    ("entries", "why"),
+    ("entries", "reason"),
     [
         ([(1, 2, RUNNING)], "attempt 2 at udp-01 starts, although it or its repeat has ended"),
         ([(1, 3, RUNNING)], "attempt 3 at udp-01 starts, although it or its repeat has ended"),
@@ -193,11 +193,11 @@ RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Stat
     ],
 )
 def test_a_contradictory_journal_is_reported_with_its_line(
-    trial: Path, entries: list[tuple[int, int, Status]], why: str
+    trial: Path, entries: list[tuple[int, int, Status]], reason: str
 ) -> None:
     lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
     for read in (rebuild, lambda folder: Ledger(store.read_plan(folder), folder, Stop())):
-        with pytest.raises(EvidenceError, match=f"impossible entry: {why}") as caught:
+        with pytest.raises(EvidenceError, match=f"impossible entry: {reason}") as caught:
             read(trial)
         assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"
 
@@ -234,9 +234,9 @@ def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Pat
     with journal.locked(folder):
         ledger = Ledger(plan, folder, Stop())
         repeat = RepeatId(Protocol.UDP, 1)
-        begun = ledger.begin(repeat)
-        why = "cannot read \udcff\ud800.bag"
-        ledger.commit(store.open_attempt(folder, repeat), replace(begun, status=VOID, reason=why), Measured())
+        entry = ledger.begin(repeat)
+        reason = "cannot read \udcff\ud800.bag"
+        ledger.commit(store.open_attempt(folder, repeat), replace(entry, status=VOID, reason=reason), Measured())
         ledger.summarize()
         (attempt,) = journal.ended(journal.history(folder, plan))
         assert attempt.reason == "cannot read ??.bag"

@@ -49,11 +49,11 @@ def add_trial(folder: Path, number: int) -> Path:
     return trial
 
 
-def outcome(*paths: Path, use_index: bool, where: str = "") -> tuple[object, ...]:
+def outcome(*paths: Path, use_index: bool, selection: str = "") -> tuple[object, ...]:
     """Return the rows, columns, expectations and notes of trials, or the error."""
     notes: list[str] = []
     try:
-        data = sources.find(paths, notes.append, workers=Workers(jobs=1), use_index=use_index).with_filter(where)
+        data = sources.find(paths, notes.append, workers=Workers(jobs=1), use_index=use_index).with_filter(selection)
         rows = data.read(undeclared=True)
         some = data.read({"status", "rtt_median_s"})
         expected = {source: [str(item) for item in items] for source, items in data.expectations().items()}
@@ -91,10 +91,10 @@ def test_rows_come_from_the_index_and_equal_those_of_the_tables(
     monkeypatch.setattr("fieldkit.analysis.table_files.names", unread)
     monkeypatch.setattr("fieldkit.trial.frozen.read", unread)
     assert outcome(tmp_path / "trials", use_index=True) == expected
-    where = 'topology == "master" and distance_m < 20'
-    some = outcome(tmp_path / "trials", use_index=True, where=where)
+    selection = 'topology == "master" and distance_m < 20'
+    some = outcome(tmp_path / "trials", use_index=True, selection=selection)
     monkeypatch.undo()
-    assert some == outcome(tmp_path / "trials", use_index=False, where=where)
+    assert some == outcome(tmp_path / "trials", use_index=False, selection=selection)
     assert some != expected
 
 

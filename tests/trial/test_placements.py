@@ -49,10 +49,10 @@ PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER]
 )
 def test_positions_in_metres_have_a_tolerance_of_two_metres(apart_m: float, agrees: bool, tmp_path: Path) -> None:
     """31 ft instead of 30 ft is a distance of 18.897 m between the stations."""
-    why = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
-    assert (why is None) is agrees
-    if why:
-        assert why.startswith("the sender and the receiver were placed 18.3 m apart, but by their recorded")
+    reason = placements.contradiction(SCENE, in_metres(tmp_path, apart_m))
+    assert (reason is None) is agrees
+    if reason:
+        assert reason.startswith("the sender and the receiver were placed 18.3 m apart, but by their recorded")
 
 
 @given(off_m=st.floats(-18, 300))
@@ -74,10 +74,10 @@ def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("off_m", "why"), [(0.0, None), (200.0, "has the receiver 200.0 m from where it was placed")]
+    ("off_m", "expected_reason"), [(0.0, None), (200.0, "has the receiver 200.0 m from where it was placed")]
 )
 def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
-    off_m: float, why: str | None, tmp_path: Path
+    off_m: float, expected_reason: str | None, tmp_path: Path
 ) -> None:
     places_m = SCENE.places_m
     x, y, z = places_m[Role.RECEIVER]
@@ -85,7 +85,9 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
         tmp_path, PositionSource(place=(x + off_m, y, z)), PositionSource(place=places_m[Role.SENDER])
     )
     problems = list(follow.problems(View(SCENE, evidence), ()))
-    assert (problems == []) if why is None else [why in reason for reason in problems] == [True]
+    assert (
+        (problems == []) if expected_reason is None else [expected_reason in reason for reason in problems] == [True]
+    )
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_removing_any_sync_is_detected(place: Path) -> None:
         file = place / "disk.img"
         cuts, witness, places = cuts_at_every_sync(Disk.make(STRICTEST, file), place, without=without)
         file.unlink()
-        return any(_lost(place, cut, witness) for cut in cuts), set(places)
+        return any(_describe_losses(place, cut, witness) for cut in cuts), set(places)
 
     _, places = lost("")
     assert len(places) > 5
@@ -109,7 +109,7 @@ def test_consecutive_cuts_at_random_moments_lose_nothing(place: Path, file_syste
     assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
 
 
-def _lost(place: Path, cut: Cut, witness: Witness) -> list[str]:
+def _describe_losses(place: Path, cut: Cut, witness: Witness) -> list[str]:
     with cut.disk.repair().mounted(place / "elsewhere") as mounted:
         return cut.lost(mounted / OUT, witness)
 

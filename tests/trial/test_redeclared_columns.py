@@ -52,7 +52,7 @@ def fetching(text: str) -> Callable[..., list[str]]:
 @pytest.fixture(scope="module")
 def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """A trial for each unit, with a value in it."""
-    made = {}
+    folders = {}
     with pytest.MonkeyPatch.context() as patch:
         robots_with_evidence(patch)
         for unit, value in VALUES.items():
@@ -63,8 +63,8 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             outcome = run_trial(planned, IdleTestbed(), tmp_path_factory.mktemp(unit), lambda _: None)
             assert outcome is not None
             assert outcome.valid == 3
-            made[unit] = outcome.folder
-    return made
+            folders[unit] = outcome.folder
+    return folders
 
 
 @pytest.mark.parametrize("now", UNITS)

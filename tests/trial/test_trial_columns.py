@@ -47,9 +47,9 @@ def declared_columns(draw: st.DrawFn) -> Column:
 @st.composite
 def tables_of_columns(draw: st.DrawFn) -> tuple[list[Column], dict[str, Value]]:
     """Columns of one trial, and a value for each."""
-    drawn = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
-    kept = [column for column in drawn if column.name not in EVERYWHERE]
-    return kept, {column.name: draw(values(column)) for column in kept}
+    drawn_columns = draw(st.lists(declared_columns(), min_size=1, max_size=5, unique_by=lambda column: column.name))
+    columns = [column for column in drawn_columns if column.name not in EVERYWHERE]
+    return columns, {column.name: draw(values(column)) for column in columns}
 
 
 def values(column: Column) -> st.SearchStrategy[Value]:
@@ -67,9 +67,9 @@ def values(column: Column) -> st.SearchStrategy[Value]:
 @settings(max_examples=15)
 @given(tables_of_columns())
 def test_any_valid_column_is_read_back_from_plan_and_table(
-    tmp_path_factory: pytest.TempPathFactory, found: tuple[list[Column], dict[str, Value]]
+    tmp_path_factory: pytest.TempPathFactory, drawn_table: tuple[list[Column], dict[str, Value]]
 ) -> None:
-    columns, row = found
+    columns, row = drawn_table
     assert [column.declaration_error() for column in columns] == [None] * len(columns)
     plan = los_plan().model_copy(update={"columns": freeze(columns) or None})
     folder = tmp_path_factory.mktemp("trial")
@@ -78,8 +78,8 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     assert store.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
     read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
     # A cell has nine digits of a number; a bound may have more.
-    kept = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
-    assert [read.column(name)[0] for name in row] == kept
+    values = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
+    assert [read.column(name)[0] for name in row] == values
 
 
 def test_common_columns_are_first_independently_of_their_rank() -> None:
@@ -171,19 +171,21 @@ def names(columns: Sequence[Column]) -> list[str]:
 
 @pytest.mark.usefixtures("meters")
 def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
-    made = procedure("meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}")
-    own = of_steps(placed.step for placed in made.walk())
-    assert names(own) == ["b.meter_level", "b.x", "meter_level"]
-    filled = names(filled_by(placed.step for placed in made.walk()))
-    assert filled[-3:] == names(own)
+    parsed_procedure = procedure(
+        "meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}"
+    )
+    columns = of_steps(placed.step for placed in parsed_procedure.walk())
+    assert names(columns) == ["b.meter_level", "b.x", "meter_level"]
+    filled = names(filled_by(placed.step for placed in parsed_procedure.walk()))
+    assert filled[-3:] == names(columns)
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
-    plan = los_plan().model_copy(update={"procedure": made})
-    assert plan.table == (*trial_columns(), *own), "a plan of an earlier version, without columns"
+    plan = los_plan().model_copy(update={"procedure": parsed_procedure})
+    assert plan.table == (*trial_columns(), *columns), "a plan of an earlier version, without columns"
 
 
 @pytest.mark.parametrize(
-    ("steps", "what"),
+    ("steps", "message"),
     [
         (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is one of fieldkit's"),
         (("meter: {measures: [status]}",), "'status' is one of fieldkit's"),
@@ -193,10 +195,10 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     ],
 )
 @pytest.mark.usefixtures("meters")
-def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence[str], what: str) -> None:
-    with pytest.raises(ConfigurationError, match=what) as refused:
+def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence[str], message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message) as caught:
         procedure(*steps)
-    assert refused.value.where == f"x.yaml:{7 + len(steps)}"
+    assert caught.value.where == f"x.yaml:{7 + len(steps)}"
 
 
 @pytest.mark.usefixtures("meters")
@@ -234,10 +236,10 @@ def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
 
 
 def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path: Path) -> None:
-    alone = write_trial(
+    table = write_trial(
         tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
     )
-    actual = {column.name: column for column in tables.declared_in([alone])}
+    actual = {column.name: column for column in tables.declared_in([table])}
     for column in vendor_trials.NAMED_STEP_COLUMNS:
         assert actual[column.name] == column
     for column in vendor_trials.VENDOR_COLUMNS:
@@ -264,9 +266,9 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
 )
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
     paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
-    with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as refused:
+    with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as caught:
         tables.declared_in(paths)
-    assert refused.value.where == str(paths[1].with_name("trial.yaml"))
+    assert caught.value.where == str(paths[1].with_name("trial.yaml"))
 
 
 def test_plans_may_differ_in_meaning_and_bounds_of_a_column(tmp_path: Path) -> None:
@@ -301,11 +303,11 @@ def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
     for read in (lambda: tables.declared_in([table]), lambda: store.read_plan(path.parent)):
-        with pytest.raises(ConfigurationError) as refused:
+        with pytest.raises(ConfigurationError) as caught:
             read()
-        assert refused.value.where is not None
-        assert refused.value.where.startswith(f"{path}:")
-        assert len(str(refused.value)) < 1000
+        assert caught.value.where is not None
+        assert caught.value.where.startswith(f"{path}:")
+        assert len(str(caught.value)) < 1000
 
 
 def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:

@@ -66,9 +66,9 @@ class Attempt:
     def packets(self, name: str) -> list[Packet]:
         data, at, packets = (self.folder / name).read_bytes(), 24, list[Packet]()
         while at < len(data):
-            seconds, micros, kept = struct.unpack_from("<3I", data, at)
-            packets.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + kept]))
-            at += 16 + kept
+            seconds, micros, captured_bytes = struct.unpack_from("<3I", data, at)
+            packets.append((seconds * 10**6 + micros, data[at + 8 : at + 16 + captured_bytes]))
+            at += 16 + captured_bytes
         return packets
 
     def capture(self, role: str, change: Callable[[list[Packet]], Sequence[Packet]]) -> None:
@@ -151,13 +151,13 @@ def test_a_handshake_missing_in_one_capture(tcp: Attempt, role: str, reason: str
 def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: bool) -> None:
     """An immediate refusal: no listener; a refusal after lost calls: perhaps the listener was at its time limit."""
 
-    def refused(packets: list[Packet]) -> list[Packet]:
+    def with_reset(packets: list[Packet]) -> list[Packet]:
         (at, call), (answered, answer) = packets[:2]
         assert answer[41] == 0x12, "SYN and ACK"
         return [(at, call)] * calls + [(answered, answer[:41] + bytes([0x14]) + answer[42:])]
 
     for role in ("sender", "receiver"):
-        tcp.capture(role, refused)
+        tcp.capture(role, with_reset)
     tcp.file("recv.bag", lambda _: b"")
     message = "the receiver refused the connection: no program listened when the sender started"
     assert (message in " ".join(tcp.problems())) == is_told

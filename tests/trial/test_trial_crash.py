@@ -129,12 +129,12 @@ def at_write(moment: int, befalls: Callable[..., None]) -> None:
     count = 0
 
     def watched(call: Callable[..., object]) -> Callable[..., object]:
-        def counted(*words: object, **more: object) -> object:
+        def counted(*words: object, **options: object) -> object:
             nonlocal count
             count += 1
             if count == moment:
                 befalls(call, *words)
-            return None if call is FSYNC else call(*words, **more)  # a kill of a process does not affect the disk
+            return None if call is FSYNC else call(*words, **options)  # a kill of a process does not affect the disk
 
         return counted
 
@@ -187,17 +187,19 @@ def demand_agreement(folder: Path) -> None:
 def demand_whole(out: Path) -> None:
     """Check the properties of every finished trial."""
     folder = trial_of(out)
-    ended = journal.ended(journal.read(folder))
+    entries = journal.ended(journal.read(folder))
     valid = Counter(
-        (attempt.repeat.protocol, attempt.repeat.number) for attempt in ended if attempt.status == "valid"
+        (attempt.repeat.protocol, attempt.repeat.number) for attempt in entries if attempt.status == "valid"
     )
     assert valid == {(Protocol.TCP, number + 1): 1 for number in range(REPEATS)}
-    assert all(attempt.reason for attempt in ended if attempt.status != "valid")
-    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(attempt.folder for attempt in ended)
+    assert all(attempt.reason for attempt in entries if attempt.status != "valid")
+    assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(
+        attempt.folder for attempt in entries
+    )
     demand_agreement(folder)
     assert all(
         problems(plan(), attempt.repeat.protocol, folder / "repeats" / attempt.folder) == ()
-        for attempt in ended
+        for attempt in entries
         if attempt.status == "valid"
     )
 

@@ -18,7 +18,7 @@ from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
 EARLIER = "packets of an earlier attempt were still in transit"
 HEADS = 8
 """Offset of a record's lengths, after which its IP packet starts: the captures have link type RAW."""
-KEPT = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
+REPEATS = sorted(TRIALS.glob("*/repeats/*-0[0-9]"))
 
 Chosen = Callable[[bytes], bool]
 
@@ -44,13 +44,13 @@ def _is_load(packet: bytes) -> bool:
     return not _is_icmp(packet) and not _is_later(packet) and int.from_bytes(packet[2:4], "big") > 60
 
 
-def _left(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
+def _own_packets(packets: list[Packet], role: str, chosen: Chosen) -> list[Packet]:
     """Return the packets that the robot in `role` sent; the first of each capture is the sender's."""
     sender = packets[0][1][HEADS + 12 : HEADS + 16]
     return [
-        one
-        for one in packets
-        if (one[1][HEADS + 12 : HEADS + 16] == sender) == (role == "sender") and chosen(one[1][HEADS:])
+        packet
+        for packet in packets
+        if (packet[1][HEADS + 12 : HEADS + 16] == sender) == (role == "sender") and chosen(packet[1][HEADS:])
     ]
 
 
@@ -58,7 +58,7 @@ def _waiting(attempt: Attempt, role: str, chosen: Chosen) -> list[Packet]:
     """Return packets sent in the other repeat, as if they were delayed until the start of this one."""
     other = Attempt(LOSSLESS / "repeats" / f"{attempt.protocol}-02", attempt.protocol)
     began_us, _ = attempt.packets("receiver.pcap")[0]
-    actual = [(began_us, rest) for _, rest in _left(other.packets(f"{role}.pcap"), role, chosen)]
+    actual = [(began_us, rest) for _, rest in _own_packets(other.packets(f"{role}.pcap"), role, chosen)]
     assert actual
     return actual
 
@@ -68,11 +68,11 @@ def _changed(packet: Packet, at: int, by: bytes) -> Packet:
     return time_us, rest[: HEADS + at] + by + rest[HEADS + at + len(by) :]
 
 
-def _told(attempt: Attempt) -> list[str]:
+def _reasons(attempt: Attempt) -> list[str]:
     return [reason for reason in attempt.problems() if EARLIER in reason]
 
 
-@pytest.mark.parametrize("path", KEPT, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
+@pytest.mark.parametrize("path", REPEATS, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
 def test_stored_repeats_stay_valid(path: Path) -> None:
     assert problems(store.read_plan(path.parents[1]), Protocol(path.name.split("-")[0]), path) == ()
 
@@ -120,11 +120,11 @@ def test_only_earlier_packets_arrived(tmp_path: Path, chosen: Chosen) -> None:
     attempt = of(Protocol.UDP, tmp_path)
     waiting = _waiting(attempt, "sender", chosen)
     attempt.capture("receiver", lambda _: (waiting * 5)[:9])
-    attempt.capture("sender", lambda packets: _left(packets, "sender", lambda _: True))
+    attempt.capture("sender", lambda packets: _own_packets(packets, "sender", lambda _: True))
     (attempt.folder / "recv.bag").write_bytes(b"")
     sent = "10 packets transmitted, 0 received, 100% packet loss, time 1800ms\n"
     (attempt.folder / "ping.txt").write_text(f"PING 10.42.0.2 (10.42.0.2) 8192(8220) bytes of data.\n\n{sent}")
-    assert len(_told(attempt)) == 1, attempt.problems()
+    assert len(_reasons(attempt)) == 1, attempt.problems()
 
 
 @given(st.sampled_from(Protocol), st.integers(0, 2**32), st.sampled_from((0.0, 0.1, 0.6, 1.0)))
@@ -134,25 +134,29 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as place:
         attempt = of(protocol, Path(place))
-        aside = [_changed(one, 24, b"\x12\x34") for one in _waiting(attempt, "sender", _is_echo)]
+        aside = [
+            _changed(changed_packet, 24, b"\x12\x34") for changed_packet in _waiting(attempt, "sender", _is_echo)
+        ]
         strays = [
-            _changed(one, 20, b"\x04\x00")
-            for one in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
+            _changed(packet, 20, b"\x04\x00")
+            for packet in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
         ] if protocol is Protocol.TCP else []  # fmt: skip
         near, far = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
 
         def carried(packets: list[Packet], role: str) -> list[Packet]:
-            own = _left(packets, role, lambda _: True)
-            return [one for one in packets if one in own or chance.random() >= lost]
+            own_packets = _own_packets(packets, role, lambda _: True)
+            return [packet for packet in packets if packet in own_packets or chance.random() >= lost]
 
         cut = chance.randrange(3)
         near = [*carried(near, "sender"), *aside[1:]]
         far = [*strays[:2], *aside[:2], *carried(far, "receiver")]
-        replies = _left(far, "receiver", _is_icmp)
+        replies = _own_packets(far, "receiver", _is_icmp)
         late = replies[len(replies) - cut :]
         attempt.capture("sender", lambda _: near)
-        attempt.capture("receiver", lambda _: [one for one in far if one not in late])
-        assert _told(attempt) == []
+        attempt.capture(
+            "receiver", lambda _: [changed_packet for changed_packet in far if changed_packet not in late]
+        )
+        assert _reasons(attempt) == []
 
 
 def test_rewritten_ip_ids_are_not_an_earlier_attempt(tmp_path: Path) -> None:

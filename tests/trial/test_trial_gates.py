@@ -151,8 +151,8 @@ def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, mon
 
     monkeypatch.setattr(PingStep, "measure", measure)
     (output_text,) = problems(PLAN, Protocol.UDP, folder)
-    what = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
-    assert re.fullmatch(rf"{what} \(test_trial_gates.py, line [0-9]+\)", output_text)
+    reason = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
+    assert re.fullmatch(rf"{reason} \(test_trial_gates.py, line [0-9]+\)", output_text)
     judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
     assert judged.measured.missing["rtt_loss"] == output_text
     (traceback,) = judged.step_errors

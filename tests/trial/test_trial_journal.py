@@ -30,9 +30,9 @@ def test_a_torn_journal_gives_every_complete_entry(
     journal.append(folder, *written)
     path = folder / journal.JOURNAL_FILE
     content = path.read_bytes()
-    torn = content[: max(0, len(content) - cut)]
-    path.write_bytes(torn)
-    complete = torn.count(b"\n")
+    truncated = content[: max(0, len(content) - cut)]
+    path.write_bytes(truncated)
+    complete = truncated.count(b"\n")
     read = journal.read(folder)
     # A last line that lost only its line end is still complete.
     assert read in (written[:complete], written[: complete + 1])
@@ -78,8 +78,8 @@ def test_entries_after_a_repair_are_read_back(
     folder = tmp_path_factory.mktemp("trial")
     journal.append(folder, *written)
     path = folder / journal.JOURNAL_FILE
-    whole = path.read_bytes()
-    path.write_bytes(whole[: max(0, len(whole) - cut)])
+    content = path.read_bytes()
+    path.write_bytes(content[: max(0, len(content) - cut)])
     before = journal.read(folder)
     journal.remove_torn_line(folder)
     journal.append(folder, next_entry)

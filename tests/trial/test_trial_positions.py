@@ -121,17 +121,19 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
 
 
 @pytest.mark.motion
-@pytest.mark.parametrize("how", ["changed", "gone", "unsummed"])
-def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.CaptureFixture[str], how: str) -> None:
+@pytest.mark.parametrize("change", ["changed", "gone", "unsummed"])
+def test_changed_position_files_prevent_a_rebuild(
+    trial: Path, capsys: pytest.CaptureFixture[str], change: str
+) -> None:
     walk(trial)
     assert output_text(capsys, "receiver=walk.csv", "sender=0m,0m", "--gap", "1000min")[0] == 0
-    kept = trial / "positions-receiver.csv"
-    if how == "changed":
-        kept.write_bytes(kept.read_bytes() + b"\n")
-    elif how == "gone":
-        kept.unlink()
+    positions_file = trial / "positions-receiver.csv"
+    if change == "changed":
+        positions_file.write_bytes(positions_file.read_bytes() + b"\n")
+    elif change == "gone":
+        positions_file.unlink()
     else:
-        shutil.copy(kept, trial / "positions-sender.csv")
+        shutil.copy(positions_file, trial / "positions-sender.csv")
     assert main(["rebuild", "trial"]) == 4
     assert "positions-" in capsys.readouterr().err
     assert output_text(capsys, "--clear")[0] == 0
@@ -139,7 +141,7 @@ def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.Ca
 
 
 @pytest.mark.parametrize(
-    ("text", "found"),
+    ("text", "expected"),
     [
         ("sender=48.1,-11.5", PositionSource(place=(48.1, -11.5, None), frame=WGS84)),
         ("sender=-48.1,11.5,520", PositionSource(place=(-48.1, 11.5, 520.0), frame=WGS84)),
@@ -152,8 +154,8 @@ def test_changed_position_files_prevent_a_rebuild(trial: Path, capsys: pytest.Ca
         ("sender=a=b.gpx", Path("a=b.gpx")),
     ],
 )
-def test_a_place_is_distinguished_from_a_file(text: str, found: object) -> None:
-    assert positions.parse_source(text) == (Role.SENDER, found)
+def test_a_place_is_distinguished_from_a_file(text: str, expected: object) -> None:
+    assert positions.parse_source(text) == (Role.SENDER, expected)
 
 
 def test_an_invalid_pair_is_rejected() -> None:

@@ -52,12 +52,12 @@ def test_a_copy_counts_once_with_a_note(tmp_path: Path) -> None:
 
 def test_a_trial_without_a_table_is_named(tmp_path: Path) -> None:
     trial(tmp_path, "1")
-    begun = tmp_path / "2"
-    begun.mkdir()
-    (begun / "trial.yaml").touch()
+    unfinished = tmp_path / "2"
+    unfinished.mkdir()
+    (unfinished / "trial.yaml").touch()
     notes: list[str] = []
     assert len(load([tmp_path], notes)) == 2
-    assert [note for note in notes if f"to make it: fieldkit rebuild {begun}" in note]
+    assert [note for note in notes if f"to make it: fieldkit rebuild {unfinished}" in note]
 
 
 def test_a_table_without_its_trial_cannot_be_rebuilt(tmp_path: Path) -> None:
@@ -65,9 +65,9 @@ def test_a_table_without_its_trial_cannot_be_rebuilt(tmp_path: Path) -> None:
         sources.find([trial(tmp_path, "1")], print, rebuild=True).read()
 
 
-@pytest.mark.parametrize(("name", "what"), [("gone", "no such file"), (".", "no trial is there")])
-def test_a_path_without_a_trial_is_rejected(tmp_path: Path, name: str, what: str) -> None:
-    with pytest.raises(ConfigurationError, match=what):
+@pytest.mark.parametrize(("name", "message"), [("gone", "no such file"), (".", "no trial is there")])
+def test_a_path_without_a_trial_is_rejected(tmp_path: Path, name: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         load([tmp_path / name])
 
 

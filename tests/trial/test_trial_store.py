@@ -14,16 +14,16 @@ from tests.helpers.casts import los_plan, plain_plan
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    made = store.create(tmp_path, plain_plan())
-    partial = store.open_attempt(made, RepeatId(Protocol.UDP, 1))
+    trial_folder = store.create(tmp_path, plain_plan())
+    partial = store.open_attempt(trial_folder, RepeatId(Protocol.UDP, 1))
     (partial / "scan.bag").write_bytes(b"#ROSBAG V2.0\n" * 100)
     (partial / "ping.txt").write_text("PING", encoding="utf-8")
     (partial / "scan").mkdir()
     (partial / "scan" / "scan_0.db3").write_bytes(b"SQLite format 3\0" * 9)
-    sums = manifest.Manifest(made)
+    sums = manifest.Manifest(trial_folder)
     sums.add(store.commit_attempt(partial, "udp-01"))
     sums.write()
-    return made
+    return trial_folder
 
 
 def test_a_plan_is_written_and_read_back(folder: Path) -> None:
@@ -102,6 +102,6 @@ def test_partially_fetched_files_are_kept_only_for_the_next_fetch(folder: Path) 
         (partial / name).write_bytes(b"x")
     assert store.reopen_attempt(folder, repeat) == partial
     assert [path.name for path in partial.iterdir()] == [".sender.camera.bag.part"]
-    kept = store.commit_attempt(partial, "tcp-01.void1")
-    assert list(kept.iterdir()) == []
+    attempt = store.commit_attempt(partial, "tcp-01.void1")
+    assert list(attempt.iterdir()) == []
     assert list(store.reopen_attempt(folder, repeat).iterdir()) == []

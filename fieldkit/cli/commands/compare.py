@@ -24,7 +24,7 @@ example: fieldkit compare field/ trials/ --threshold ip_loss=2% --threshold rtt_
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit compare`."""
-    parser.description = "Compare two runs cell by cell: the difference B - A with its 95 % interval, and a verdict."
+    parser.description = "Compare two runs by condition: the difference B - A with its 95 % interval, and a verdict."
     parser.epilog = _EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("a", type=Path, metavar="A", help=shared.PATH_HELP)

@@ -36,8 +36,8 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Pin the key, unless it is pinned already."""
     from fieldkit.config.site_edits import pin_host_key
-    from fieldkit.remote.link import over_tcp
     from fieldkit.remote.login import offered_key
+    from fieldkit.remote.sockets import over_tcp
     from fieldkit.remote.ssh import CONNECT_S
 
     name, path = arguments.robot, arguments.site

@@ -36,7 +36,7 @@ def add(parser: Parser) -> None:
         "--repeat",
         default="",
         metavar="NAME",
-        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median one of the worst cell)",
+        help="repeat for the time line: udp-07, or TRIAL/udp-07 (default: the median one of the worst condition)",
     )
     parser.add_argument(
         "--quantity",
@@ -72,13 +72,17 @@ def run(arguments: argparse.Namespace) -> int:
     ).with_filter(arguments.where)
     selected_names = [data.quantity(name).name for name in arguments.quantity]
     repeats = data.read()
+    with_attempts = (
+        {str(table.parent) for table in data.tables} if arguments.where else set(repeats.texts["source"].tolist())
+    )
     report_contents = contents.build_contents(
         repeats,
         title=arguments.title,
         repeat=arguments.repeat,
         command=_command(arguments),
+        paths=list(map(str, arguments.paths)),
         quantities=selected_names,
-        unmeasured=list(unmeasured(arguments.paths, set(repeats.texts["source"].tolist()), show_note)),
+        unmeasured=list(unmeasured(arguments.paths, with_attempts, show_note)),
         sweep_condition=data.sweep_condition,
     )
     with _explain_os_errors(out, "-o"):

@@ -71,8 +71,13 @@ def run(arguments: argparse.Namespace) -> int:
             )
             for request in requests
         ]
-        for line in (*requests[0].procedure.adjustments(cast), *plans[0].shortfalls()):
+        for line in requests[0].procedure.adjustments(cast):
             sink(Note(line))
+        if plans[0].procedure.expectations:
+            from fieldkit.trial.check import shortfalls
+
+            for line in shortfalls.of_plan(plans[0]):
+                sink(Note(line))
         if arguments.dry_run:
             from fieldkit.cli import dry_run
 

@@ -1,122 +1,20 @@
 """Capture files, pcap and pcapng: their IP packets as columns, for the whole file or in chunks.
 
-Classic pcap files are scanned for the record boundaries, then all headers are read together.
+Each format has a module with a function `chunks`, which is imported when a file of the format is read.
 """
 
-import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from importlib import import_module
 from mmap import MADV_DONTNEED, mmap
 from pathlib import Path
-from typing import Final
-
-import numpy as np
+from types import MappingProxyType
+from typing import Final, Protocol
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.captures import pcapng
-from fieldkit.measure.captures.arrays import Buffer, Chunk, Frames, Integers, Ints, Mask, Order, layout
-from fieldkit.measure.captures.headers import check_link_type
+from fieldkit.measure.captures.arrays import Buffer, Chunk, Integers
 from fieldkit.measure.captures.packets import Packets, decode
 from fieldkit.measure.evidence import reading
-
-CLASSIC_MAGIC: Final[dict[bytes, tuple[Order, int]]] = {
-    b"\xd4\xc3\xb2\xa1": ("<", 1_000_000),
-    b"\xa1\xb2\xc3\xd4": (">", 1_000_000),
-    b"\x4d\x3c\xb2\xa1": ("<", 1_000_000_000),
-    b"\xa1\xb2\x3c\x4d": (">", 1_000_000_000),
-}
-"""Byte order and clock ticks per second, by the first four bytes of the file."""
-
-_FILE_HEADER_BYTES: Final = 24
-_RECORD_HEADER_BYTES: Final = 16
-# After this many records of equal length, the next record probably has this length too.
-_MIN_RUN: Final = 16
-# libpcap's MAXIMUM_SNAPLEN: no record of a valid file is longer.
-_MAX_CAPTURED_BYTES: Final = 262_144
-
-
-def classic_chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
-    """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk.
-
-    Raises:
-        EvidenceError: The file ends inside its header, or has an unknown link type.
-    """
-    size = len(data)
-    if size < _FILE_HEADER_BYTES:
-        raise EvidenceError("ends inside its header", where=where, remedy="repeat the measurement")
-    order, ticks_per_s = CLASSIC_MAGIC[bytes(data[:4])]
-    # The upper bits of this field are the length of the frame check sequence.
-    link_type = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
-    check_link_type(link_type, where=where)
-    integers = Integers(data, order)
-    form = layout(order, _RECORD_HEADER_BYTES, seconds=(0, 4), ticks=(4, 4), captured=(8, 4), wire=(12, 4))
-    at, count, damage = _FILE_HEADER_BYTES, 0, None
-    while True:
-        starts, at = _scan(data, order, at, min(at + chunk_bytes, size - _RECORD_HEADER_BYTES + 1))
-        frames, valid = _frames(integers, form, starts, link_type, ticks_per_s)
-        if not valid.all():
-            frames = frames.where(slice(0, int(valid.argmin())))
-            damage = f"no packet header at byte {starts[len(frames)]}, after packet {count + len(frames)}"
-        elif at > size:
-            frames = frames.where(slice(0, len(frames) - 1))
-            damage = f"ends inside the packet at byte {starts[-1]}, after packet {count + len(frames)}"
-        elif size - _RECORD_HEADER_BYTES < at < size:
-            damage = f"ends inside the packet at byte {at}, after packet {count + len(frames)}"
-        count += len(frames)
-        yield Chunk(frames, damage)
-        if damage or at == size:
-            return
-
-
-def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
-    """Return the start positions of the records from `at` to before `stop`, and the position of the next record.
-
-    A snap length gives most records the same length. Such records are checked together, in groups of growing size.
-    """
-    captured = struct.Struct(f"{order}I").unpack_from
-    parts: list[Ints] = []
-    starts: list[int] = []
-    step, run_length = 0, 0
-    while at < stop:
-        starts.append(at)
-        previous_step, step = step, _RECORD_HEADER_BYTES + captured(data, at + 8)[0]
-        at += step
-        run_length = run_length + 1 if step == previous_step else 0
-        if run_length >= _MIN_RUN and at < stop:
-            equal_count = _equal_length_run(
-                data, order, at, step, min(4 * run_length, (stop - at + step - 1) // step)
-            )
-            parts += [np.array(starts, dtype=np.int64), np.arange(equal_count) * step + at]
-            starts = []
-            at += equal_count * step
-            run_length += equal_count
-    return np.concatenate([*parts, np.array(starts, dtype=np.int64)]), at
-
-
-def _equal_length_run(data: Buffer, order: Order, at: int, step: int, count: int) -> int:
-    """Return the number of consecutive records of `step` bytes from `at` on, at most `count`."""
-    captured = np.ndarray(count, f"{order}u4", buffer=data, offset=at + 8, strides=(step,))
-    differ = captured != step - _RECORD_HEADER_BYTES
-    return int(differ.argmax()) if differ.any() else len(differ)
-
-
-def _frames(
-    integers: Integers, form: np.dtype[np.void], start: Ints, link_type: int, ticks_per_s: int
-) -> tuple[Frames, Mask]:
-    """Return the frames of the records at the positions `start`, and a mask of valid record headers."""
-    head = integers.fields(form, start)
-    ticks, captured, wire = head["ticks"], head["captured"], head["wire"]
-    frames = Frames(
-        start=start + _RECORD_HEADER_BYTES,
-        captured_bytes=captured,
-        wire_bytes=wire,
-        time_ns=head["seconds"] * 1_000_000_000 + ticks * (1_000_000_000 // ticks_per_s),
-        link_type=np.full(len(start), link_type),
-    )
-    # A wire length of 0 is invalid: no link has empty frames, and a power failure leaves zeros in the file.
-    valid = (ticks < ticks_per_s) & (captured <= np.minimum(wire, _MAX_CAPTURED_BYTES)) & (wire > 0)
-    return frames, valid
-
 
 CHUNK_BYTES: Final = 1 << 22
 """Number of file bytes that are decoded together; the memory needed besides the columns is a few times as much."""
@@ -124,8 +22,32 @@ CHUNK_BYTES: Final = 1 << 22
 _SPARE_DIVISOR: Final = 8
 """The expected number of rows divided by this is the number of additional rows that are allocated."""
 
-READERS: Final = dict.fromkeys(CLASSIC_MAGIC, classic_chunks) | {pcapng.MAGIC: pcapng.chunks}
-"""Readers of frames, by the first four bytes of the file."""
+FORMATS: Final = MappingProxyType(
+    {
+        b"\xd4\xc3\xb2\xa1": "classic_pcap",
+        b"\xa1\xb2\xc3\xd4": "classic_pcap",
+        b"\x4d\x3c\xb2\xa1": "classic_pcap",
+        b"\xa1\xb2\x3c\x4d": "classic_pcap",
+        b"\x0a\x0d\x0d\x0a": "pcapng",
+    }
+)
+"""Module that reads a format, in this package, by the first four bytes of the file."""
+
+
+class ChunkReader(Protocol):
+    """The function `chunks` of a format's module."""
+
+    def __call__(self, data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
+        """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk."""
+
+
+def frame_reader(data: Buffer) -> ChunkReader | None:
+    """Return the reader of a capture file's format, or None if the bytes have none of the formats."""
+    module = FORMATS.get(bytes(data[:4]))
+    if module is None:
+        return None
+    reader: ChunkReader = import_module(f"{__package__}.{module}").chunks
+    return reader
 
 
 @dataclass(frozen=True)
@@ -183,15 +105,15 @@ def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
 
 
 def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
-    magic = bytes(data[:4])
-    if magic not in READERS:
+    reader = frame_reader(data)
+    if reader is None:
         raise EvidenceError(
             "is not a pcap or pcapng file" if data else "is empty",
             where=where,
             remedy="read the capture's log: tcpdump must have started, and must be stopped with SIGINT or SIGTERM",
         )
     integers = Integers(data)
-    for chunk in READERS[magic](data, where=where, chunk_bytes=chunk_bytes):
+    for chunk in reader(data, where=where, chunk_bytes=chunk_bytes):
         yield Capture(decode(integers, chunk.frames), len(chunk.frames), chunk.damage)
 
 

@@ -13,11 +13,11 @@ from contextlib import ExitStack, contextmanager
 from fieldkit.core.model import Role, sort_roles
 from fieldkit.motion.steps import piloting
 from fieldkit.steps.scene import Scene, Shells
-from fieldkit.trial.plan import Plan
+from fieldkit.trial.procedure_section import TrialOutline
 
 
 @contextmanager
-def guarded(actions: Mapping[Role, str], plan: Plan, scene: Scene, shells: Shells) -> Iterator[None]:
+def guarded(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, shells: Shells) -> Iterator[None]:
     """Guard drones that no step flies while the body runs.
 
     Args:

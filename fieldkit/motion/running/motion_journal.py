@@ -12,7 +12,8 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final
 
-from fieldkit.config.schema import Codec, Field
+from fieldkit.config.json_records import Codec
+from fieldkit.config.schema import Field
 from fieldkit.core import jsonl, laptop_files
 from fieldkit.core.errors import FieldkitError, MotionHeldError, shell_command
 from fieldkit.core.model import Placement, Role, Topology

@@ -28,7 +28,7 @@ from fieldkit.motion.steps.lease import orders_file, run_inside
 from fieldkit.motion.steps.link_need import link_need
 from fieldkit.motion.steps.mavlink import MavlinkStep
 from fieldkit.remote.shell import Shell
-from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import (
     ChecksPlacement,
     DescribesActions,
@@ -41,6 +41,7 @@ from fieldkit.steps.capabilities import (
 from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.nest import Nest, steps_inside
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 _Distance = Annotated[Length, Field(gt=0)] | None
@@ -376,7 +377,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
             yield f"{height_m:.1f} m high"
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if any(nest.disturbs for nest in within):
             return "a flight must not be inside a fault: put the fault into the flight"
         if any(nest.parallel for nest in within):

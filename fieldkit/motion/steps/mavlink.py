@@ -26,11 +26,12 @@ from fieldkit.motion.steps.link_need import link_need
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import agent_commands
-from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import ChecksPlacement, HasNeeds, SendsTraffic, Summarizes, UsesSpace, WritesOnLaptop
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Scene
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 MESSAGES: Final = MappingProxyType(
@@ -245,7 +246,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         return (_DEFAULT_HZ + sum(self.rates.values())) * self.expected_s(scene.protocol)
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         return None if self.positions is None else follow.placement_error("mavlink with positions", within)
 
     @override

@@ -19,7 +19,7 @@ from fieldkit.motion.profile_sections import drive_of, drives
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
 from fieldkit.ros.streams import stream_options
-from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import (
     AsksOperator,
     ChecksPlacement,
@@ -34,6 +34,7 @@ from fieldkit.steps.capabilities import (
 from fieldkit.steps.legs import PathLeg
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 _LOG_BYTES_PER_S: Final = 2200.0
@@ -266,7 +267,7 @@ class MoveStep(
             yield f"drove {driven_m:.1f} m"
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if any(nest.disturbs for nest in within):
             return "a move must not be inside a fault: put the fault into the move"
         if any(nest.parallel for nest in within):

@@ -19,7 +19,7 @@ from fieldkit.measure.positions import position_checks, position_sources, sample
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.ros.steps.record import SUBSCRIBE_S, RecordStep
-from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import (
     ChecksPlacement,
     HasNeeds,
@@ -32,6 +32,7 @@ from fieldkit.steps.capabilities import (
 from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 _PERIODS: Final = 1.5
@@ -264,7 +265,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         return (position_sources.FILE,)
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if any(isinstance(step, TrackStep) for step in earlier):
             return "a repeat can have only one track: list all robots in it, and put all steps into it"
         return follow.placement_error("track", within)

@@ -23,7 +23,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.captures.arrays import LITTLE, Buffer, Frames, Integers, Ints, Mask, Table
 from fieldkit.measure.captures.headers import TCP, ip_headers, network
 from fieldkit.measure.captures.packets import ACK, UDP_HEADER_BYTES, Packets
-from fieldkit.measure.captures.pcap import CHUNK_BYTES, READERS
+from fieldkit.measure.captures.pcap import CHUNK_BYTES, frame_reader
 from fieldkit.measure.evidence import reading
 from fieldkit.measure.transfers.udp import with_ports
 
@@ -176,7 +176,7 @@ def find_bytes(path: Path, pattern: bytes) -> Occurrences:
     """
     data = reading.mapped(path)
     integers = Integers(data)
-    reader = READERS.get(bytes(data[:4]))
+    reader = frame_reader(data)
     parts, packets = [_no_occurrences()], 0
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
         ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))

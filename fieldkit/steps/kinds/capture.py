@@ -26,7 +26,7 @@ from fieldkit.measure.transfers import altered_packets
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import capabilities
+from fieldkit.steps import base
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.capabilities import HasNeeds, UsesSpace
 from fieldkit.steps.nest import Nest, flows_inside, steps_inside
@@ -196,7 +196,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
         prepared: list[Callable[[Announce], None]] = []
 
         def prepare() -> None:
-            prepared.append(capabilities.prepare(first, scene, testbed))
+            prepared.append(base.prepare(first, scene, testbed))
 
         starts: list[Callable[[], None]] = [
             partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures

@@ -20,6 +20,7 @@ from fieldkit.steps import clocks
 from fieldkit.steps.capabilities import Moves
 from fieldkit.steps.nest import Nest, steps_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
+from fieldkit.steps.surroundings import EnclosingStep
 from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
@@ -113,7 +114,7 @@ def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]
     return {role: PositionSource(place=places_m[role]) for role in nest.roles() if role in places_m}
 
 
-def placement_error(what: str, within: Sequence[Nest]) -> str | None:
+def placement_error(what: str, within: Sequence[EnclosingStep]) -> str | None:
     """Return the reason why the step `what`, which records positions, must not be inside `within`; None if it may."""
     if any(nest.has_path for nest in within):
         return f"a {what} starts where robots were placed: put the move into the {what}"

@@ -76,7 +76,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
             `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds
             (`rtt_gap_at_least_s`).
-        forwarded: Whether robots forward for each other; preflight then looks for a routing daemon on all of them.
+        forwarded: Whether robots forward for each other; the checks then include a routing daemon on all of them.
     """
 
     columns = (*ping.COLUMNS, *ping.SENT_COLUMNS, *ping.MOTION_COLUMNS)

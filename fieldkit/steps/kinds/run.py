@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
-from fieldkit.config.program_files import NamedProgram
+from fieldkit.config.named_programs import NamedProgram
 from fieldkit.config.schema import AfterValidator, Bool, Bytes, Duration, Field, Int, Number, Strict
 from fieldkit.core.columns import Column, Figure, Kind, Measured, Value, cell
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck

@@ -14,11 +14,11 @@ from fieldkit.measure.evidence import reading
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
-from fieldkit.steps.base import FileName, Step
+from fieldkit.steps.base import FileName
 from fieldkit.steps.capabilities import HasNeeds
 from fieldkit.steps.kinds.transfer import TransferStep
-from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import GOOD_BIT_S, Announce, CommandResult, Need, Planned, RecordedFile, Refusal, Scene
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 FILE: Final = "send.bin"
@@ -65,7 +65,7 @@ class SendStep(TransferStep, HasNeeds):
     into: FileName = "recv.bin"
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         return None
 
     def _sent(self, scene: Scene) -> RecordedFile:  # noqa: ARG002 (no step records it)

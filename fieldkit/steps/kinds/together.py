@@ -14,7 +14,7 @@ from fieldkit.config.schema import Field
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Protocol
 from fieldkit.core.threads import run_parallel
-from fieldkit.steps import capabilities
+from fieldkit.steps import base
 from fieldkit.steps.base import Step, StepEntry
 from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Prepares
 from fieldkit.steps.nest import Nest, end_inside
@@ -66,7 +66,7 @@ class TogetherStep(Nest, Prepares, DescribesActions):
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         inner = replace(scene, halt=scene.halt.child())
         prepared = self._run_all(
-            [partial(capabilities.prepare, entry.step, inner, testbed) for entry in self.during], inner, testbed
+            [partial(base.prepare, entry.step, inner, testbed) for entry in self.during], inner, testbed
         )
 
         def carry_out(announce: Announce) -> None:

@@ -52,6 +52,7 @@ from fieldkit.steps.scene import (
     Scene,
     frames,
 )
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.variants import Netcat, Tool
 from fieldkit.steps.view import View, capture_around
 
@@ -119,7 +120,7 @@ class TransferStep(
         return self
 
     @override
-    def placement_error(self, earlier: Sequence[Step], within: Sequence[Nest]) -> str | None:
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         recorders = [step for step in earlier if isinstance(step, Records) and self.sender in step.records_on()]
         what = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
         if not recorders:
@@ -289,7 +290,7 @@ class TransferStep(
         return self._sent(scene).size_bytes
 
     @override
-    def transfer(self, scene: Scene, within: Sequence[Nest]) -> Transfer:
+    def transfer(self, scene: Scene, within: Sequence[EnclosingStep]) -> Transfer:
         return Transfer(
             protocol=scene.protocol,
             source=self.sender,
@@ -358,7 +359,7 @@ class TransferStep(
 
     def _shares_port(self, view: View) -> bool:
         """Return True if another flow in the same capture uses its port, also in the reverse direction."""
-        captures = (nest for nest in reversed(view.within) if nest.captures())
+        captures = (step for step in reversed(view.within) if isinstance(step, Nest) and step.captures())
         flows = next((list(flows_inside(nest, view.scene)) for nest in captures), [])
         return sum(flow.port == self.port for flow in flows) > 1
 

@@ -1,1 +1,1 @@
-"""Checks of `fieldkit check`: a shell script reads the state of each robot once, and pure functions judge it."""
+"""Checks before a trial: of each robot, whose state a shell script reads once, and of the plan."""

@@ -124,7 +124,7 @@ def require_passed(findings: Sequence[Finding]) -> None:
             f"\n  {finding.robot}: {finding.check}: {finding.detail}\n    {finding.remedy}" for finding in failed
         )
         raise RobotError(
-            f"preflight found {format_count(len(failed), 'problem')}:{lines}",
+            f"the checks found {format_count(len(failed), 'problem')}:{lines}",
             remedy="fix these, then try again",
         )
 

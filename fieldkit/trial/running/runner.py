@@ -127,7 +127,7 @@ def run_repeats(
     try:
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.stop_leftover_jobs()
-        sink(PhaseStarted("preflight"))
+        sink(PhaseStarted("check"))
         variants = preflight.preflight(plan, robots.shells, folder, sink)
         permission = motion_control.permission(plan, testbed, folder)
         attempts = Attempts(

@@ -138,7 +138,9 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
         SheetColumn("flow", "flow", ""),
         SheetColumn("end_s", "ended at (s)", "end of the fault"),
         SheetColumn("lost", "lost", "packets that were sent during the fault and lost"),
-        SheetColumn("recovered_s", "back after (ms)", "from its end to the first arrival of a later packet", 1e3),
+        SheetColumn(
+            "recovered_s", "recovered after (ms)", "from its end to the first arrival of a later packet", 1e3
+        ),
     )
     rows: list[Sequence[Value]] = [
         (

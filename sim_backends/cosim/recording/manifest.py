@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from fieldkit.config.schema import Codec
+from fieldkit.config.json_records import Codec
 from fieldkit.core import files
 from fieldkit.core.errors import EvidenceError
 

@@ -1,4 +1,4 @@
-"""Fail-safes of the emulated autopilots for battery, ground station and fence, and the reactions of the vehicle.
+"""Failsafes of the emulated autopilots for battery, ground station and fence, and the reactions of the vehicle.
 
 ArduCopter: https://ardupilot.org/copter/docs/failsafe-battery.html,
 https://ardupilot.org/copter/docs/gcs-failsafe.html,
@@ -24,7 +24,7 @@ _INFO: Final = dialect.MAV_SEVERITY_INFO
 
 @dataclass(frozen=True)
 class VehicleState:
-    """State of the vehicle on which fail-safes depend.
+    """State of the vehicle on which failsafes depend.
 
     Attributes:
         now_ns: Time.
@@ -43,7 +43,7 @@ class VehicleState:
 
 @dataclass(frozen=True)
 class Reaction:
-    """Reaction of a fail-safe.
+    """Reaction of a failsafe.
 
     Attributes:
         text: Text of the STATUSTEXT message, or empty.
@@ -59,16 +59,16 @@ class Reaction:
 
 
 class Failsafes(Protocol):
-    """The fail-safes of a vehicle.
+    """The failsafes of a vehicle.
 
     Attributes:
-        active: True if a fail-safe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
+        active: True if a failsafe is triggered; HEARTBEAT then has MAV_STATE_CRITICAL.
         arming_errors: Reasons why they prevent arming.
     """
 
     @property
     def active(self) -> bool:
-        """True if a fail-safe is triggered."""
+        """True if a failsafe is triggered."""
 
     @property
     def arming_errors(self) -> list[str]:
@@ -88,9 +88,9 @@ class Failsafes(Protocol):
 
 
 class ArduCopterFailsafes:
-    """Battery and ground-station fail-safes of ArduCopter.
+    """Battery and ground-station failsafes of ArduCopter.
 
-    A triggered battery fail-safe lasts until the next boot, one of the ground station until a heartbeat arrives.
+    A triggered battery failsafe lasts until the next boot, one of the ground station until a heartbeat arrives.
 
     Args:
         parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.
@@ -124,7 +124,7 @@ class ArduCopterFailsafes:
         """Implement `Failsafes.mode_changed`: nothing depends on the mode."""
 
     def set_points_lost(self) -> None:
-        """Implement `Failsafes.set_points_lost`: ArduCopter has no such fail-safe."""
+        """Implement `Failsafes.set_points_lost`: ArduCopter has no such failsafe."""
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
         """Implement `Failsafes.advance`."""
@@ -187,9 +187,9 @@ _GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: M
 
 
 class Px4Failsafes:
-    """Ground-station (data-link) and battery fail-safes of PX4.
+    """Ground-station (data-link) and battery failsafes of PX4.
 
-    The vehicle first holds for COM_FAIL_ACT_T, so that a pilot can take over. A mode change ends a fail-safe.
+    The vehicle first holds for COM_FAIL_ACT_T, so that a pilot can take over. A mode change ends a failsafe.
 
     Args:
         parameters: NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT, BAT_*_THR, COM_FAIL_ACT_T.
@@ -220,11 +220,11 @@ class Px4Failsafes:
             self._gcs_heartbeat_ns = now_ns
 
     def mode_changed(self, now_ns: int) -> None:  # noqa: ARG002
-        """Implement `Failsafes.mode_changed`: the fail-safe ends."""
+        """Implement `Failsafes.mode_changed`: the failsafe ends."""
         self._active, self._next = False, None
 
     def set_points_lost(self) -> None:
-        """Implement `Failsafes.set_points_lost`: the fail-safe lasts until a client changes the mode."""
+        """Implement `Failsafes.set_points_lost`: the failsafe lasts until a client changes the mode."""
         self._active = True
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:

@@ -78,7 +78,7 @@ class Firmware:
         prearm: Prefixes of the texts with the reasons against arming: on request, and on arming.
         arming_errors: Returns the reasons against arming.
         parameters: Its parameters, within the limits of a profile.
-        failsafes: Its fail-safes.
+        failsafes: Its failsafes.
         streams_hz: Default rates of messages on a telemetry port.
         groups: Groups of messages whose rates parameters and REQUEST_DATA_STREAM set; empty if it ignores these.
         spool_s: Time from arming to the earliest lift-off.

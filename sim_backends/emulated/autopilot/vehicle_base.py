@@ -1,4 +1,4 @@
-"""Base class of the vehicle: its airframe, estimates, fence, fail-safes and mission; its home and its local frame."""
+"""Base class of the vehicle: its airframe, estimates, fence, failsafes and mission; its home and its local frame."""
 
 import math
 from collections.abc import Sequence
@@ -44,7 +44,7 @@ class VehicleBase:
         fence: Its fence.
         guidance: Its goal and set-points.
         home_m: Home in the world, metres east, north, up: where it was armed last, or else where it booted.
-        failsafes: Its fail-safes.
+        failsafes: Its failsafes.
         status_texts: Texts that are not sent yet; the reader clears the list.
     """
 
@@ -74,7 +74,7 @@ class VehicleBase:
         self.boot(now_ns)
 
     def boot(self, now_ns: int) -> None:
-        """Boot: set the mode after power-on, and reset fail-safes and origin."""
+        """Boot: set the mode after power-on, and reset failsafes and origin."""
         self.estimate.boot(now_ns)
         self._prearm_ns = now_ns
         self.mode = self.firmware.boot_mode

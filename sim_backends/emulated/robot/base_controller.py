@@ -1,7 +1,7 @@
 """Base controller of an emulated ground robot: computes its pose from commanded velocities, within limits.
 
-It treats velocities as ROS's `diff_drive_controller` and the firmware of a TurtleBot3 do, and stops if none arrived
-for `TIMEOUT_NS`. The robot is a differential drive of the co-simulation's physics, without collisions.
+Like ROS's `diff_drive_controller` and the firmware of a TurtleBot3 it limits the commanded velocity, and stops if no
+command arrived for `TIMEOUT_NS`. It uses the differential drive of the co-simulation's physics, without collisions.
 """
 
 import math

@@ -35,7 +35,7 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
     Raises:
         OSError: The socket cannot be created.
     """
-    CHANNEL.unlink(missing_ok=True)  # left by a process that was killed
+    CHANNEL.unlink(missing_ok=True)  # remains after a process was killed
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
         channel.bind(str(CHANNEL))
         if base.simulated:
@@ -60,7 +60,7 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
 
 
 def _record_velocities(channel: socket.socket) -> NoReturn:
-    """Record each velocity for the physics, which limits it and stops the robot if none arrives any more."""
+    """Record each velocity for the physics, which limits it and stops the robot after the last one."""
     record = CommandedRecord.open(COMMANDED)
     while True:
         velocity = unpack(channel.recv(BYTES + 1))

@@ -1,4 +1,4 @@
-"""Record of the velocity that a robot's base was commanded last, read by the physics that moves the robot.
+"""Record of the last velocity command to a robot's base, read by the physics that moves the robot.
 
 Only the standard library is imported, because the base process is imported under Debian's Python, too.
 """
@@ -14,7 +14,7 @@ COMMANDED: Final = Path(STATE, "commanded")
 
 
 class Commanded(NamedTuple):
-    """A commanded velocity.
+    """Velocity command.
 
     Attributes:
         time_ns: Time at which the base received it, by the monotonic clock.

@@ -118,7 +118,7 @@ class RobotSpec:
         netcat: Its only netcat, as `nc` and by its full name; None for those of this machine or of the userland.
         ping: Its `ping`; None as for `netcat`.
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
-        ros2: Its ROS 2 over the radio; None for a robot without.
+        ros2: Its ROS 2 over the radio; None if it has none.
         routes_zenoh: True if it runs the Zenoh router.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """

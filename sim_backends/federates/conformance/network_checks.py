@@ -95,7 +95,7 @@ class _Account:
 
     def _decide(self, packet_id: int) -> None:
         if packet_id not in self._packets:
-            raise CheckError(f"the fate of packet {packet_id} was reported, which it never got")
+            raise CheckError(f"the fate of packet {packet_id} was reported, but it was not sent to the network")
         if packet_id in self._decided:
             raise CheckError(f"the fate of packet {packet_id} was reported twice")
         self._decided.add(packet_id)
@@ -176,7 +176,7 @@ def check_next_event(target: Target) -> None:
 
 
 def check_window_borders(target: Target) -> None:
-    """A packet may enter at the end of a window, or at the previous one's end, and arrives not before it entered."""
+    """A packet may enter at either end of a window, and does not arrive before it has entered."""
     probe = target.open()
     account, states = _Account(probe), _states(probe)
     first, second, third = _packets(probe, (10 * _MS, 10 * _MS, 10 * _MS + 1))
@@ -244,7 +244,7 @@ def check_determinism(target: Target) -> None:
 
 
 def _arrivals_ns(probe: FederateProbe, every: int = 1) -> dict[int, int]:
-    """Return the times of arrivals by packet, of packets at several distances, or of every second one of them."""
+    """Return the arrival time of each packet sent at several distances, or of every second packet."""
     account, states = _Account(probe), _states(probe)
     packets = _packets(probe, [_MS + number * _SPACING_NS for number in range(len(_DISTANCES_M) * _GROUP)])
     first, second = (agent.name for agent in probe.hello.agents[:2])
@@ -287,7 +287,7 @@ def check_seed(target: Target) -> None:
 
 
 def check_removed_packets(target: Target) -> None:
-    """The fate of a packet is the same without other packets; this is recommended, so that the check never fails."""
+    """The fate of a packet is the same without other packets; as this is a recommendation, the check never fails."""
     results = []
     for every in (1, 2):
         probe = target.open()

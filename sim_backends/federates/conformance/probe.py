@@ -1,4 +1,4 @@
-"""Means of the checks: connections to fresh federates, and the last request and answer of each."""
+"""Helpers of the checks: connections to fresh federates, and the last request and answer of each."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ _CLOSE_S: Final = 5.0
 
 
 class CheckError(Exception):
-    """A federate does not conform; the message says how."""
+    """A federate does not conform to the protocol; the message says why."""
 
 
 class NotDeclaredError(Exception):
@@ -151,7 +151,7 @@ class FederateProbe:
         return outcomes
 
     def fork(self, copy: int) -> None:
-        """Let the federate copy itself."""
+        """Request a copy of the federate in its present state."""
         self.request(MessageKind.FORK, encode_fork(copy), MessageKind.DONE, bytes)
 
     def ping(self, value: int) -> int:
@@ -163,7 +163,7 @@ class FederateProbe:
         """Send a request that the federate must refuse.
 
         Raises:
-            CheckError: It answers, or does not react within the deadline.
+            CheckError: It sends another answer, or none within the deadline.
         """
         started_s = time.monotonic()
         try:

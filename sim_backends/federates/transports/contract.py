@@ -1,4 +1,4 @@
-"""What a transport provides: an address that can connect or listen, and a listener that accepts with a deadline."""
+"""Interface of a transport: an address that can connect or listen, and a listener that accepts with a deadline."""
 
 import hmac
 import ipaddress
@@ -30,7 +30,7 @@ class ChannelListener(Protocol):
 
 
 class TransportAddress(Protocol):
-    """An address of a transport. Its text is that of the user.
+    """An address of a transport; `str` returns the text as the user wrote it.
 
     Attributes:
         listens: True if the side that has this address listens, False if it connects; None if the federate listens

@@ -65,13 +65,13 @@ def test_expectations_of_trials_under_one_condition_are_judged_together(
         table = (folder / "trial.csv").read_text(encoding="utf-8")
         (folder / "trial.csv").write_text(table.replace(LOSSY.name, f"trial {number}"), encoding="utf-8")
     assert main(["aggregate", str(tmp_path), "--quantity", "rtt_median_s", "--quantity", "rtt_loss"]) == 0
-    shown = capsys.readouterr()
-    _, _, judged = shown.out.partition(" expected ")
+    output = capsys.readouterr()
+    _, _, judged = output.out.partition(" expected ")
     assert [re.split("  +", line)[:2] for line in judged.splitlines()[2:]] == [
         [" rtt_median_s > 1 us", "tcp"], [" rtt_median_s > 1 us", "udp"], [" tcp rtt_loss < 2 %", "tcp"],
     ]  # fmt: skip
-    assert shown.out.count("  holds\n") == 2
-    assert "1: an expectation is left out: the expected figure 'no_such' does not exist" in shown.err.replace(
+    assert output.out.count("  holds\n") == 2
+    assert "1: an expectation is left out: the expected figure 'no_such' does not exist" in output.err.replace(
         f"/{LOSSY.name}", ""
     )
     assert "expected" not in output_of(capsys, str(tmp_path), "--quantity", "datagram_loss")
@@ -84,15 +84,15 @@ def test_quantity_missing_in_some_repeats_has_its_count(
 ) -> None:
     rows = repeats(ROW, 10)
     write(tmp_path, [*rows[:7], *(replace(row, rtt_median_s=None) for row in rows[7:])])
-    shown = output_of(capsys, str(tmp_path), "--format", form, "--quantity", "rtt_median_s")
+    output = output_of(capsys, str(tmp_path), "--format", form, "--quantity", "rtt_median_s")
     if form == "csv":
-        (record,) = records(shown)
+        (record,) = records(output)
         assert (record["n"], record["n_valid"]) == ("7", "10")
     elif form == "json":
-        (cell,) = json.loads(shown)["cells"]
+        (cell,) = json.loads(output)["cells"]
         assert (cell["estimates"]["rtt_median_s"]["n"], cell["n_valid"]) == (7, 10)
     else:
-        assert "7 of 10" in shown
+        assert "7 of 10" in output
 
 
 def test_different_procedures_of_one_name_cause_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -128,9 +128,9 @@ def test_csv_equals_the_summary_file(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_json_and_csv_agree(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = records(output_of(capsys, str(campaign), "--format", "csv"))
-    whole = json.loads(output_of(capsys, str(campaign), "--format", "json"))
-    assert whole["by"] == list(DEFAULT_BY)
-    estimates = [(cell, name, estimate) for cell in whole["cells"] for name, estimate in cell["estimates"].items()]
+    document = json.loads(output_of(capsys, str(campaign), "--format", "json"))
+    assert document["by"] == list(DEFAULT_BY)
+    estimates = [(cell, name, estimate) for cell in document["cells"] for name, estimate in cell["estimates"].items()]
     assert len(estimates) == len(lines)
     for line, (cell, name, estimate) in zip(lines, estimates, strict=True):
         assert (line["quantity"], line["n_void"]) == (name, str(cell["n_void"]))
@@ -171,8 +171,8 @@ def test_width_gives_the_number_of_repeats_needed(campaign: Path, capsys: pytest
         width = 0.01 if line["unit"] == "share" else 0.005
         assert line["more_wanted"] == str(additional_repeats(interval, int(line["n"]), width, Kind(line["estimate"])))
     assert {line["more_wanted"] == "0" for line in lines} == {True, False}
-    whole = json.loads(output_of(capsys, *words, "--format", "json"))
-    counts = [estimate["more_wanted"] for cell in whole["cells"] for estimate in cell["estimates"].values()]
+    document = json.loads(output_of(capsys, *words, "--format", "json"))
+    counts = [estimate["more_wanted"] for cell in document["cells"] for estimate in cell["estimates"].values()]
     assert [str(count) for count in counts] == [line["more_wanted"] for line in lines]
     (loss,) = (line for line in lines if line["quantity"] == "ip_loss")
     assert re.search(

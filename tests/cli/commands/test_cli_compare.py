@@ -45,20 +45,20 @@ def field(lab: Path) -> list[RepeatRow]:
 
 def test_run_does_not_differ_from_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare("field field/trial.csv --threshold rtt_median_s=10ms") == 0
-    shown = capsys.readouterr()
-    assert shown.err == "note: may matter: attempts that the other run has too: A has 20, B has 20\n"
-    assert "IP packet loss" in shown.out
-    assert "no difference seen; up to " in shown.out
-    assert ": 0 differences seen, 0 after correction" in shown.out
+    output = capsys.readouterr()
+    assert output.err == "note: may matter: attempts that the other run has too: A has 20, B has 20\n"
+    assert "IP packet loss" in output.out
+    assert "no difference seen; up to " in output.out
+    assert ": 0 differences seen, 0 after correction" in output.out
 
 
 def test_field_and_simulation_differ_in_loss(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare("field sim") == 0
-    shown = capsys.readouterr().out
-    assert shown.startswith("los, master, 9.144 m, udp: A 20 valid; B 20 valid\n")
-    (loss,) = (line for line in shown.splitlines() if "IP packet loss" in line)
+    output = capsys.readouterr().out
+    assert output.startswith("los, master, 9.144 m, udp: A 20 valid; B 20 valid\n")
+    (loss,) = (line for line in output.splitlines() if "IP packet loss" in line)
     assert "B 18.52 points more [" in loss
-    assert ": 1 difference seen, 1 after correction" in shown
+    assert ": 1 difference seen, 1 after correction" in output
 
 
 @pytest.mark.parametrize(
@@ -93,9 +93,9 @@ def test_runs_that_are_not_comparable_are_rejected_without_force(
 ) -> None:
     write(lab / "other", [replace(row, procedure_sha256="ffff", sent_bytes=293_797) for row in field])
     assert compare("field other") == 2
-    shown = capsys.readouterr()
-    assert shown.out == ""
-    assert shown.err == (
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err == (
         "error: A and B are not comparable:\n"
         "  procedure_sha256: A has bbbb, B has ffff (los, master, 9.144 m, udp)\n"
         "  sent_bytes, median: A has 230,695 B, B has 293,797 B (los, master, 9.144 m, udp)\n"
@@ -103,28 +103,28 @@ def test_runs_that_are_not_comparable_are_rejected_without_force(
         "or, to compare them anyway, add --force\n"
     )
     assert compare("field other --force") == 0
-    shown = capsys.readouterr()
-    assert "not comparable: procedure_sha256: A has bbbb, B has ffff" in shown.err
-    assert "no difference seen" in shown.out
+    output = capsys.readouterr()
+    assert "not comparable: procedure_sha256: A has bbbb, B has ffff" in output.err
+    assert "no difference seen" in output.out
 
 
 def test_all_formats_agree(capsys: pytest.CaptureFixture[str]) -> None:
-    shown = {}
+    outputs = {}
     for form in ("csv", "json", "markdown", "table"):
         assert compare(f"field sim --threshold ip_loss=2% --format {form}") == 1
-        shown[form] = capsys.readouterr().out
-    (loss,) = (row for row in csv.DictReader(shown["csv"].splitlines()) if row["quantity"] == "ip_loss")
-    whole = json.loads(shown["json"])
-    (same,) = (row for row in whole["differences"] if row["quantity"] == "ip_loss")
-    assert whole["missed"] is True
+        outputs[form] = capsys.readouterr().out
+    (loss,) = (row for row in csv.DictReader(outputs["csv"].splitlines()) if row["quantity"] == "ip_loss")
+    document = json.loads(outputs["json"])
+    (same,) = (row for row in document["differences"] if row["quantity"] == "ip_loss")
+    assert document["missed"] is True
     assert float(loss["difference"]) == pytest.approx(same["difference"]) == pytest.approx(40 / 216)
     assert loss["within"] == "false"
     assert loss["verdict"] == same["verdict"]
-    assert same["verdict"] in shown["markdown"]
-    assert same["verdict"] in shown["table"]
-    for line in whole["conclusions"]:
-        assert line in shown["markdown"]
-        assert line in shown["table"]
+    assert same["verdict"] in outputs["markdown"]
+    assert same["verdict"] in outputs["table"]
+    for line in document["conclusions"]:
+        assert line in outputs["markdown"]
+        assert line in outputs["table"]
 
 
 SITE = """\
@@ -165,11 +165,11 @@ def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureF
 
 
 def test_equal_inputs_give_equal_bytes(capsys: pytest.CaptureFixture[str]) -> None:
-    shown = []
+    outputs = []
     for _ in range(2):
         compare("field sim --format json")
-        shown.append(capsys.readouterr().out)
-    assert shown[0] == shown[1]
+        outputs.append(capsys.readouterr().out)
+    assert outputs[0] == outputs[1]
 
 
 def far_away(lab: Path, field: list[RepeatRow], *names: str) -> None:
@@ -183,16 +183,17 @@ def test_runs_that_differ_only_in_distance_compare_by_protocol(
 ) -> None:
     far_away(lab, field, "far")
     assert compare("field far") == 2
-    refused = capsys.readouterr().err
+    error_text = capsys.readouterr().err
     assert (
-        "only distance_m differs; to compare one with the other: fieldkit compare field far --by protocol" in refused
+        "only distance_m differs; to compare one with the other: fieldkit compare field far --by protocol"
+        in error_text
     )
     assert compare("field far --by protocol") == 0
-    shown = capsys.readouterr()
-    assert shown.err.startswith(
+    output = capsys.readouterr()
+    assert output.err.startswith(
         "note: A and B differ in this, which may explain differences between their figures: distance_m: A has 9.1"
     )
-    assert shown.out.startswith("udp: A 20 valid; B 20 valid\n")
+    assert output.out.startswith("udp: A 20 valid; B 20 valid\n")
     assert compare("field far --by protocol --format markdown") == 0
     assert (
         "- A and B differ in this, which may explain differences between their figures: distance"

@@ -51,9 +51,9 @@ def test_key_is_shown_and_pinned_after_confirmation(
     before = lab.read_text(encoding="utf-8")
     typing(monkeypatch, "maybe", "yes")
     assert main(["enroll", "turtlebot-1"]) == 0
-    shown = capsys.readouterr().out
-    assert f"turtlebot-1 at 127.0.0.1 port {server.port} offers: ssh-ed25519 {fingerprint(server.folder)}" in shown
-    assert "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub" in shown
+    output = capsys.readouterr().out
+    assert f"turtlebot-1 at 127.0.0.1 port {server.port} offers: ssh-ed25519 {fingerprint(server.folder)}" in output
+    assert "ssh-keygen -lf /etc/ssh/ssh_host_ed25519_key.pub" in output
     line = f"    host_key: {key_of(server)}\n"
     assert lab.read_text(encoding="utf-8") == before.replace("roles:", f"{line}roles:")
     assert main(["enroll", "turtlebot-1"]) == 0

@@ -11,7 +11,7 @@ FIELD = ROOT / "docs" / "field.md"
 
 
 @pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def opened_addresses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The addresses passed to the browser."""
     addresses: list[str] = []
 
@@ -23,19 +23,21 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return addresses
 
 
-def test_a_topic_is_opened_in_the_browser(opened: list[str]) -> None:
+def test_a_topic_is_opened_in_the_browser(opened_addresses: list[str]) -> None:
     assert main(["docs", "field"]) == 0
-    assert opened == [FIELD.as_uri()]
+    assert opened_addresses == [FIELD.as_uri()]
 
 
-def test_overview_is_opened_by_default(opened: list[str]) -> None:
+def test_overview_is_opened_by_default(opened_addresses: list[str]) -> None:
     assert main(["docs"]) == 0
-    assert opened == [(ROOT / "docs" / "index.md").as_uri()]
+    assert opened_addresses == [(ROOT / "docs" / "index.md").as_uri()]
 
 
-def test_the_path_is_printed_and_no_browser_opened(opened: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_path_is_printed_and_no_browser_opened(
+    opened_addresses: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["docs", "field", "--path"]) == 0
-    assert (capsys.readouterr().out, opened) == (f"{FIELD}\n", [])
+    assert (capsys.readouterr().out, opened_addresses) == (f"{FIELD}\n", [])
 
 
 def test_topics_are_listed(capsys: pytest.CaptureFixture[str]) -> None:

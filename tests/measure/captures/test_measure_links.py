@@ -29,7 +29,7 @@ from tests.helpers.dissected import dissected, rows, write
 TO_DS, FROM_DS, MORE, RETRY, PROTECTED = 0x01, 0x02, 0x04, 0x08, 0x40
 MAC = "02:00:00:00:00:01"
 ETHER = Ether(src=MAC, dst="02:00:00:00:00:02")
-HERE, THERE = "fd00::1", "2001:db8:1234:5678:9abc:def0:1234:5678"
+ADDRESS_A, ADDRESS_B = "fd00::1", "2001:db8:1234:5678:9abc:def0:1234:5678"
 
 
 def _dot11(flags: int, *, subtype: int = 0, qos: Packet | None = None) -> Packet:
@@ -66,7 +66,7 @@ LINKS: dict[str, tuple[int, Packet | None]] = {
 
 
 def _ipv4_packets() -> list[Packet]:
-    there, back = IP(src=SENDER, dst=RECEIVER), IP(src=RECEIVER, dst=SENDER)
+    forward, back = IP(src=SENDER, dst=RECEIVER), IP(src=RECEIVER, dst=SENDER)
     with_options = IP(src=SENDER, dst=RECEIVER, options=[b"\x94\x04\x00\x00"])
     big = IP(src=SENDER, dst=RECEIVER, id=65535) / UDP(sport=40000, dport=1234) / Raw(bytes(8192))
     # The last offsets need all 13 bits of the field.
@@ -75,28 +75,28 @@ def _ipv4_packets() -> list[Packet]:
         IP(src=SENDER, dst=RECEIVER, id=7) / UDP(sport=4, dport=5) / Raw(bytes(20)),
         *fragment(biggest, 8000),  # type: ignore[no-untyped-call]
         *fragment(big, 1480),  # type: ignore[no-untyped-call]
-        there / TCP(sport=1234, dport=40000, seq=2**32 - 1, flags="S", options=[("MSS", 1460), ("WScale", 7)]),
+        forward / TCP(sport=1234, dport=40000, seq=2**32 - 1, flags="S", options=[("MSS", 1460), ("WScale", 7)]),
         back / TCP(sport=40000, dport=1234, seq=1, ack=2**32 - 1, flags="PA") / Raw(bytes(1448)),
         with_options / TCP(sport=1, dport=65535, ack=7, flags="FA") / Raw(b"abc"),
-        there / ICMP(id=0xFEDC) / Raw(bytes(56)),
+        forward / ICMP(id=0xFEDC) / Raw(bytes(56)),
         *fragment(back / ICMP(type="echo-reply", id=7) / Raw(bytes(3000)), 1480),  # type: ignore[no-untyped-call]
-        back / ICMP(type="dest-unreach", code="port-unreachable") / there / UDP(sport=4, dport=5),
+        back / ICMP(type="dest-unreach", code="port-unreachable") / forward / UDP(sport=4, dport=5),
     ]
 
 
 def _ipv6_packets() -> list[Packet]:
-    there = IPv6(src=HERE, dst=THERE)
+    forward = IPv6(src=ADDRESS_A, dst=ADDRESS_B)
     hops = IPv6ExtHdrHopByHop(options=[PadN(optdata=bytes(10))])
-    routing = IPv6ExtHdrRouting(addresses=[THERE, HERE])
+    routing = IPv6ExtHdrRouting(addresses=[ADDRESS_B, ADDRESS_A])
     udp = UDP(sport=40000, dport=1234, chksum=1) / Raw(bytes(3000))
-    fragmented = there / hops / IPv6ExtHdrFragment(id=0xFEDC_BA98) / IPv6ExtHdrDestOpt() / udp
+    fragmented = forward / hops / IPv6ExtHdrFragment(id=0xFEDC_BA98) / IPv6ExtHdrDestOpt() / udp
     return [
-        there / UDP(sport=4, dport=5) / Raw(bytes(20)),
-        IPv6(src=THERE, dst=HERE) / TCP(sport=1, dport=2, seq=2**32 - 1, flags="FA") / Raw(bytes(1000)),
-        there / hops / routing / IPv6ExtHdrDestOpt() / TCP(sport=3, dport=4, seq=9) / Raw(b"abc"),
+        forward / UDP(sport=4, dport=5) / Raw(bytes(20)),
+        IPv6(src=ADDRESS_B, dst=ADDRESS_A) / TCP(sport=1, dport=2, seq=2**32 - 1, flags="FA") / Raw(bytes(1000)),
+        forward / hops / routing / IPv6ExtHdrDestOpt() / TCP(sport=3, dport=4, seq=9) / Raw(b"abc"),
         *fragment6(fragmented, 1280),  # type: ignore[no-untyped-call]
-        there / IPv6ExtHdrFragment(id=5, m=0, offset=0) / SCTP(sport=8, dport=9),
-        there / ICMPv6EchoRequest(data=bytes(56)),
+        forward / IPv6ExtHdrFragment(id=5, m=0, offset=0) / SCTP(sport=8, dport=9),
+        forward / ICMPv6EchoRequest(data=bytes(56)),
     ]
 
 
@@ -122,7 +122,7 @@ def test_every_column_equals_scapys_dissection(tmp_path: Path, name: str, order:
 @pytest.mark.parametrize(("link_type", "order"), [(0, "<"), (0, ">"), (108, ">")])
 @pytest.mark.parametrize("family", [2, 10, 24, 28, 30])
 def test_the_address_family_of_loopback_is_read_in_either_byte_order(link_type: int, order: str, family: int) -> None:
-    packet = IPv6(src=HERE, dst=THERE) / UDP(sport=4, dport=5)
+    packet = IPv6(src=ADDRESS_A, dst=ADDRESS_B) / UDP(sport=4, dport=5)
     data = file_bytes([Frame(0, struct.pack(f"{order}I", family) + bytes(packet))], link_type=link_type)
     assert pcap.parse(data, where="x").packets.dport.tolist() == [5]
     other = file_bytes([Frame(0, struct.pack(f"{order}I", 7) + bytes(packet))], link_type=link_type)
@@ -246,9 +246,9 @@ def test_the_length_of_an_ipv6_superframe_is_from_its_option_or_the_wire(
 
 
 def test_a_packet_truncated_in_its_headers_has_no_ports() -> None:
-    whole = segment(5, 0)
-    for kept, count, ported in ((19, 0, 0), (20, 1, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
-        packets = _of(whole[:kept], wire=40)
+    packet = segment(5, 0)
+    for length, count, ported in ((19, 0, 0), (20, 1, 0), (23, 1, 0), (24, 1, 1), (39, 1, 1)):
+        packets = _of(packet[:length], wire=40)
         assert len(packets) == count
         assert (packets.dport != NO_PORT).sum() == ported
         assert not packets.tcp_seq.any()
@@ -257,19 +257,19 @@ def test_a_packet_truncated_in_its_headers_has_no_ports() -> None:
 def test_the_length_of_an_authentication_header_is_in_words() -> None:
     """The packet is built by hand, because scapy does not dissect the header after it."""
     authentic = AH(nh=17, payloadlen=4, spi=1, seq=1, icv=bytes(12))
-    packets = _of(bytes(IPv6(src=HERE, dst=THERE) / authentic / UDP(sport=6, dport=7) / Raw(b"abcd")))
+    packets = _of(bytes(IPv6(src=ADDRESS_A, dst=ADDRESS_B) / authentic / UDP(sport=6, dport=7) / Raw(b"abcd")))
     assert (packets.protocol.tolist(), packets.dport.tolist(), packets.udp_bytes.tolist()) == ([17], [7], [12])
     assert packets.ip_payload_bytes.tolist() == [12]
 
 
 def test_an_ipv6_packet_truncated_in_its_extension_headers_has_no_ports() -> None:
     hops = IPv6ExtHdrHopByHop(options=[PadN(optdata=bytes(10))])
-    whole = bytes(IPv6(src=HERE, dst=THERE) / hops / UDP(sport=4, dport=5))
-    for kept in range(len(whole)):
-        packets = _of(whole[:kept], wire=len(whole))
-        assert len(packets) == (kept >= 40)
-        assert packets.protocol.tolist() == ([] if kept < 40 else [17 if kept >= 48 else 0])
-        assert packets.dport.tolist() == ([] if kept < 40 else [5 if kept >= 60 else NO_PORT])
+    packet = bytes(IPv6(src=ADDRESS_A, dst=ADDRESS_B) / hops / UDP(sport=4, dport=5))
+    for length in range(len(packet)):
+        packets = _of(packet[:length], wire=len(packet))
+        assert len(packets) == (length >= 40)
+        assert packets.protocol.tolist() == ([] if length < 40 else [17 if length >= 48 else 0])
+        assert packets.dport.tolist() == ([] if length < 40 else [5 if length >= 60 else NO_PORT])
 
 
 def test_headers_at_the_end_of_a_file_do_not_read_beyond_it() -> None:

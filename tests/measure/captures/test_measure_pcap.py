@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures import classic_pcap, pcap, pcapng
 from fieldkit.measure.captures.headers import LINKS
 from tests.helpers.captures import TCPDUMP, file_bytes, segment, timed
 
@@ -34,6 +34,13 @@ def test_a_file_that_is_not_a_capture_is_rejected_with_a_remedy(data: bytes, mes
         pcap.parse(data, where="sender.pcap")
     assert caught.value.remedy
     assert caught.value.where == "sender.pcap"
+
+
+def test_each_format_has_the_first_bytes_that_its_module_reads() -> None:
+    by_module = {
+        module: {magic for magic in pcap.FORMATS if pcap.FORMATS[magic] == module} for module in pcap.FORMATS.values()
+    }
+    assert by_module == {"classic_pcap": set(classic_pcap.MAGIC), "pcapng": {pcapng.MAGIC}}
 
 
 def test_a_missing_capture_is_rejected(tmp_path: Path) -> None:
@@ -150,7 +157,7 @@ def test_any_changed_bit_of_an_ipv4_header_makes_its_checksum_wrong(
     changed = header.copy()
     changed[bit // 8] ^= 1 << bit % 8
     not_computed = header[:10] + bytes(2) + header[12:]
-    frames = timed([bytes(each) + bytes(20) for each in (header, changed, not_computed)])
+    frames = timed([bytes(head) + bytes(20) for head in (header, changed, not_computed)])
     packets = pcap.parse(file_bytes(frames, link_type=101), where="x").packets
     is_computed, is_decoded = any(changed[10:12]), int.from_bytes(changed[2:4]) >= len(header)
     expected = [False, *([is_computed] if is_decoded else []), False]

@@ -46,12 +46,12 @@ def test_every_block_type_that_contains_a_packet(order: str) -> None:
 
 
 def test_a_simple_packet_has_the_snap_length_of_its_interface() -> None:
-    whole = segment(7, 100)
-    for snap, kept, ported in ((0, 40, True), (40, 40, True), (24, 24, True), (23, 23, False)):
-        data = section() + interface(snap=snap) + simple(Frame(0, whole[:kept], wire_bytes=40))
+    packet = segment(7, 100)
+    for snap, captured, ported in ((0, 40, True), (40, 40, True), (24, 24, True), (23, 23, False)):
+        data = section() + interface(snap=snap) + simple(Frame(0, packet[:captured], wire_bytes=40))
         packets = pcap.parse(data, where="x").packets
         assert (packets.dport == 1234).tolist() == [ported]
-        assert packets.tcp_seq.tolist() == [7 if kept == 40 else 0]
+        assert packets.tcp_seq.tolist() == [7 if captured == 40 else 0]
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -120,10 +120,10 @@ PACKET_ENDS = [ENDS[index] for index in (2, 3, 4, 8, 9, 11)]
 def test_a_truncated_file_gives_the_packets_before_the_cut() -> None:
     for size in range(28, len(VALID) + 1):
         capture = pcap.parse(VALID[:size], where="x")
-        whole = sum(end <= size for end in PACKET_ENDS)
-        assert capture.packets.tcp_seq.tolist() == list(range(whole))
+        complete = sum(end <= size for end in PACKET_ENDS)
+        assert capture.packets.tcp_seq.tolist() == list(range(complete))
         start = max(end for end in ENDS if end <= size)
-        inside = f"ends inside the block at byte {start}, after packet {whole}"
+        inside = f"ends inside the block at byte {start}, after packet {complete}"
         assert capture.damage == (None if size == start else inside)
 
 
@@ -194,8 +194,8 @@ def test_a_file_with_too_many_definitions_is_rejected(definition: bytes) -> None
 
 
 def test_a_packet_longer_than_any_snap_length_is_damage() -> None:
-    kept = [Frame(T_NS, segment(1, size) + bytes(size), wire_bytes=1 << 20) for size in (262_104, 262_105)]
-    for frame, damaged in zip(kept, (False, True), strict=True):
+    frames = [Frame(T_NS, segment(1, size) + bytes(size), wire_bytes=1 << 20) for size in (262_104, 262_105)]
+    for frame, damaged in zip(frames, (False, True), strict=True):
         capture = pcap.parse(section() + interface() + enhanced(frame, ticks=1), where="x")
         assert (capture.frames, capture.damage is not None) == (not damaged, damaged)
 
@@ -207,10 +207,10 @@ def test_an_option_with_an_invalid_size_is_ignored() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**32 * 10**9 - 1), st.integers(0, 60), st.integers(0, 60)), max_size=12))
-def test_both_formats_give_the_same_columns(drawn: list[tuple[int, int, int]]) -> None:
+def test_both_formats_give_the_same_columns(records: list[tuple[int, int, int]]) -> None:
     frames = [
-        Frame(time_ns, segment(index, size)[: 10 + kept], wire_bytes=140)
-        for index, (time_ns, size, kept) in enumerate(drawn)
+        Frame(time_ns, segment(index, size)[: 10 + captured], wire_bytes=140)
+        for index, (time_ns, size, captured) in enumerate(records)
     ]
     for order in ("<", ">"):
         classic, blocks = (make(frames, order=order) for make in (file_bytes, file_of))

@@ -36,25 +36,25 @@ def test_chunks_of_every_size_equal_the_whole_file(tmp_path: Path, name: str, st
     """CI uses every fifth size; 5 has no common divisor with the sizes of headers and the alignment of blocks."""
     path = tmp_path / "x"
     path.write_bytes(FILES[name])
-    whole = pcap.parse(FILES[name], where=str(path))
-    assert len(whole.packets) == whole.frames == {"empty": 0, "classic, broken": 6}.get(name, whole.frames)
+    frames = pcap.parse(FILES[name], where=str(path))
+    assert len(frames.packets) == frames.frames == {"empty": 0, "classic, broken": 6}.get(name, frames.frames)
     for chunk_bytes in range(1, len(FILES[name]) + 2, step):
         chunks = list(pcap.stream(path, chunk_bytes=chunk_bytes))
-        assert rows(Packets.concatenated(chunk.packets for chunk in chunks)) == rows(whole.packets)
-        assert sum(chunk.frames for chunk in chunks) == whole.frames
-        assert [chunk.damage for chunk in chunks] == [None] * (len(chunks) - 1) + [whole.damage]
-        assert chunk_bytes > 1 or name == "empty" or len(chunks) >= whole.frames
+        assert rows(Packets.concatenated(chunk.packets for chunk in chunks)) == rows(frames.packets)
+        assert sum(chunk.frames for chunk in chunks) == frames.frames
+        assert [chunk.damage for chunk in chunks] == [None] * (len(chunks) - 1) + [frames.damage]
+        assert chunk_bytes > 1 or name == "empty" or len(chunks) >= frames.frames
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_concatenated_chunks_equal_the_whole_file(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """The number of packets per chunk is constant, or larger or smaller than in the first chunk."""
-    whole = pcap.parse(FILES[name], where="x")
+    frames = pcap.parse(FILES[name], where="x")
     for chunk_bytes in (1, 100, 200, 1000):
         monkeypatch.setattr(pcap, "CHUNK_BYTES", chunk_bytes)
         joined = pcap.parse(FILES[name], where="x")
-        assert rows(joined.packets) == rows(whole.packets)
-        assert (joined.frames, joined.damage) == (whole.frames, whole.damage)
+        assert rows(joined.packets) == rows(frames.packets)
+        assert (joined.frames, joined.damage) == (frames.frames, frames.damage)
 
 
 @pytest.mark.parametrize("name", ["nc-udp", "nc-tcp"])

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.core.model import StationSample
-from fieldkit.measure.evidence import link_samples
+from fieldkit.measure.evidence import robot_link_samples
 from tests.helpers.paths import DATA
 
 STATIONS = {
@@ -31,46 +31,52 @@ def output(name: str) -> str:
 
 @pytest.mark.parametrize("name", STATIONS)
 def test_a_station_is_parsed_from_the_output_of_each_driver(name: str) -> None:
-    assert link_samples.parse_stations(output(name)) == (STATIONS[name],)
+    assert robot_link_samples.parse_stations(output(name)) == (STATIONS[name],)
 
 
 def test_several_stations_are_parsed() -> None:
-    both = link_samples.parse_stations(output("station-iwlwifi-6") + output("station-mt7603-6"))
+    both = robot_link_samples.parse_stations(output("station-iwlwifi-6") + output("station-mt7603-6"))
     assert both == (STATIONS["station-iwlwifi-6"], STATIONS["station-mt7603-6"])
-    assert [peer.signal_dbm for peer in link_samples.parse_stations(output("stations-ap"))] == [-57.0]
-    other, peer = link_samples.parse_stations(output("stations-hwsim-ap-6"))
+    assert [peer.signal_dbm for peer in robot_link_samples.parse_stations(output("stations-ap"))] == [-57.0]
+    other, peer = robot_link_samples.parse_stations(output("stations-hwsim-ap-6"))
     assert (other.tx_packets, other.tx_failures, peer.tx_packets, peer.tx_failures) == (13, 7, 6, 0)
 
 
 def test_the_associated_access_point() -> None:
-    assert link_samples.parse_cell(output("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
-    pi = link_samples.parse_cell(output("link-station"))
+    assert robot_link_samples.parse_cell(output("link-rtl8812au")) == StationSample("xx:xx", -45.0, 216.7e6)
+    pi = robot_link_samples.parse_cell(output("link-station"))
     assert pi == StationSample("f0:99:bf:0e:86:98", -65.0, 65e6, None, 1263, 25943), "a Raspberry Pi's brcmfmac"
     assert (
-        link_samples.parse_cell(output("link-none"))
-        is link_samples.parse_cell(output("link-ibss"))
-        is link_samples.parse_cell(output("no-wifi"))
+        robot_link_samples.parse_cell(output("link-none"))
+        is robot_link_samples.parse_cell(output("link-ibss"))
+        is robot_link_samples.parse_cell(output("no-wifi"))
         is None
     )
-    assert link_samples.parse_cell(output("link-hwsim-ibss-6")) is None
+    assert robot_link_samples.parse_cell(output("link-hwsim-ibss-6")) is None
     ours = StationSample("02:00:00:00:00:00", -30.0)
-    assert link_samples.parse_cell(output("link-hwsim-3")) == replace(
+    assert robot_link_samples.parse_cell(output("link-hwsim-3")) == replace(
         ours, tx_rate_bit_s=1e6, tx_packets=21, rx_packets=3530
     )
     rates = replace(ours, tx_rate_bit_s=65e6, rx_rate_bit_s=1e6)
-    assert link_samples.parse_cell(output("link-hwsim-5")) == replace(rates, tx_packets=19, rx_packets=3320)
+    assert robot_link_samples.parse_cell(output("link-hwsim-5")) == replace(rates, tx_packets=19, rx_packets=3320)
     rates = replace(ours, tx_rate_bit_s=1e6, rx_rate_bit_s=1e6)
-    assert link_samples.parse_cell(output("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
+    assert robot_link_samples.parse_cell(output("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
 
 
 def test_only_the_channel_in_use_is_parsed() -> None:
-    assert link_samples.parse_channel(output("survey-ath9k-4")) == (-95.0, 1704490481 * 10**6, 945335227 * 10**6)
-    assert link_samples.parse_channel(output("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
-    assert link_samples.parse_channel(output("survey-hwsim-6")) == (None, None, None), (
+    assert robot_link_samples.parse_channel(output("survey-ath9k-4")) == (
+        -95.0,
+        1704490481 * 10**6,
+        945335227 * 10**6,
+    )
+    assert robot_link_samples.parse_channel(output("survey-mt7996-6")) == (-84.0, 497753 * 10**6, 104676 * 10**6)
+    assert robot_link_samples.parse_channel(output("survey-hwsim-6")) == (None, None, None), (
         "no channel is marked as in use"
     )
     assert (
-        link_samples.parse_channel(output("survey-ath10k-4")) == link_samples.parse_channel("") == (None, None, None)
+        robot_link_samples.parse_channel(output("survey-ath10k-4"))
+        == robot_link_samples.parse_channel("")
+        == (None, None, None)
     )
 
 
@@ -78,10 +84,10 @@ def test_a_line_of_proc_net_wireless_has_powers_if_they_are_valid() -> None:
     def behind(name: str) -> str:
         return output(name).splitlines()[-1].partition(":")[2].lstrip()
 
-    assert link_samples.parse_wireless(behind("wireless-iwlwifi")) == (-42.0, None)
-    assert link_samples.parse_wireless(behind("wireless-hwsim")) == (-30.0, None)
-    assert link_samples.parse_wireless(behind("wireless-percent")) == (None, None)
-    assert link_samples.parse_wireless("0000   54.  -56.  -91.        0") == (-56.0, -91.0)
+    assert robot_link_samples.parse_wireless(behind("wireless-iwlwifi")) == (-42.0, None)
+    assert robot_link_samples.parse_wireless(behind("wireless-hwsim")) == (-30.0, None)
+    assert robot_link_samples.parse_wireless(behind("wireless-percent")) == (None, None)
+    assert robot_link_samples.parse_wireless("0000   54.  -56.  -91.        0") == (-56.0, -91.0)
 
 
 @given(st.sampled_from([*STATIONS, "link-station", "survey-mt7996-6"]), st.integers(0), st.binary(max_size=20))
@@ -89,8 +95,8 @@ def test_a_changed_output_raises_no_error(name: str, at: int, with_: bytes) -> N
     complete = output(name).encode()
     at %= len(complete)
     text = (complete[:at] + with_ + complete[at + len(with_) :]).decode(errors="replace")
-    for peer in link_samples.parse_stations(text):
+    for peer in robot_link_samples.parse_stations(text):
         assert peer.signal_dbm is None or -1000 < peer.signal_dbm < 0
-    link_samples.parse_cell(text)
-    link_samples.parse_channel(text)
-    link_samples.parse_wireless(text)
+    robot_link_samples.parse_cell(text)
+    robot_link_samples.parse_channel(text)
+    robot_link_samples.parse_wireless(text)

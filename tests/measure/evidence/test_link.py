@@ -11,7 +11,7 @@ from fieldkit.core.model import LinkSample, Role, StationSample
 from fieldkit.measure.evidence import link
 
 S = 10**9
-ONE = StationSample("aa", -50.0, 65e6, 58.5e6, 10, 100, 1, 0, 0)
+SAMPLE = StationSample("aa", -50.0, 65e6, 58.5e6, 10, 100, 1, 0, 0)
 
 
 def samples(*stations: StationSample, cell: str | None = None) -> list[LinkSample]:
@@ -26,9 +26,11 @@ def measured(recorded: list[LinkSample]) -> dict[str, object]:
 
 def test_each_column_has_the_expected_value() -> None:
     recorded = samples(
-        ONE,
-        replace(ONE, signal_dbm=-70.0, tx_rate_bit_s=6.5e6, tx_packets=15, tx_retries=4),
-        replace(ONE, signal_dbm=-55.0, tx_packets=30, rx_packets=130, tx_retries=9, tx_failures=2, beacon_losses=1),
+        SAMPLE,
+        replace(SAMPLE, signal_dbm=-70.0, tx_rate_bit_s=6.5e6, tx_packets=15, tx_retries=4),
+        replace(
+            SAMPLE, signal_dbm=-55.0, tx_packets=30, rx_packets=130, tx_retries=9, tx_failures=2, beacon_losses=1
+        ),
     )
     assert measured(recorded) == {
         "signal_median_dbm": -55.0,
@@ -49,11 +51,11 @@ def test_each_column_has_the_expected_value() -> None:
 
 def test_each_column_has_a_value_or_a_reason() -> None:
     names = {column.name for column in link.COLUMNS}
-    for recorded in ([], samples(ONE), [LinkSample(0)]):
+    for recorded in ([], samples(SAMPLE), [LinkSample(0)]):
         measured_link = [link.measure(role, recorded) for role in link.ROLES]
         assert names == {name for item in measured_link for name in (*item.values, *item.missing)}
     assert "no Wi-Fi, or no iw" in link.measure(Role.SENDER, []).missing["sender_signal_min_dbm"]
-    assert "tx_retries" not in measured(samples(ONE)), "an increment needs two samples"
+    assert "tx_retries" not in measured(samples(SAMPLE)), "an increment needs two samples"
 
 
 COUNTS = st.none() | st.integers(0, 10**18)
@@ -84,10 +86,10 @@ def test_any_values_of_a_driver_give_a_table_that_can_be_read(recorded: list[Lin
 
 
 def test_an_access_points_link_has_the_station_with_the_most_packets() -> None:
-    other = replace(ONE, station="bb", signal_dbm=-80.0, tx_packets=0, rx_packets=10**6)
+    other = replace(SAMPLE, station="bb", signal_dbm=-80.0, tx_packets=0, rx_packets=10**6)
     recorded = [
-        LinkSample(0, (other, ONE)),
-        LinkSample(S, (other, replace(ONE, tx_packets=60, signal_dbm=-52.0))),
+        LinkSample(0, (other, SAMPLE)),
+        LinkSample(S, (other, replace(SAMPLE, tx_packets=60, signal_dbm=-52.0))),
         LinkSample(2 * S, (replace(other, tx_packets=40), StationSample("", -51.0))),
     ]
     assert measured(recorded)["radio_tx_packets"] == 50
@@ -99,9 +101,9 @@ def test_an_access_points_link_has_the_station_with_the_most_packets() -> None:
 
 
 def test_counters_continue_when_a_station_roams() -> None:
-    far = replace(ONE, station="bb", tx_packets=4, tx_retries=0)
+    far = replace(SAMPLE, station="bb", tx_packets=4, tx_retries=0)
     recorded = [
-        *samples(ONE, replace(ONE, tx_packets=15), cell="aa"),
+        *samples(SAMPLE, replace(SAMPLE, tx_packets=15), cell="aa"),
         LinkSample(2 * S, (far,), "bb"),
         LinkSample(3 * S, (replace(far, tx_packets=9),)),
         LinkSample(4 * S, (), "aa"),
@@ -137,11 +139,11 @@ def test_unsampled_counts_before_a_new_link_make_the_sum_unknown() -> None:
 
 
 def test_the_link_of_a_station_with_several_peers_is_its_access_point() -> None:
-    peer = replace(ONE, station="peer", tx_packets=5000)
+    peer = replace(SAMPLE, station="peer", tx_packets=5000)
     recorded = [
-        LinkSample(0, (ONE, peer)),
-        LinkSample(S, (replace(ONE, tx_packets=12),), "aa"),
-        LinkSample(2 * S, (replace(ONE, tx_packets=17), peer)),
+        LinkSample(0, (SAMPLE, peer)),
+        LinkSample(S, (replace(SAMPLE, tx_packets=12),), "aa"),
+        LinkSample(2 * S, (replace(SAMPLE, tx_packets=17), peer)),
     ]
     assert measured(recorded)["radio_tx_packets"] == 7
     assert measured(recorded)["roams"] == 0

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FIXED_ROLES, LinkSample, Role, StationSample
-from fieldkit.measure.evidence import link_samples
+from fieldkit.measure.evidence import link_samples, robot_link_samples
 from tests.helpers.paths import DATA
 
 S = 10**9
@@ -21,7 +21,7 @@ def output(name: str) -> str:
     return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8")
 
 
-OWN = (
+OWN_FRAMES = (
     f"==> 101.00 link <==\n{output('link-station')}\n==> 101.00 survey <==\n{output('survey-mt7996-6')}"
     f"==> 101.00 station <==\n{output('station-iwlwifi-6')}"
     "==> 101.20 wireless <==\n0000   54.  -56.  -256        0      0      0      0      0        0\n"
@@ -77,8 +77,8 @@ def test_an_incomplete_file_of_a_testbed_is_an_error(tmp_path: Path, damage: "ty
 
 def test_a_truncated_file_of_a_testbed_is_an_error_and_an_earlier_format_is_read(tmp_path: Path) -> None:
     samples = {Role.SENDER: [LinkSample(at_ns, noise_dbm=-95.0) for at_ns in range(3)]}
-    path, whole = tmp_path / link_samples.FILE, link_samples.text(samples)
-    count, *lines = whole.splitlines(keepends=True)
+    path, content = tmp_path / link_samples.FILE, link_samples.text(samples)
+    count, *lines = content.splitlines(keepends=True)
     path.write_text("".join([count, *lines[:-1]]), encoding="ascii")
     with pytest.raises(EvidenceError, match="has 2 lines of 3: truncated"):
         link_samples.read(path)
@@ -94,10 +94,10 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
         + output("station-iwlwifi-6").replace("3441", "3461")
     )
     if packed:
-        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode()))
+        (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN_FRAMES.encode()))
     else:
-        (tmp_path / "sender-link.txt").write_text(OWN, encoding="utf-8")
-    samples_read = link_samples.read_robot(tmp_path, Role.SENDER)
+        (tmp_path / "sender-link.txt").write_text(OWN_FRAMES, encoding="utf-8")
+    samples_read = robot_link_samples.read(tmp_path, Role.SENDER)
     at_s = [item.utc_ns / S - BOOTED_S for item in samples_read]
     assert at_s == pytest.approx([100.0, 101.0, 101.2, 101.4, 102.0], abs=0.02)
     packets = [[station.tx_packets for station in item.stations if station.station] for item in samples_read]
@@ -111,13 +111,13 @@ def test_a_robots_file_is_read_with_its_clock_and_host_states(tmp_path: Path, pa
     assert samples_read[2].stations == (StationSample("", -56.0),)
 
 
-@given(st.integers(0, len(OWN)))
+@given(st.integers(0, len(OWN_FRAMES)))
 def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
-    whole, cut = link_samples.parse(OWN), link_samples.parse(OWN[:at])
-    assert [item.utc_ns for item in cut] == [item.utc_ns for item in whole][: len(cut)]
-    for item, other in zip(cut, whole, strict=False):
+    complete, cut = robot_link_samples.parse(OWN_FRAMES), robot_link_samples.parse(OWN_FRAMES[:at])
+    assert [item.utc_ns for item in cut] == [item.utc_ns for item in complete][: len(cut)]
+    for item, other in zip(cut, complete, strict=False):
         for station in item.stations:
-            (same,) = (known for known in other.stations if known.station == station.station)
+            (same,) = (candidate for candidate in other.stations if candidate.station == station.station)
             present = {name: value for name, value in vars(station).items() if value is not None}
             later = {"tx_packets", "rx_packets", "signal_dbm", "tx_rate_bit_s"}  # `link` reports these first
             assert all(value == getattr(same, name) for name, value in present.items() if name not in later)
@@ -125,9 +125,9 @@ def test_a_truncated_file_of_a_sampler_has_the_earlier_samples(at: int) -> None:
 
 def test_without_a_clock_or_a_file_there_are_no_samples(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="does not contain the clock"):
-        link_samples.read_robot(tmp_path, Role.SENDER)
+        robot_link_samples.read(tmp_path, Role.SENDER)
     (tmp_path / "sender-before.txt").write_text(STATE, encoding="utf-8")
-    assert link_samples.read_robot(tmp_path, Role.SENDER) == ()
-    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN.encode())[:-20])
+    assert robot_link_samples.read(tmp_path, Role.SENDER) == ()
+    (tmp_path / "sender-link.txt.gz").write_bytes(gzip.compress(OWN_FRAMES.encode())[:-20])
     with pytest.raises(EvidenceError, match="cannot be read"):
-        link_samples.read_robot(tmp_path, Role.SENDER)
+        robot_link_samples.read(tmp_path, Role.SENDER)

@@ -10,7 +10,7 @@ SILENT = CaptureLog(False, None, None, None, None)
 
 
 @pytest.mark.parametrize(
-    ("name", "says"),
+    ("name", "expected"),
     [
         ("normal", CaptureLog(True, 42, 84, 0, 0)),
         ("one-packet", CaptureLog(True, 1, 4, 0, 0)),
@@ -24,8 +24,8 @@ SILENT = CaptureLog(False, None, None, None, None)
         ("../4.9/limited", CaptureLog(True, 100, 114, 0, 0)),
     ],
 )
-def test_real_logs_are_parsed(name: str, says: CaptureLog) -> None:
-    assert tcpdump_log.read(TCPDUMP / f"{name}.log") == says
+def test_real_logs_are_parsed(name: str, expected: CaptureLog) -> None:
+    assert tcpdump_log.read(TCPDUMP / f"{name}.log") == expected
 
 
 def test_drops_of_the_interface_are_parsed_if_present() -> None:

@@ -68,7 +68,7 @@ def test_the_counts_of_a_tcp_test_with_two_streams_agree(version: str) -> None:
     assert not {"iperf3_loss", "iperf3_datagrams_sent", "iperf3_jitter_s"} & values.keys()
     ports = [iperf3.parse(output(version, "tcp", end_name)).ports for end_name in ("client", "server")]
     assert len(ports[0]) == 2
-    assert ports[0] == tuple((own, other) for other, own in ports[1])
+    assert ports[0] == tuple((own_port, other) for other, own_port in ports[1])
 
 
 @pytest.mark.parametrize("version", VERSIONS)
@@ -103,9 +103,9 @@ def test_other_json_is_an_error(text: str) -> None:
 
 def test_omitted_intervals_are_not_counted() -> None:
     data = json.loads(output("3.12", "udp", "server"))
-    whole = iperf3.parse(json.dumps(data)).intervals
+    intervals = iperf3.parse(json.dumps(data)).intervals
     data["intervals"][0]["sum"]["omitted"] = True
-    assert iperf3.parse(json.dumps(data)).intervals == whole[1:]
+    assert iperf3.parse(json.dumps(data)).intervals == intervals[1:]
 
 
 def test_with_one_end_only_its_columns_have_values() -> None:

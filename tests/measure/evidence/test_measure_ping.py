@@ -231,11 +231,11 @@ def test_without_time_stamps_there_is_no_gap() -> None:
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
-def test_every_ping_has_either_a_gap_or_its_lower_bound(came: list[bool]) -> None:
-    result = answered(*((seq, 100 * seq) for seq, arrived in enumerate(came, 1) if arrived), sent=len(came))
+def test_every_ping_has_either_a_gap_or_its_lower_bound(replies: list[bool]) -> None:
+    result = answered(*((seq, 100 * seq) for seq, arrived in enumerate(replies, 1) if arrived), sent=len(replies))
     measured = ping.measure_gap(result, INTERVAL_S)
-    longest_run = max((len(list(run)) for arrived, run in groupby(came) if not arrived), default=0)
-    if len(came) == 1 and came[0]:
+    longest_run = max((len(list(run)) for arrived, run in groupby(replies) if not arrived), default=0)
+    if len(replies) == 1 and replies[0]:
         assert not measured.values
     else:
         (lost,) = (value for name, value in measured.values.items() if "lost" in name)

@@ -60,8 +60,8 @@ def test_a_clock_in_whole_seconds_shows_larger_steps() -> None:
 
 
 def test_a_clock_set_during_the_reading_is_detected() -> None:
-    torn = parsed("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
-    assert clock.step_description(torn, parsed(BUSYBOX)) == "its clock was set while it was read"
+    inconsistent = parsed("1.00 50.000000000 1.00\n1.00 70.000000000 1.00\n")
+    assert clock.step_description(inconsistent, parsed(BUSYBOX)) == "its clock was set while it was read"
 
 
 @pytest.mark.parametrize("text", ["", "1.0 2 3.0", "nothing", "1.00 1795320484.07 1.00", "12611.27  12611.27"])

@@ -14,11 +14,11 @@ from tests.helpers.measures import measure
 
 S = 10**9
 ENDS = (Role.SENDER, Role.RECEIVER)
-HERE = TrackPoint(5 * S, Role.SENDER, (1.0, 0.0, 0.2))
-THERE = TrackPoint(5 * S, Role.RECEIVER, (4.0, 4.0, 0.2))
+SENDER_POINT = TrackPoint(5 * S, Role.SENDER, (1.0, 0.0, 0.2))
+RECEIVER_POINT = TrackPoint(5 * S, Role.RECEIVER, (4.0, 4.0, 0.2))
 AWAY = (
-    HERE,
-    THERE,
+    SENDER_POINT,
+    RECEIVER_POINT,
     TrackPoint(10 * S, Role.SENDER, (1.0, 0.0, 0.2), (-3.0, 0.0, 0.0)),
     TrackPoint(11 * S, Role.SENDER, (-4.0, 4.0, 0.2), (-3.0, 0.0, 4.0)),
     TrackPoint(12 * S, Role.RELAY, (0.0, 0.0, 0.2)),
@@ -51,7 +51,7 @@ def test_a_single_time_has_a_distance_and_times_before_the_track_have_none() -> 
     assert track.separation_between(AWAY, *ENDS, 11 * S, 11 * S) == track.Separation(8.0, 8.0, 8.0, 8.0, 5.0, 5.0)
     assert track.separation_between(AWAY, *ENDS, 13 * S, 14 * S) is None
     assert track.separation_between(AWAY, *ENDS, 1 * S, 14 * S) is None
-    assert track.separation_between((HERE,), *ENDS, 6 * S, 14 * S) is None
+    assert track.separation_between((SENDER_POINT,), *ENDS, 6 * S, 14 * S) is None
 
 
 def test_distances_change_with_both_robots_but_not_with_the_relay() -> None:

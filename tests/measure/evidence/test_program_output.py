@@ -27,7 +27,7 @@ def output(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("where", "unit", "value"),
+    ("path", "unit", "value"),
     [
         ("battery.cells[0].mV", "mV", 3712.0),
         ("battery.cells[-1].mV", "count", 3698),
@@ -36,8 +36,8 @@ def output(tmp_path: Path) -> Path:
         ("mode", "text", "auto"),
     ],
 )
-def test_a_path_finds_a_value_of_its_column(output: Path, where: str, unit: str, value: object) -> None:
-    extracted = program_output.value(column(unit), program_output.at_path(output, where))
+def test_a_path_finds_a_value_of_its_column(output: Path, path: str, unit: str, value: object) -> None:
+    extracted = program_output.value(column(unit), program_output.at_path(output, path))
     assert (extracted, type(extracted)) == (value, type(value))
 
 
@@ -143,10 +143,10 @@ def test_any_extracted_value_is_a_valid_cell_or_an_error(extracted: object, unit
         assert value.isprintable()
 
 
-@pytest.mark.parametrize("where", ["(" * 5000 + "a" + ")" * 5000, "a" + "|a" * 5000])
-def test_a_path_that_is_nested_too_deeply_is_an_error(output: Path, where: str) -> None:
-    if reason := program_output.path_error(where):
+@pytest.mark.parametrize("path", ["(" * 5000 + "a" + ")" * 5000, "a" + "|a" * 5000])
+def test_a_path_that_is_nested_too_deeply_is_an_error(output: Path, path: str) -> None:
+    if reason := program_output.path_error(path):
         assert reason == "it is nested too deeply"
         return
     with pytest.raises(EvidenceError, match="nested too deeply"):
-        program_output.at_path(output, where)
+        program_output.at_path(output, path)

@@ -12,10 +12,10 @@ from fieldkit.measure.evidence import reading
 @pytest.mark.parametrize(("change", "same"), [(b"", True), (b"x", False)])
 @pytest.mark.parametrize("at", [0, 1 << 20, (3 << 20) - 1])
 def test_files_are_compared_byte_for_byte(tmp_path: Path, at: int, change: bytes, same: bool) -> None:
-    whole = bytearray(3 << 20)
-    (tmp_path / "a").write_bytes(whole)
-    whole[at : at + len(change)] = change
-    (tmp_path / "b").write_bytes(whole)
+    content = bytearray(3 << 20)
+    (tmp_path / "a").write_bytes(content)
+    content[at : at + len(change)] = change
+    (tmp_path / "b").write_bytes(content)
     assert reading.size(tmp_path / "a") == reading.size(tmp_path / "b") == 3 << 20
     assert reading.have_equal_bytes(tmp_path, "a", "b") is same
 

@@ -31,7 +31,7 @@ AWAY = [odometry(BEGAN_NS + n * S, float(n), 0.0) for n in range(5)]
 ODOMETRY = PositionSource(
     file="track.bag", topic="/where", start=(10.0, 0.0, 0.0), heading_rad=0.0, began_utc_ns=BEGAN_NS, gap_s=1.5
 )
-HERE = PositionSource(place=(0.0, 0.0, 0.0))
+ORIGIN_SOURCE = PositionSource(place=(0.0, 0.0, 0.0))
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_sources_of_the_trial_precede_those_of_the_attempt_and_of_the_testbed(at
     (attempt / track.FILE).write_text(track.text(ORACLE), encoding="ascii")
     assert mean_m(attempt) == pytest.approx(100)
     write_bag(attempt, AWAY)
-    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
     assert mean_m(attempt) == pytest.approx(12)
     assert recorded_positions.sources_text(AttemptEvidence(attempt)) == "sender as placed, receiver /where"
     trial = attempt.parent.parent
@@ -105,7 +105,7 @@ def test_times_of_robots_are_converted_to_one_clock(
         heading_rad=0.0,
         began_utc_ns=BEGAN_NS - round(1e9 * clocks.get(RECEIVER, 0.0)) * (not wrong_ns),
     )
-    write_sources(attempt, {SENDER: HERE, RECEIVER: start}, clocks)
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: start}, clocks)
     begin_s, end_s = (1.0 + wrong_ns / 1e9, 3.0 + wrong_ns / 1e9)
     assert mean_m(attempt, begin_s, end_s) == pytest.approx(metres)
     assert recorded_positions.clock_error_s(AttemptEvidence(attempt)) == (
@@ -114,30 +114,30 @@ def test_times_of_robots_are_converted_to_one_clock(
 
 
 @pytest.mark.parametrize(
-    ("begin_s", "end_s", "why"),
+    ("begin_s", "end_s", "reason"),
     [
         (-1, 2, "the positions of the receiver from /where begin 1.0 s too late"),
         (2, 6, "the positions of the receiver from /where end 2.0 s too early"),
     ],
 )
 def test_times_that_are_not_covered_are_missing_with_a_reason(
-    attempt: Path, begin_s: float, end_s: float, why: str
+    attempt: Path, begin_s: float, end_s: float, reason: str
 ) -> None:
     write_bag(attempt, AWAY)
-    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
-    assert mean_m(attempt, begin_s, end_s) == why
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
+    assert mean_m(attempt, begin_s, end_s) == reason
 
 
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
     write_bag(attempt, AWAY[:2] + AWAY[3:])
-    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
-    why = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
-    assert mean_m(attempt) == why
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
+    reason = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
+    assert mean_m(attempt) == reason
 
 
 def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt: Path) -> None:
     write_bag(attempt, AWAY[:2] + AWAY[3:])
-    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY}, {SENDER: 0.25})
     distances = position_columns.distances_m(AttemptEvidence(attempt), ENDS)
     begin_ns = BEGAN_NS + S // 4
     in_gap = (begin_ns + S + 1, None)
@@ -151,7 +151,7 @@ def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
     write_sources(attempt, {RECEIVER: ODOMETRY})
     assert mean_m(attempt) == "no source has the position of the sender"
     (attempt / "track.bag").unlink()
-    write_sources(attempt, {SENDER: HERE, RECEIVER: ODOMETRY})
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
     assert "cannot be read" in str(mean_m(attempt))
 
 
@@ -160,7 +160,7 @@ def test_a_tracker_and_a_fixed_place_in_its_frame(attempt: Path) -> None:
     tracker = PositionSource(file="track.bag", topic="/where")
     write_sources(attempt, {SENDER: PositionSource(place=(0.0, 2.0, 0.0), frame="frame map"), RECEIVER: tracker})
     assert mean_m(attempt, 2.0, 2.0) == pytest.approx(3)
-    write_sources(attempt, {SENDER: HERE, RECEIVER: tracker})
+    write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: tracker})
     assert (
         mean_m(attempt)
         == "the positions of the robots are in different frames: the sender as placed, the receiver frame map"

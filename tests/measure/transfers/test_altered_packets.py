@@ -28,17 +28,17 @@ CHANGED = "they were changed on the path, or the sender's capture is incomplete"
 
 def _put(at: int, form: str, value: int) -> Change:
     def change(packet: bytes) -> bytes:
-        whole = bytearray(packet)
-        struct.pack_into(form, whole, at, value)
-        return bytes(whole)
+        changed = bytearray(packet)
+        struct.pack_into(form, changed, at, value)
+        return bytes(changed)
 
     return change
 
 
-def _added(at: int, form: str, more: int) -> Change:
+def _added(at: int, form: str, added: int) -> Change:
     def change(packet: bytes) -> bytes:
         (old,) = struct.unpack_from(form, packet, at)
-        return _put(at, form, (old + more) % 256 ** struct.calcsize(form))(packet)
+        return _put(at, form, (old + added) % 256 ** struct.calcsize(form))(packet)
 
     return change
 
@@ -72,7 +72,7 @@ def _tcp(change: Change, *, stamped: bool = True) -> tuple[list[Frame], list[Fra
     return truth.sender, [Frame(frame.time_ns, change(frame.data), frame.wire_bytes) for frame in truth.receiver]
 
 
-def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str | None:
+def _reason(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str | None:
     sender, receiver = map(packets, captures)
     return altered_packets.incomparability_reason(sender, receiver, transfer(protocol))
 
@@ -80,10 +80,10 @@ def _why(captures: tuple[list[Frame], list[Frame]], protocol: Protocol) -> str |
 @pytest.mark.parametrize("protocol", Protocol)
 @pytest.mark.parametrize("what", WAYS)
 def test_a_translated_address_or_port_is_reported(what: str, protocol: Protocol) -> None:
-    change, why = WAYS[what]
-    reason = _why(_udp(change) if protocol is Protocol.UDP else _tcp(change), protocol)
+    change, expected_reason = WAYS[what]
+    reason = _reason(_udp(change) if protocol is Protocol.UDP else _tcp(change), protocol)
     assert reason
-    assert reason.endswith(why)
+    assert reason.endswith(expected_reason)
     assert f"as {SENDER}:40000 > {RECEIVER}:{PORT} and reached the receiver as " in reason
     assert not what.endswith("port") or ":55555 > " in reason
 
@@ -92,13 +92,13 @@ def test_a_translated_address_or_port_is_reported(what: str, protocol: Protocol)
     "change", [_added(24, ">I", 1 << 31), _added(44, ">I", 77_777)], ids=["sequence numbers", "time stamps"]
 )
 def test_changed_sequence_numbers_are_reported(change: Change) -> None:
-    reason = _why(_tcp(change), Protocol.TCP)
+    reason = _reason(_tcp(change), Protocol.TCP)
     assert reason
     assert reason.endswith(CHANGED)
 
 
 def test_changed_ids_are_reported() -> None:
-    reason = _why(_udp(_added(4, ">H", 30_000)), Protocol.UDP)
+    reason = _reason(_udp(_added(4, ">H", 30_000)), Protocol.UDP)
     assert reason
     assert reason.endswith(CHANGED)
 
@@ -108,14 +108,14 @@ def test_a_port_that_changes_during_the_transfer_is_reported() -> None:
     sent, received = _udp(lambda packet: packet)
     half = len(received) // 2
     later = [Frame(frame.time_ns, _port(frame.data), 2000) for frame in received[half:]]
-    reason = _why((sent, [*received[:half], *later]), Protocol.UDP)
+    reason = _reason((sent, [*received[:half], *later]), Protocol.UDP)
     assert reason
     assert reason.endswith(TRANSLATED)
 
 
 def test_packets_missing_in_the_senders_capture_are_reported() -> None:
     sent, received = _udp(lambda packet: packet)
-    assert str(_why((sent[60:], received), Protocol.UDP)).endswith(CHANGED)
+    assert str(_reason((sent[60:], received), Protocol.UDP)).endswith(CHANGED)
 
 
 @pytest.mark.parametrize("protocol", Protocol)
@@ -123,29 +123,33 @@ def test_packets_captured_on_two_interfaces_are_reported(protocol: Protocol) -> 
     """As with `-i any` if packets pass a bridge or a VLAN: they would appear as lost or retransmitted."""
     sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
     twice = [packet for frame in sent for packet in (frame, replace(frame, time_ns=frame.time_ns + 5000))]
-    reason = _why((twice, received), protocol)
+    reason = _reason((twice, received), protocol)
     assert reason
     assert "in the sender's capture occur twice" in reason
-    assert _why((sent, [*received, *received]), protocol) is None, "a link may duplicate packets"
+    assert _reason((sent, [*received, *received]), protocol) is None, "a link may duplicate packets"
 
 
 @pytest.mark.parametrize("end", ["sender", "receiver"])
 @pytest.mark.parametrize(
-    ("protocol", "kept"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
+    ("protocol", "snap_length"), [(Protocol.UDP, 2), (Protocol.UDP, 4), (Protocol.TCP, 2), (Protocol.TCP, 8)]
 )
-def test_a_snap_length_within_the_headers_does_not_appear_as_loss(protocol: Protocol, kept: int, end: str) -> None:
+def test_a_snap_length_within_the_headers_does_not_appear_as_loss(
+    protocol: Protocol, snap_length: int, end: str
+) -> None:
     """Without ports everything appears lost or never sent; without sequence numbers TCP has no payload."""
     sent, received = _udp(lambda packet: packet) if protocol is Protocol.UDP else _tcp(lambda packet: packet)
-    cut = [replace(packet, data=packet.data[: 20 + kept]) for packet in (sent if end == "sender" else received)]
-    reason = _why((cut, received) if end == "sender" else (sent, cut), protocol)
+    cut = [
+        replace(packet, data=packet.data[: 20 + snap_length]) for packet in (sent if end == "sender" else received)
+    ]
+    reason = _reason((cut, received) if end == "sender" else (sent, cut), protocol)
     assert reason
     assert f"in the {end}'s capture were truncated in their TCP or UDP header" in reason
 
 
 def test_similar_traffic_is_not_mistaken_for_a_translation() -> None:
     sent, received = _udp(lambda packet: packet)
-    stranger = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
-    of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in stranger]
+    other_stream = timed([packet for number in range(36) for packet in datagram(900 + number, 700, sport=9)])
+    of_another = [Frame(frame.time_ns, source(frame.data), 2000) for frame in other_stream]
     translated_here = [Frame(frame.time_ns, target(frame.data), 2000) for frame in received]
     for name, captures in {
         "nothing": (sent, received),
@@ -157,7 +161,7 @@ def test_similar_traffic_is_not_mistaken_for_a_translation() -> None:
         "one of something earlier, and all was lost": (sent, timed(datagram(999, 10, sport=9))),
         "the transfer was not captured": ([], received),
     }.items():
-        assert _why(captures, Protocol.UDP) is None, name
+        assert _reason(captures, Protocol.UDP) is None, name
 
 
 @given(st.integers(0, 2**32), st.sampled_from((1, 40)), st.booleans(), st.booleans())
@@ -167,7 +171,7 @@ def test_losses_copies_and_reordering_are_not_mistaken_for_a_translation(
 ) -> None:
     link = Link(seed, loss=0.3, copied=0.1, late=0.1)
     truth = links.tcp(link, 60, ids=ids, offload=offload, again=0.1, stamped=stamped)
-    assert _why((truth.sender, truth.receiver), Protocol.TCP) is None
+    assert _reason((truth.sender, truth.receiver), Protocol.TCP) is None
 
 
 @pytest.mark.parametrize("what", WAYS)

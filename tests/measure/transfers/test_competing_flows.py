@@ -61,17 +61,17 @@ class Flow:
         content = self.content
         for number, start in enumerate(range(0, len(content), 8192)):
             payload = content[start : start + 8192]
-            whole = struct.pack(">HHHH", 30_000 + self.port, self.port, len(payload) + 8, 0) + payload
+            datagram = struct.pack(">HHHH", 30_000 + self.port, self.port, len(payload) + 8, 0) + payload
             ends = {"src": RECEIVER, "dst": SENDER} if self.back else {}
-            cuts = range(0, len(whole), MTU_BYTES)
+            cuts = range(0, len(datagram), MTU_BYTES)
             yield [
                 ipv4(
-                    whole[at : at + MTU_BYTES][:100],
+                    datagram[at : at + MTU_BYTES][:100],
                     protocol=17,
-                    size=len(whole[at : at + MTU_BYTES]),
+                    size=len(datagram[at : at + MTU_BYTES]),
                     ip_id=self.first_id + number,
                     offset=at,
-                    more=at + MTU_BYTES < len(whole),
+                    more=at + MTU_BYTES < len(datagram),
                     **ends,
                 )
                 for at in cuts

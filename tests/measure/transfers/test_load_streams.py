@@ -55,11 +55,11 @@ def test_consecutive_lost_datagrams_are_a_stall() -> None:
 
 
 def test_stalls_of_parallel_streams_are_counted_separately() -> None:
-    both = [control(), data(), data(40001, range(200, 300))]
+    packets = [control(), data(), data(40001, range(200, 300))]
     two = replace(UDP, count=2)
-    assert measured(two, both) == {"stall_s": pytest.approx(1.0), "stalls": 2}
+    assert measured(two, packets) == {"stall_s": pytest.approx(1.0), "stalls": 2}
     named = replace(UDP, ports=((40000, PORT),))
-    assert measured(named, both) == {"stall_s": pytest.approx(0.5), "stalls": 1}
+    assert measured(named, packets) == {"stall_s": pytest.approx(0.5), "stalls": 1}
 
 
 def test_streams_that_cannot_be_distinguished_have_no_stall() -> None:
@@ -67,8 +67,8 @@ def test_streams_that_cannot_be_distinguished_have_no_stall() -> None:
 
 
 def test_a_test_longer_than_its_arrivals_has_a_lower_bound() -> None:
-    lasts = replace(UDP, expected=replace(EVERY, lasts_s=10.0))
-    assert measured(lasts, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
+    limited = replace(UDP, expected=replace(EVERY, lasts_s=10.0))
+    assert measured(limited, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
 
 
 def tcp_data(gap_ns: int) -> Stream:

@@ -64,10 +64,10 @@ def traffic(draw: st.DrawFn, largest: int = 40, smallest: int = 1) -> tuple[Floa
 @given(offsets_s, drifts, traffic(), traffic())
 @settings(max_examples=examples(200))
 def test_offset_and_skew_are_within_their_errors(
-    offset_s: float, drift: float, there: tuple[Floats, Floats], back: tuple[Floats, Floats]
+    offset_s: float, drift: float, forward_delays: tuple[Floats, Floats], back: tuple[Floats, Floats]
 ) -> None:
     world = World(offset_s, drift)
-    forward, reverse = world.forward(*there), world.reverse(*back)
+    forward, reverse = world.forward(*forward_delays), world.reverse(*back)
     clocks = estimate(forward, reverse)
     assert clocks is not None, "the truth is a line that is possible"
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
@@ -80,11 +80,11 @@ def test_offset_and_skew_are_within_their_errors(
 @given(offsets_s, drifts, traffic(7, smallest=2), traffic(7, smallest=2))
 @settings(max_examples=30, deadline=None)
 def test_the_error_is_that_of_linear_programs_that_each_leave_out_one_packet(
-    offset_s: float, drift: float, there: tuple[Floats, Floats], back: tuple[Floats, Floats]
+    offset_s: float, drift: float, forward_delays: tuple[Floats, Floats], back: tuple[Floats, Floats]
 ) -> None:
     """The farthest line that is possible without one of the packets has the distance of the error."""
     world = World(offset_s, drift)
-    forward, reverse = world.forward(*there), world.reverse(*back)
+    forward, reverse = world.forward(*forward_delays), world.reverse(*back)
     clocks = estimate(forward, reverse)
     assert clocks is not None
     at_ns = np.array([forward.receiver_ns.min()])
@@ -114,10 +114,14 @@ def test_the_error_is_that_of_linear_programs_that_each_leave_out_one_packet(
 @given(offsets_s, drifts, traffic(smallest=2), traffic(smallest=2), st.data())
 @settings(max_examples=examples(300), deadline=None)
 def test_the_truth_is_within_the_error_with_one_wrong_time_of_any_size(
-    offset_s: float, drift: float, there: tuple[Floats, Floats], back: tuple[Floats, Floats], data: st.DataObject
+    offset_s: float,
+    drift: float,
+    forward_delays: tuple[Floats, Floats],
+    back: tuple[Floats, Floats],
+    data: st.DataObject,
 ) -> None:
     world = World(offset_s, drift)
-    forward, reverse = world.forward(*there), world.reverse(*back)
+    forward, reverse = world.forward(*forward_delays), world.reverse(*back)
     changed = data.draw(st.sampled_from([stamps for pairs in (forward, reverse) for stamps in _stamps(pairs)]))
     index = data.draw(st.integers(0, len(changed) - 1))
     changed[index] += data.draw(st.integers(-5_000, 5_000) | st.integers(-100_000, 100_000)) * 1000
@@ -144,11 +148,11 @@ def test_one_wrong_time_neither_shifts_the_offset_nor_narrows_its_error(
     """Half of a round trip of 10 ms, and 5 ms of drift in the 10 s from the middle to either end."""
     world = World(3.0, 0.0)
     sent_s, delay_s = np.linspace(0, 20, 21), np.full(21, 0.005)
-    both = world.forward(sent_s, delay_s), world.reverse(sent_s, delay_s)
-    _stamps(both[direction])[end][10] += wrong_ns
-    clocks = estimate(*both)
+    delays = world.forward(sent_s, delay_s), world.reverse(sent_s, delay_s)
+    _stamps(delays[direction])[end][10] += wrong_ns
+    clocks = estimate(*delays)
     assert clocks is not None
-    at_ns = both[0].receiver_ns
+    at_ns = delays[0].receiver_ns
     assert np.abs(_ahead_s(clocks, at_ns) - 3.0).max() <= 2e-6
     assert clocks.error_s(np.array([clocks.middle_ns])) >= 0.005
 

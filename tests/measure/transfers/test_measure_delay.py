@@ -112,9 +112,11 @@ def _exchange(
     left_ms: list[float], delay_ms: list[float], wrong: Wrong, *, back_ms: float = 1.0
 ) -> tuple[Packets, Packets]:
     """A UDP transfer of unfragmented datagrams with ten pings after it; the sender has the true clock."""
-    there = [(ms, extra, datagram(n, 1000)[0]) for n, (ms, extra) in enumerate(zip(left_ms, delay_ms, strict=True))]
+    sent_packets = [
+        (ms, extra, datagram(n, 1000)[0]) for n, (ms, extra) in enumerate(zip(left_ms, delay_ms, strict=True))
+    ]
     asked_ms = [max(left_ms) + 10 * n for n in range(1, 11)]
-    there += [(ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=60000 + n)) for n, ms in enumerate(asked_ms)]
+    sent_packets += [(ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=60000 + n)) for n, ms in enumerate(asked_ms)]
     back = [
         (ms + 2 * back_ms, back_ms, ipv4(bytes(8), protocol=1, ip_id=n, src=RECEIVER, dst=SENDER))
         for n, ms in enumerate(asked_ms)
@@ -125,8 +127,10 @@ def _exchange(
             Frame(START_NS + round(ms * MILLISECOND_NS), data) for ms, data in sorted(items, key=lambda item: item[0])
         )
 
-    sender = capture([(ms, data) for ms, _, data in there] + [(ms + extra, data) for ms, extra, data in back])
-    receiver = capture([(ms + extra, data) for ms, extra, data in there] + [(ms, data) for ms, _, data in back])
+    sender = capture([(ms, data) for ms, _, data in sent_packets] + [(ms + extra, data) for ms, extra, data in back])
+    receiver = capture(
+        [(ms + extra, data) for ms, extra, data in sent_packets] + [(ms, data) for ms, _, data in back]
+    )
     return sender, _on_another_clock(receiver, *wrong)
 
 
@@ -241,12 +245,12 @@ def test_with_offload_a_tcp_frame_arrives_with_its_last_byte() -> None:
     back = segment(8, 0, back=True)
     arrivals = [(1, sent[0][1]), *((110 + 5 * n, segment(isn + 1 + 1000 * n, 1000)) for n in range(3))]
     arrivals += [(150, segment(isn + 3001, 1000)), (200, sent[-1][1])]
-    bare = segment(isn + 1, 0)
+    ack = segment(isn + 1, 0)
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames)
         for frames in (
-            [*sent, (3, back), (4, bare), (6, segment(9, 0, back=True))],
-            [*arrivals, (2, back), (5, bare), (5, segment(9, 0, back=True))],
+            [*sent, (3, back), (4, ack), (6, segment(9, 0, back=True))],
+            [*arrivals, (2, back), (5, ack), (5, segment(9, 0, back=True))],
         )
     )
     measures = _measured(sender, receiver, transfer(Protocol.TCP))
@@ -288,11 +292,11 @@ WITHHELD: dict[str, Change] = {
 }
 
 
-@pytest.mark.parametrize("why", WITHHELD)
-def test_unknown_values_are_empty_with_a_reason(why: str) -> None:
+@pytest.mark.parametrize("reason", WITHHELD)
+def test_unknown_values_are_empty_with_a_reason(reason: str) -> None:
     sender, receiver = _exchange([0.0, 1.0, 2.0], [1.0, 1.0, 1.5], (12.0, 0))
-    measures = _measured(*WITHHELD[why](sender, receiver), transfer(Protocol.UDP))
-    assert measures.one_way_withheld == why
+    measures = _measured(*WITHHELD[reason](sender, receiver), transfer(Protocol.UDP))
+    assert measures.one_way_withheld == reason
     assert (
         measures.one_way_min_s
         is measures.one_way_median_s
@@ -300,7 +304,7 @@ def test_unknown_values_are_empty_with_a_reason(why: str) -> None:
         is measures.one_way_p95_s
         is None
     )
-    uncertain = why.startswith("the error")
+    uncertain = reason.startswith("the error")
     assert (measures.one_way_error_s is not None) == (measures.clock_offset_s is not None) == uncertain
     # Values that need no common clock are present if packets and times are and both clocks are steady.
-    assert (measures.jitter_s is None) == (why.startswith(("no packet of", "no offset")) or "times" in why)
+    assert (measures.jitter_s is None) == (reason.startswith(("no packet of", "no offset")) or "times" in reason)

@@ -79,9 +79,9 @@ def test_streams_are_summed() -> None:
         Frame(frame.time_ns, datagram(20_000 + index, PAYLOAD_BYTES, sport=50_000)[0])
         for index, frame in enumerate(udp_frames(400)[1:401])
     ]
-    both = udp_frames(400) + second
+    all_frames = udp_frames(400) + second
     flow = replace(UDP, ports=((40000, PORT), (50000, PORT)))
-    assert measured(flow, both, both)["iperf3_captured_bit_s"] == 2 * RATE
+    assert measured(flow, all_frames, all_frames)["iperf3_captured_bit_s"] == 2 * RATE
 
 
 def test_fragmented_datagrams_have_no_loss() -> None:

@@ -41,9 +41,9 @@ def of_udp(sent: list[Frame], received: list[Frame]) -> Rates:
 
 
 def of_tcp(sent: list[Frame], received: list[Frame]) -> Rates:
-    here, there, which = packets(sent), packets(received), transfer(Protocol.TCP)
-    crossing = tcp.match_transfer(here, there, which)
-    return rates.of_tcp(crossing, there, which, tcp.count(crossing))
+    sent_packets, received_packets, which = packets(sent), packets(received), transfer(Protocol.TCP)
+    crossing = tcp.match_transfer(sent_packets, received_packets, which)
+    return rates.of_tcp(crossing, received_packets, which, tcp.count(crossing))
 
 
 @given(sizes)
@@ -88,7 +88,7 @@ def stream(total: int, *, joined: int = 1, again: Sequence[int] = ()) -> list[by
     return [segment(ISN, 0, flags=SYN, mss=1460), *data]
 
 
-def closed(received: list[Frame], after_ns: int, acked: int) -> list[Frame]:
+def with_fin(received: list[Frame], after_ns: int, acked: int) -> list[Frame]:
     """The receiver's FIN `after_ns` after the last frame, acknowledging `acked` bytes and the sender's FIN."""
     at_ns = received[-1].time_ns + after_ns
     return [*received, Frame(at_ns, segment(77, 0, flags=FIN_ACK, ack=ISN + 1 + acked + 1, back=True))]
@@ -99,7 +99,7 @@ def test_tcp_ends_when_the_receiver_closes(total: int, after_ns: int) -> None:
     """In most examples the sequence numbers wrap."""
     sent = stream(total)
     received = through_link(sent)
-    result = of_tcp(timed(sent), closed(received, after_ns, total))
+    result = of_tcp(timed(sent), with_fin(received, after_ns, total))
     assert result.throughput_bit_s == pytest.approx(1e6)
     completion_s = (received[-1].time_ns + after_ns - received[0].time_ns) / 1e9
     assert result.completion_s == pytest.approx(completion_s)
@@ -109,7 +109,7 @@ def test_tcp_ends_when_the_receiver_closes(total: int, after_ns: int) -> None:
 def test_retransmissions_count_in_throughput_but_not_in_goodput() -> None:
     total, sent = 10 * SEGMENT, stream(10 * SEGMENT, again=[3, 3, 4])
     received = through_link(sent)
-    result = of_tcp(timed(sent), closed(received, 0, total))
+    result = of_tcp(timed(sent), with_fin(received, 0, total))
     assert result.throughput_bit_s == pytest.approx(1e6)
     took_s = (received[-1].time_ns - received[0].time_ns) / 1e9
     assert result.values(total)["goodput_bit_s"] == pytest.approx(8 * total / took_s)

@@ -5,7 +5,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.measure.captures import pcap
+from fieldkit.measure.captures import classic_pcap, pcap
 from tests.helpers.captures import Frame, file_bytes, segment
 
 runs = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 200)), min_size=1, max_size=12)
@@ -24,15 +24,15 @@ def records(data: bytes) -> list[int]:
 def test_runs_of_any_lengths(some: list[tuple[int, int]], chunk_bytes: int) -> None:
     frames = [Frame(0, bytes(1 + size)) for size, count in some for _ in range(count)]
     data = file_bytes(frames)
-    chunks = list(pcap.classic_chunks(data, where="test", chunk_bytes=chunk_bytes))
+    chunks = list(classic_pcap.chunks(data, where="test", chunk_bytes=chunk_bytes))
     assert [at for chunk in chunks for at in chunk.frames.start.tolist()] == records(data)
     assert [chunk.damage for chunk in chunks] == [None] * len(chunks)
 
 
 @given(st.integers(1, 5_000))
 def test_a_run_cut_anywhere_gives_what_is_before_the_cut(cut: int) -> None:
-    whole = file_bytes([Frame(index, segment(index, 0)) for index in range(100)])
-    data = whole[: max(24, len(whole) - cut)]
+    content = file_bytes([Frame(index, segment(index, 0)) for index in range(100)])
+    data = content[: max(24, len(content) - cut)]
     capture = pcap.parse(data, where="test")
     per_packet = len(segment(0, 0)) + 16
     assert len(capture.packets) == (len(data) - 24) // per_packet

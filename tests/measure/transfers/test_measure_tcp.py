@@ -38,9 +38,9 @@ def _retransmitted(sent: Iterable[Range]) -> int:
     sent_before: set[int] = set()
     repeated = 0
     for start, size in sent:
-        own = set(range(start, start + size))
-        repeated += bool(own & sent_before)
-        sent_before |= own
+        sequence_numbers = set(range(start, start + size))
+        repeated += bool(sequence_numbers & sent_before)
+        sent_before |= sequence_numbers
     return repeated
 
 
@@ -101,14 +101,14 @@ def test_offload_alone_is_not_loss_retransmission_or_reordering(
     cuts = sorted(data.draw(st.sets(st.integers(1, end - 1), max_size=9))) if end > 1 else []
     sent = [(sum(sizes[:at]), size) for at, size in enumerate(sizes)]
     received = [(start, stop - start) for start, stop in zip([0, *cuts], [*cuts, end], strict=True)]
-    both = [
+    both_captures = [
         [
             Frame(10**18 + number, segment(isn, 0, flags=SYN, mss=1460)),
             *(Frame(10**18 + number, _lengthless(isn + 1 + start, size), 40 + size) for start, size in ranges),
         ]
         for number, ranges in enumerate((sent, received))
     ]
-    counts = tcp.count(tcp.match_transfer(packets(both[0]), packets(both[1]), TCP_TRANSFER))
+    counts = tcp.count(tcp.match_transfer(packets(both_captures[0]), packets(both_captures[1]), TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes, counts.lost_bytes) == (end, end, end, 0)
     assert (counts.retransmitted_frames, counts.spurious_frames, counts.reordered_frames) == (0, 0, 0)
     assert (counts.duplicated_bytes, counts.ambiguous_frames) == (0, 0)
@@ -117,17 +117,17 @@ def test_offload_alone_is_not_loss_retransmission_or_reordering(
 
 def _lengthless(seq: int, payload_bytes: int) -> bytes:
     """A frame whose IP length is 0, as above 64 KiB, so that only the length on the wire is known."""
-    whole = segment(seq, payload_bytes)
-    return whole[:2] + bytes(2) + whole[4:]
+    packet = segment(seq, payload_bytes)
+    return packet[:2] + bytes(2) + packet[4:]
 
 
 def test_a_retransmission_is_spurious_only_if_an_earlier_copy_arrived() -> None:
     sent = [segment(0, 0, flags=SYN, ip_id=1), *(segment(1, 100, ip_id=number) for number in (2, 3, 4))]
-    for kept, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
+    for arrived, spurious in (((1,), 2), ((2,), 1), ((3,), 0), ((1, 2, 3), 2), ((), 0)):
         counts = tcp.count(
-            tcp.match_transfer(packets(timed(sent)), packets(timed([sent[at] for at in kept])), TCP_TRANSFER)
+            tcp.match_transfer(packets(timed(sent)), packets(timed([sent[at] for at in arrived])), TCP_TRANSFER)
         )
-        assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), kept
+        assert (counts.retransmitted_frames, counts.spurious_frames) == (2, spurious), arrived
 
 
 def test_without_ids_time_shows_which_copy_of_a_byte_arrived() -> None:
@@ -143,14 +143,14 @@ def test_without_ids_time_shows_which_copy_of_a_byte_arrived() -> None:
 
 
 def test_captures_that_started_late_or_ended_early() -> None:
-    whole = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
-    late_receiver = tcp.count(tcp.match_transfer(packets(whole), packets(whole[4:-2]), TCP_TRANSFER))
+    frames = timed(_frames(2**32 - 1500, [(start, 1000) for start in range(0, 10_000, 1000)]))
+    late_receiver = tcp.count(tcp.match_transfer(packets(frames), packets(frames[4:-2]), TCP_TRANSFER))
     assert (late_receiver.received_bytes, late_receiver.lost_bytes) == (5000, 5000)
-    early_sender = tcp.count(tcp.match_transfer(packets(whole[:5]), packets(whole), TCP_TRANSFER))
+    early_sender = tcp.count(tcp.match_transfer(packets(frames[:5]), packets(frames), TCP_TRANSFER))
     assert (early_sender.sent_bytes, early_sender.received_bytes, early_sender.lost_bytes) == (4000, 4000, 0)
     assert early_sender.duplicated_bytes == 0
     # Without its SYN it is unknown to which transfer a connection belongs.
-    assert tcp.count(tcp.match_transfer(packets(whole[1:]), packets(whole), TCP_TRANSFER)).sent_bytes == 0
+    assert tcp.count(tcp.match_transfer(packets(frames[1:]), packets(frames), TCP_TRANSFER)).sent_bytes == 0
 
 
 def test_superframes_at_either_end_count_as_their_segments() -> None:
@@ -199,9 +199,9 @@ def test_connections_are_counted_separately_and_other_ports_are_ignored() -> Non
 def test_retransmissions_of_an_earlier_transfer_are_not_counted() -> None:
     """Observed at 30 % loss: a connection of an aborted transfer sent a segment during a later repeat."""
     orphan = segment(2**31, 1448, sport=41878)
-    own = _frames(10, [(0, 100)], sport=42344)
-    sent = packets(timed([own[0], orphan, *own[1:]]))
-    received = packets(timed([orphan, *own]))
+    connection = _frames(10, [(0, 100)], sport=42344)
+    sent = packets(timed([connection[0], orphan, *connection[1:]]))
+    received = packets(timed([orphan, *connection]))
     counts = tcp.count(tcp.match_transfer(sent, received, TCP_TRANSFER))
     assert (counts.sent_bytes, counts.unique_bytes, counts.received_bytes) == (100, 100, 100)
     assert (counts.frames_sent, counts.frames_received) == (2, 2)

@@ -29,17 +29,17 @@ def test_any_subset_of_fragments_gives_the_counts_in_closed_form(
 ) -> None:
     cut = [datagram((start + index) % 65536, size) for index, size in enumerate(sizes)]
     sent = timed([packet for fragments in cut for packet in fragments])
-    kept = data.draw(st.lists(st.booleans(), min_size=len(sent), max_size=len(sent)))
-    received = [frame for frame, keep in zip(sent, kept, strict=True) if keep]
+    arrives = data.draw(st.lists(st.booleans(), min_size=len(sent), max_size=len(sent)))
+    received = [frame for frame, keep in zip(sent, arrives, strict=True) if keep]
     order = data.draw(st.permutations(received))
 
     counts = _count(sent, list(order))
 
-    flags = iter(kept)
+    flags = iter(arrives)
     fates = [[next(flags) for _ in fragments] for fragments in cut]
     carried = [[len_of(packet) for packet in fragments] for fragments in cut]
     assert counts.packets_sent == len(sent)
-    assert counts.packets_received == sum(kept)
+    assert counts.packets_received == sum(arrives)
     assert counts.datagrams_sent == len(sizes)
     assert counts.datagrams_received == sum(all(fate) for fate in fates)
     assert counts.bytes_sent == sum(sizes)
@@ -89,7 +89,7 @@ def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: i
     clock_ns = data.draw(st.integers(-(10**12), 10**12))
     sent: list[Frame] = []
     received: list[Frame] = []
-    whole = arrived = 0
+    complete = arrived = 0
     for turn in range(rounds):
         for ip_id in range(ids):
             at_ns = 10**15 + turn * 5 * 10**9 + ip_id * 10**6
@@ -101,17 +101,17 @@ def test_packets_with_repeated_ids_are_distinguished_by_time(ids: int, rounds: i
                 for frame, keep in zip(cut, fate, strict=True)
                 if keep
             ]
-            whole += all(fate)
+            complete += all(fate)
             arrived += sum(fate)
     # One datagram with a unique id arrives completely, which gives the clock offset.
-    known = [Frame(10**15 - 10**7, packet, wire_bytes=2000) for packet in datagram(9999, 4000)]
-    sent += known
-    received += [Frame(frame.time_ns + clock_ns, frame.data, wire_bytes=2000) for frame in known]
+    earlier = [Frame(10**15 - 10**7, packet, wire_bytes=2000) for packet in datagram(9999, 4000)]
+    sent += earlier
+    received += [Frame(frame.time_ns + clock_ns, frame.data, wire_bytes=2000) for frame in earlier]
 
     counts = _count(sent, received)
 
     assert counts.packets_received == arrived + 3
-    assert counts.datagrams_received == whole + 1
+    assert counts.datagrams_received == complete + 1
 
 
 @given(st.integers(1, 40), st.data())
@@ -120,9 +120,11 @@ def test_unfragmented_packets_that_all_have_the_same_id_are_counted_as_a_multise
 ) -> None:
     received = data.draw(st.integers(0, sent))
     frames = timed([datagram(0, 100)[0]] * sent, step_ns=1000)
-    kept = data.draw(st.permutations(frames))[:received]
+    arrived = data.draw(st.permutations(frames))[:received]
     delays_ns = data.draw(st.lists(st.integers(0, 10**5), min_size=received, max_size=received))
-    arrivals = [Frame(frame.time_ns + delay, frame.data, 2000) for frame, delay in zip(kept, delays_ns, strict=True)]
+    arrivals = [
+        Frame(frame.time_ns + delay, frame.data, 2000) for frame, delay in zip(arrived, delays_ns, strict=True)
+    ]
     counts = _count(frames, arrivals)
     assert counts.packets_received == counts.datagrams_received == received
     assert counts.bytes_received == 100 * received
@@ -182,12 +184,12 @@ def test_the_papers_file_in_datagrams_fragmented_by_scapy() -> None:
     blocks = [8192] * 35 + [293_797 - 35 * 8192]
     sent: list[Frame] = []
     for number, size in enumerate(blocks):
-        whole = (
+        datagram = (
             IP(src=SENDER, dst=RECEIVER, id=65_520 + number & 0xFFFF) / UDP(sport=1, dport=PORT) / Raw(bytes(size))
         )
-        cut = fragment(whole, 1480)  # type: ignore[no-untyped-call]
+        cut = fragment(datagram, 1480)  # type: ignore[no-untyped-call]
         sent += [Frame(number * 10**6 + at, bytes(packet)) for at, packet in enumerate(cut)]
     lost = np.random.default_rng(1).random(len(sent)) < 0.1
-    counts = _count(sent, [frame for frame, gone in zip(sent, lost, strict=True) if not gone])
+    counts = _count(sent, [frame for frame, is_lost in zip(sent, lost, strict=True) if not is_lost])
     assert (counts.packets_sent, counts.datagrams_sent, counts.bytes_sent) == (215, 36, 293_797)
     assert counts.packets_received == 215 - lost.sum()

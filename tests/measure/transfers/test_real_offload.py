@@ -55,8 +55,17 @@ done
 
 def test_offload_at_one_end_alone_changes_no_count(tmp_path: Path) -> None:
     (tmp_path / "sent").write_bytes(bytes(range(250)) * (FILE_BYTES // 250))
-    own = ("unshare", "--mount", "--propagation", "private", "--pid", "--fork", "--kill-child", "--mount-proc")
-    subprocess.run((*own, "sh", "-c", IN_NAMESPACES), cwd=tmp_path, check=True, timeout=60)
+    sandbox_command = (
+        "unshare",
+        "--mount",
+        "--propagation",
+        "private",
+        "--pid",
+        "--fork",
+        "--kill-child",
+        "--mount-proc",
+    )
+    subprocess.run((*sandbox_command, "sh", "-c", IN_NAMESPACES), cwd=tmp_path, check=True, timeout=60)
     assert (tmp_path / "received").read_bytes() == (tmp_path / "sent").read_bytes()
     sender, receiver = (pcap.read(tmp_path / f"{name}.pcap").packets for name in ("sender", "receiver"))
     joined, single = (int(packets.tcp_payload_bytes.max()) for packets in (sender, receiver))

@@ -74,9 +74,9 @@ def test_a_flow_that_ended_during_the_fault_has_only_an_outage() -> None:
 
 
 def test_the_last_of_several_streams_to_recover_counts() -> None:
-    back, gone = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
+    back, unrecovered = delivery(0, 900, 3100), delivery(0, 900, end_ms=5000)
     assert measured(times(1000, 3000), back, delivery(0, 950, 3900))["recovery_s"] == pytest.approx(0.9)
-    assert measured(times(1000, 3000), back, gone) == {
+    assert measured(times(1000, 3000), back, unrecovered) == {
         "recovery_at_least_s": pytest.approx(2.0),
         "outage_at_least_s": pytest.approx(4.1),
     }

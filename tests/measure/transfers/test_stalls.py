@@ -153,8 +153,8 @@ def test_datagrams_that_are_lost_make_a_gap_whole_or_in_fragments(lost: set[int]
     for number in range(100):
         stream.datagram(number, number * STEP_NS, size=size, arrives=number not in lost)
     result = measured(of_udp(*captured([stream])))
-    there = sorted(set(range(100)) - lost)
-    gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(there)]
+    arrived = sorted(set(range(100)) - lost)
+    gaps_s = [(later - earlier) * 0.01 for earlier, later in pairwise(arrived)]
     assert result["stall_s"] == pytest.approx(max(gaps_s), abs=1e-5)
     assert result["stalls"] == sum(gap_s > 0.2001 for gap_s in gaps_s)
 
@@ -190,8 +190,8 @@ def test_a_flow_shorter_than_its_schedule_has_stalled_until_the_end_of_it() -> N
         stream.datagram(number, number * STEP_NS)
     scheduled = FlowSchedule(interval_s=0.01, lasts_s=5.0)
     assert measured(of_udp(*captured([stream]), scheduled)) == {"stall_at_least_s": pytest.approx(4.0), "stalls": 1}
-    ended = replace(scheduled, until_ns=START + 3 * SECOND)
-    assert measured(of_udp(*captured([stream]), ended))["stall_at_least_s"] == pytest.approx(2.0, abs=0.01)
+    shortened = replace(scheduled, until_ns=START + 3 * SECOND)
+    assert measured(of_udp(*captured([stream]), shortened))["stall_at_least_s"] == pytest.approx(2.0, abs=0.01)
 
 
 @pytest.mark.parametrize("ahead_ns", [-3600 * SECOND, 86_400 * SECOND])

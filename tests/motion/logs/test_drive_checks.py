@@ -86,18 +86,18 @@ CHANGES: Mapping[str, Any] = {
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_changed_line_is_detected(name: str, tmp_path: Path) -> None:
-    change, why = CHANGES[name]
-    made = lines()
+    change, expected_reason = CHANGES[name]
+    entries = lines()
     for field, by in change.items():
-        made[45] = {**made[45], field: made[45][field] + by}
+        entries[45] = {**entries[45], field: entries[45][field] + by}
     if "driven_m" in change:
-        made = [{**line, "driven_m": line["driven_m"] + (at > 45)} for at, line in enumerate(made)]
-    assert any(why in reason for reason in reasons(write_log(tmp_path, made)))
+        entries = [{**line, "driven_m": line["driven_m"] + (at > 45)} for at, line in enumerate(entries)]
+    assert any(expected_reason in reason for reason in reasons(write_log(tmp_path, entries)))
 
 
 def test_a_deviation_from_the_planned_path_is_detected(tmp_path: Path) -> None:
-    made = [{**line, "x_m": 3 * line["x_m"], "driven_m": 3 * line["driven_m"]} for line in lines()]
-    contradictions = reasons(write_log(tmp_path, made))
+    entries = [{**line, "x_m": 3 * line["x_m"], "driven_m": 3 * line["driven_m"]} for line in lines()]
+    contradictions = reasons(write_log(tmp_path, entries))
     assert any("deviates by 4.0 m" in reason for reason in contradictions)
     assert any("drove at 3.00 m/s instead of 1 m/s" in reason for reason in contradictions)
 
@@ -110,11 +110,11 @@ def test_a_deviation_from_the_planned_path_is_detected(tmp_path: Path) -> None:
 def test_a_change_of_a_field_is_detected_or_leaves_the_distance(
     field: str, some: tuple[int, int], by: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    folder, made = tmp_path_factory.getbasetemp(), lines()
-    before = drive_log.measure(drive_log.read(write_log(folder, made))).values
-    for at in range(some[0], min(some[0] + some[1], len(made))):
-        made[at] = {**made[at], field: made[at][field] + by}
-    path = write_log(folder, made)
+    folder, entries = tmp_path_factory.getbasetemp(), lines()
+    before = drive_log.measure(drive_log.read(write_log(folder, entries))).values
+    for at in range(some[0], min(some[0] + some[1], len(entries))):
+        entries[at] = {**entries[at], field: entries[at][field] + by}
+    path = write_log(folder, entries)
     try:
         if reasons(path):
             return
@@ -129,8 +129,10 @@ def test_a_change_of_a_field_is_detected_or_leaves_the_distance(
 @given(chosen=st.sets(st.integers(0, 80), min_size=1))
 def test_missing_lines_are_detected(chosen: set[int], tmp_path_factory: pytest.TempPathFactory) -> None:
     path = write_log(tmp_path_factory.mktemp("drive"), lines())
-    kept = [line for at, line in enumerate(path.read_text("ascii").splitlines(keepends=True)) if at not in chosen]
-    path.write_text("".join(kept), encoding="ascii")
+    remaining = [
+        line for at, line in enumerate(path.read_text("ascii").splitlines(keepends=True)) if at not in chosen
+    ]
+    path.write_text("".join(remaining), encoding="ascii")
     assert reasons(path)
 
 
@@ -159,13 +161,17 @@ def oracle(folder: Path, far_m: float) -> AttemptEvidence:
 @pytest.mark.parametrize(("far_m", "agrees"), [(2.0, True), (2.1, True), (8.0, False), (0.0, False)])
 def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: bool, tmp_path: Path) -> None:
     during_ns = (START_NS, START_NS + 9 * 10**9)
-    why = recorded_positions.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
-    assert (why is None) is agrees
-    if why:
-        assert why == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"
+    reason = recorded_positions.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
+    assert (reason is None) is agrees
+    if reason:
+        assert reason == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"
 
 
 def test_the_deviation_at_a_corner_is_the_straight_distance() -> None:
-    made = drive_log.DriveMoment(0.0, "out", 3.0, 4.0, 0.0, 5.0, 0.0)
-    (off,) = [why for why in drive_checks.contradictions([replace(made, ended="home")], PLAN) if "deviates by" in why]
+    moment = drive_log.DriveMoment(0.0, "out", 3.0, 4.0, 0.0, 5.0, 0.0)
+    (off,) = [
+        reason
+        for reason in drive_checks.contradictions([replace(moment, ended="home")], PLAN)
+        if "deviates by" in reason
+    ]
     assert f"deviates by {math.hypot(1.0, 4.0):.1f} m" in off

@@ -34,16 +34,16 @@ def drive(out_s: float, speed_m_s: float, back_m_s: float) -> Iterator[dict[str,
     yield from ({**LINE, "at_s": tenth / 10} for tenth in range(20))
     for tenth in range(round(10 * out_s) + 1):
         at_s = tenth / 10
-        way = {"x_m": speed_m_s * at_s, "driven_m": speed_m_s * at_s, "forward_m_s": speed_m_s}
-        yield {**LINE, "at_s": 2 + at_s, **way}
+        fields = {"x_m": speed_m_s * at_s, "driven_m": speed_m_s * at_s, "forward_m_s": speed_m_s}
+        yield {**LINE, "at_s": 2 + at_s, **fields}
     long_m = speed_m_s * out_s
     for tenth in range(1, 11):
         yield {**LINE, "at_s": 2 + out_s + tenth / 10, "x_m": long_m, "driven_m": long_m, "phase": "there"}
     home_s = long_m / back_m_s
     for tenth in range(round(10 * home_s) + 1):
         gone_m = back_m_s * tenth / 10
-        way = {"x_m": long_m - gone_m, "driven_m": long_m + gone_m, "forward_m_s": back_m_s}
-        yield {**LINE, "at_s": 3 + out_s + tenth / 10, "phase": "back", **way}
+        fields = {"x_m": long_m - gone_m, "driven_m": long_m + gone_m, "forward_m_s": back_m_s}
+        yield {**LINE, "at_s": 3 + out_s + tenth / 10, "phase": "back", **fields}
     at_s = 3 + out_s + home_s
     end = {"x_m": 0.03, "y_m": -0.04, "yaw_rad": 0.2, "phase": "home", "ended": "home"}
     yield {**LINE, "at_s": at_s, "driven_m": 2 * long_m, **end}

@@ -22,12 +22,12 @@ PLAN = FlyPlan(3.0, 20.0, 3.0, (START_NS - 10**9, START_NS + 60 * 10**9))
 
 def lines() -> list[dict[str, Any]]:
     """Lines of a drone that climbs to 3 m in 3 s, flies 20 m away in 10 s, and lands there in 5 s."""
-    made = []
+    entries = []
     for tenth in range(201):
         at_s = tenth / 10
         phase = next(name for name, until in PHASES if at_s <= until)
         up_m = min(at_s, 3.0) if at_s < 14 else max(3.0 - (at_s - 14) * 0.6, 0.0)
-        made.append(
+        entries.append(
             {
                 "utc_ns": START_NS + round(1e9 * at_s),
                 "at_s": at_s,
@@ -38,7 +38,7 @@ def lines() -> list[dict[str, Any]]:
                 "speed_m_s": 2.0 if 4 <= at_s <= 14 else 1.0,
             }
         )
-    return made
+    return entries
 
 
 PHASES = (("standing", 0.5), ("climbing", 3.0), ("up", 4.0), ("flying", 14.0), ("there", 14.5), ("coming down", 20.0))
@@ -72,7 +72,7 @@ def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "by", "why"),
+    ("field", "by", "expected_reason"),
     [
         ("ahead_m", 200.0, "two consecutive positions are farther apart"),
         ("up_m", 50.0, "two consecutive positions are farther apart"),
@@ -81,11 +81,11 @@ def test_a_log_without_its_end_is_detected(tmp_path: Path) -> None:
         ("at_s", 0.05, ""),
     ],
 )
-def test_a_changed_line_is_detected(field: str, by: float, why: str, tmp_path: Path) -> None:
-    made = lines()
-    made[80] = {**made[80], field: made[80][field] + by}
-    contradictions = reasons(write_log(tmp_path, made))
-    assert any(why in reason for reason in contradictions) if why else contradictions == []
+def test_a_changed_line_is_detected(field: str, by: float, expected_reason: str, tmp_path: Path) -> None:
+    entries = lines()
+    entries[80] = {**entries[80], field: entries[80][field] + by}
+    contradictions = reasons(write_log(tmp_path, entries))
+    assert any(expected_reason in reason for reason in contradictions) if expected_reason else contradictions == []
 
 
 @given(
@@ -96,11 +96,11 @@ def test_a_changed_line_is_detected(field: str, by: float, why: str, tmp_path: P
 def test_any_change_of_a_field_is_detected(
     field: str, some: tuple[int, int], by: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    folder, made = tmp_path_factory.getbasetemp(), lines()
-    before = fly_log.measure(fly_log.read(write_log(folder, made))).values
-    for at in range(some[0], min(sum(some), len(made))):
-        made[at] = {**made[at], field: made[at][field] + by}
-    path = write_log(folder, made)
+    folder, entries = tmp_path_factory.getbasetemp(), lines()
+    before = fly_log.measure(fly_log.read(write_log(folder, entries))).values
+    for at in range(some[0], min(sum(some), len(entries))):
+        entries[at] = {**entries[at], field: entries[at][field] + by}
+    path = write_log(folder, entries)
     try:
         if reasons(path):
             return

@@ -50,10 +50,13 @@ def flown(path: Path, yaw_rad: float) -> None:
     drone = at(BEGIN_M, 0.0)
     log.note(drone)
     log.begin(FlightOrigin("local", "", *BEGIN_M[:2], yaw_rad), BEGIN_M[2])
-    way = [("standing", 0.0, 0.0, 0.0, 0.0), ("climbing", 0.0, 0.0, 1.0, 1.0), ("up", 0.0, 0.0, 3.1, 0.1)]
-    way += [("flying", 4 * tenth / 10, 3 * tenth / 10, 3.0, 2.0) for tenth in range(11)]
-    way += [("there", 4, 3, 3.0, 0.0)] * 5 + [("coming back", 2, 1, 3.0, 2.5), ("coming down", 0.3, 0.4, -0.1, 0.2)]
-    for phase, ahead_m, left_m, up_m, speed_m_s in way:
+    phases = [("standing", 0.0, 0.0, 0.0, 0.0), ("climbing", 0.0, 0.0, 1.0, 1.0), ("up", 0.0, 0.0, 3.1, 0.1)]
+    phases += [("flying", 4 * tenth / 10, 3 * tenth / 10, 3.0, 2.0) for tenth in range(11)]
+    phases += [("there", 4, 3, 3.0, 0.0)] * 5 + [
+        ("coming back", 2, 1, 3.0, 2.5),
+        ("coming down", 0.3, 0.4, -0.1, 0.2),
+    ]
+    for phase, ahead_m, left_m, up_m, speed_m_s in phases:
         log.phase = phase
         north_m = ahead_m * math.cos(yaw_rad) + left_m * math.sin(yaw_rad)
         east_m = ahead_m * math.sin(yaw_rad) - left_m * math.cos(yaw_rad)
@@ -84,8 +87,8 @@ def test_the_columns_of_a_known_flight(tmp_path: Path, yaw_rad: float) -> None:
 
 def test_unknown_values_are_missing_with_a_reason(tmp_path: Path) -> None:
     assert fly_log.measure(None).missing.keys() == NAMES
-    torn = write_log(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
-    measured = fly_log.measure(fly_log.read(torn))
+    log = write_log(tmp_path, [{**LINE, "phase": "up"}], end='{"utc_ns": 1')
+    measured = fly_log.measure(fly_log.read(log))
     assert measured.missing.keys() == {"fly_height_median_m", "fly_speed_median_m_s", "fly_back_off_m"}
 
 

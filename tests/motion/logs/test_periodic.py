@@ -21,11 +21,11 @@ def test_each_lost_message_is_counted_once_even_if_the_sender_has_a_loop_period(
     """An autopilot whose loop takes 20 ms sends 20 messages a second at intervals of 40 and 60 ms."""
     chance = random.Random(7)
     times_ms = list(accumulate(islice(cycle(steps_ms), SENT - 1), initial=0))
-    came = [number for number in range(SENT) if number in {0, SENT - 1} or chance.random() >= share]
-    numbers = [(times_ms[number] * 1000, number % 256) for number in came]
-    stream = [StreamMessage(times_ms[number] * 1000, times_ms[number], at) for at, number in enumerate(came)]
+    arrived = [number for number in range(SENT) if number in {0, SENT - 1} or chance.random() >= share]
+    numbers = [(times_ms[number] * 1000, number % 256) for number in arrived]
+    stream = [StreamMessage(times_ms[number] * 1000, times_ms[number], at) for at, number in enumerate(arrived)]
     ended_us = times_ms[-1] * 1000
-    assert periodic.lost(numbers, {"ATTITUDE": stream}, ended_us, REQUESTED) == (len(came), SENT - len(came))
+    assert periodic.lost(numbers, {"ATTITUDE": stream}, ended_us, REQUESTED) == (len(arrived), SENT - len(arrived))
 
 
 def test_a_number_that_a_router_filtered_is_no_loss() -> None:

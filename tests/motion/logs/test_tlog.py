@@ -114,17 +114,17 @@ def test_impossible_values_are_missing(tmp_path: Path) -> None:
     assert not {item for item in values if item.endswith(("_m", "_m_s", "_deg"))}
 
 
-@pytest.mark.parametrize("how", ["old", "signed"])
-def test_logs_of_mavlink_1_and_of_signed_frames(how: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("version", ["old", "signed"])
+def test_logs_of_mavlink_1_and_of_signed_frames(version: str, tmp_path: Path) -> None:
     sender = Sender()
-    if how == "signed":
+    if version == "signed":
         sender.link.signing.secret_key, sender.link.signing.sign_outgoing = b"k" * 32, True
     messages = [beat(), *(d.MAVLink_attitude_message(at, 0.5, 0, 0, 0, 0, 0) for at in range(5))]
     frames = []
     for number, message in enumerate(messages):
-        frames.append((number, bytes(message.pack(sender.link, force_mavlink1=how == "old"))))
+        frames.append((number, bytes(message.pack(sender.link, force_mavlink1=version == "old"))))
         sender.link.seq = number + 1
-    assert {item[0] for _, item in frames} == {0xFE if how == "old" else 0xFD}
+    assert {item[0] for _, item in frames} == {0xFE if version == "old" else 0xFD}
     values = measured(tmp_path, stamped(frames))
     assert (values["mavlink_messages"], values["mavlink_sent"], values["mavlink_damaged"]) == (6, 6, 0)
     assert values["mavlink_roll_max_deg"] == pytest.approx(28.65, abs=0.01)
@@ -186,12 +186,12 @@ def _answered(data: bytes, question: Mapping[str, object]) -> object:
     return json.dumps(tlog_reader._summary(data, autopilot, 0, {}))
 
 
-SAID = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
+COUNTERS = {"frames": 3, "bytes": 99, "left_out": 0, "ended_us": 5, "refused": {"32": 2}}
 
 
 def test_the_summary_of_a_recorder(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
-    path.write_text(json.dumps(SAID), encoding="utf-8")
+    path.write_text(json.dumps(COUNTERS), encoding="utf-8")
     assert tlog.read_summary(path) == tlog.RecorderSummary(3, 0, 5, {32: 2})
 
 
@@ -206,7 +206,7 @@ WRONG: list[dict[str, object]] = [
 
 
 @pytest.mark.parametrize(
-    "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**SAID, **wrong}) for wrong in WRONG)]
+    "recorder_summary", ["", "[]", "7", "[" * 5000, *(json.dumps({**COUNTERS, **wrong}) for wrong in WRONG)]
 )
 def test_an_invalid_summary_is_refused(recorder_summary: str, tmp_path: Path) -> None:
     path = tmp_path / "mavlink.json"
@@ -222,7 +222,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
     recorder_summary = tlog.RecorderSummary(log.frames, 0, log.last_us + 5, {}, tlog.crc32_of(path))
     window = log.first_us * 1000, log.last_us * 1000 + 999
     assert list(tlog.contradictions(log, recorder_summary, tlog.crc32_of(path), window)) == []
-    for other, total, around, why in (
+    for other, total, around, expected_reason in (
         (recorder_summary, 7, window, "its checksum differs"),
         (
             replace(recorder_summary, ended_us=log.last_us - 10**6),
@@ -244,13 +244,13 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
         ),
     ):
         (reason,) = tlog.contradictions(log, other, total, around)
-        assert why in reason
+        assert expected_reason in reason
 
 
 def test_moved_frames_are_detected(tmp_path: Path) -> None:
     path = tmp_path / "mavlink.tlog"
-    whole = flight()
-    path.write_bytes(whole + whole)
+    content = flight()
+    path.write_bytes(content + content)
     log = tlog.read(path, 0, 0)
     (reason,) = tlog.contradictions(log, tlog.RecorderSummary(log.frames, 0, log.last_us, {}), 0, None)
     assert "a frame that is 10.001 s earlier than the previous one" in reason
@@ -269,5 +269,5 @@ def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float,
                 continue
             numbers.append((100_000 * slot, sent % 256))
             streams.setdefault(name, []).append(StreamMessage(100_000 * slot, 100 * slot, len(numbers) - 1))
-    came, lacking = periodic.lost(numbers, streams, 0)
-    assert (came, lacking) == (len(numbers), truth)
+    arrived, lacking = periodic.lost(numbers, streams, 0)
+    assert (arrived, lacking) == (len(numbers), truth)

@@ -45,48 +45,48 @@ TASK = DriveTask(
 )
 
 
-def kept(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> JournaledOrigins:
+def open_origins(folder: Path, placement: Placement = NEAR, *, may_return: bool = False) -> JournaledOrigins:
     """Return the origins of a trial as read by another run of fieldkit."""
     return JournaledOrigins(MotionJournal(folder / MOTION_FILE), folder, ROBOTS, placement, may_return=may_return)
 
 
 def test_an_origin_is_valid_over_runs_that_leave_the_robot_at_its_place(tmp_path: Path) -> None:
-    kept(tmp_path).record(Role.RECEIVER, ORIGIN)
-    kept(tmp_path).record(Role.SENDER, replace(ORIGIN, x_m=9.0))
-    assert kept(tmp_path).get(Role.RECEIVER) == ORIGIN
-    assert kept(tmp_path, FAR).get(Role.RECEIVER) == ORIGIN, "the sender is moved, the receiver is not"
-    assert kept(tmp_path, FAR).get(Role.SENDER) is None
+    open_origins(tmp_path).record(Role.RECEIVER, ORIGIN)
+    open_origins(tmp_path).record(Role.SENDER, replace(ORIGIN, x_m=9.0))
+    assert open_origins(tmp_path).get(Role.RECEIVER) == ORIGIN
+    assert open_origins(tmp_path, FAR).get(Role.RECEIVER) == ORIGIN, "the sender is moved, the receiver is not"
+    assert open_origins(tmp_path, FAR).get(Role.SENDER) is None
 
 
 def test_a_place_is_new_if_the_last_origin_is_of_another_one(tmp_path: Path) -> None:
-    assert not kept(tmp_path).is_new_place(Role.SENDER), "no origin yet: the first place"
+    assert not open_origins(tmp_path).is_new_place(Role.SENDER), "no origin yet: the first place"
     for role in ROBOTS:
-        kept(tmp_path).record(role, ORIGIN)
-    assert not kept(tmp_path).is_new_place(Role.SENDER)
-    assert kept(tmp_path, FAR).is_new_place(Role.SENDER)
-    assert not kept(tmp_path, FAR).is_new_place(Role.RECEIVER), "it stays"
+        open_origins(tmp_path).record(role, ORIGIN)
+    assert not open_origins(tmp_path).is_new_place(Role.SENDER)
+    assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER)
+    assert not open_origins(tmp_path, FAR).is_new_place(Role.RECEIVER), "it stays"
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.CONFIRMED, "rover-2")
-    assert kept(tmp_path, FAR).is_new_place(Role.SENDER), "confirmed at the former place"
-    kept(tmp_path, FAR).record(Role.SENDER, ORIGIN)
-    assert kept(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first place without a person"
+    assert open_origins(tmp_path, FAR).is_new_place(Role.SENDER), "confirmed at the former place"
+    open_origins(tmp_path, FAR).record(Role.SENDER, ORIGIN)
+    assert open_origins(tmp_path, NEAR).is_new_place(Role.SENDER), "back at the first place without a person"
 
 
 @pytest.mark.parametrize("at_place", [True, False])
 def test_only_a_confirmation_lets_robots_move_after_a_fault(tmp_path: Path, at_place: bool) -> None:
-    first = kept(tmp_path)
+    first = open_origins(tmp_path)
     first.record(Role.RECEIVER, ORIGIN)
     with first.moving(Role.RECEIVER) as motion:
         motion.mark_ended(ORIGIN)
     with pytest.raises(ValueError, match="torn"), first.moving(Role.RECEIVER):
         raise ValueError("torn")
     for role in ROBOTS:
-        with pytest.raises(MotionHeldError, match="rover-1"), kept(tmp_path).moving(role):
+        with pytest.raises(MotionHeldError, match="rover-1"), open_origins(tmp_path).moving(role):
             pytest.fail("it moved")
     journal = MotionJournal(tmp_path / MOTION_FILE)
     journal.confirm("how", at_place=at_place)
-    again = kept(tmp_path)
-    again.require()
-    assert again.get(Role.RECEIVER) == (None if at_place else ORIGIN)
+    reopened = open_origins(tmp_path)
+    reopened.require()
+    assert reopened.get(Role.RECEIVER) == (None if at_place else ORIGIN)
 
 
 def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -> None:
@@ -97,19 +97,19 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -
     with pytest.raises(KeyboardInterrupt), first.moving(Role.RECEIVER):
         raise KeyboardInterrupt
     later = JournaledOrigins(MotionJournal(journal_of(trials[1])), trials[1], ROBOTS, NEAR)
-    with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as held:
+    with pytest.raises(MotionHeldError, match="rover-1: stopped by the operator") as caught:
         later.require()
-    assert "fieldkit campaign, as before" in held.value.remedy
+    assert "fieldkit campaign, as before" in caught.value.remedy
 
 
 def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
     MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.BEGUN, "rover-1")
     with pytest.raises(MotionHeldError, match="fieldkit stopped while it moved"):
-        kept(tmp_path).require()
+        open_origins(tmp_path).require()
 
 
 def test_two_robots_move_at_the_same_time(tmp_path: Path) -> None:
-    origins = kept(tmp_path)
+    origins = open_origins(tmp_path)
     with origins.moving(Role.SENDER) as outer, origins.moving(Role.RECEIVER) as inner:
         inner.mark_ended()
         outer.mark_ended()
@@ -155,11 +155,11 @@ def test_no_sequence_of_attempts_leaves_the_fence_of_the_trial(attempts: list[tu
     with TemporaryDirectory() as text:
         folder = Path(text)
         for ticks, end in attempts:
-            origins = kept(folder, may_return=True)
+            origins = open_origins(folder, may_return=True)
             MotionJournal(folder / MOTION_FILE).confirm("option", at_place=False)
-            origins = kept(folder, may_return=True)
-            known = origins.get(Role.RECEIVER)
-            task = TASK if known is None else replace(TASK, origin=(known.x_m, known.y_m, known.heading_rad))
+            origins = open_origins(folder, may_return=True)
+            origin = origins.get(Role.RECEIVER)
+            task = TASK if origin is None else replace(TASK, origin=(origin.x_m, origin.y_m, origin.heading_rad))
             driver = Driver(replace(task, may_return=True), now_s)
             order = OUT
             for number in range(4000):

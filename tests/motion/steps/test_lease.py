@@ -23,15 +23,15 @@ class Link:
 
     def __init__(self) -> None:
         self.words: list[Sequence[str]] = []
-        self.broken = 0
+        self.failures_left = 0
         self.many = Event()
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
         self.words.append(argv)
         if len(self.words) >= 5:
             self.many.set()
-        if self.broken > 0:
-            self.broken -= 1
+        if self.failures_left > 0:
+            self.failures_left -= 1
             raise LinkError("is out of range", where=self.robot, remedy="wait")
         return Completed(tuple(argv), 0, b"output", b"")
 
@@ -56,7 +56,7 @@ def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
     link = Link()
     with keeper(link) as lease:
         assert lease.output == b"output"
-        link.broken = 2
+        link.failures_left = 2
         assert link.many.wait(60)
         lease.give_order("go")
     count = len(link.lines)
@@ -86,7 +86,7 @@ def renewal_threads(lease: LeaseKeeper) -> list[bool]:
 def test_order_that_cannot_be_written_is_an_error() -> None:
     link = Link()
     with keeper(link, silent_lease_s=90.0) as lease:
-        link.broken = 1
+        link.failures_left = 1
         with pytest.raises(LinkError):
             lease.give_order("go")
         lease.renew()
@@ -95,7 +95,7 @@ def test_order_that_cannot_be_written_is_an_error() -> None:
 
 def test_unreachable_robot_at_start_is_an_error() -> None:
     link = Link()
-    link.broken = 1
+    link.failures_left = 1
     with pytest.raises(LinkError), keeper(link):
         pytest.fail("the lease was entered")
 
@@ -110,20 +110,20 @@ class Ending(Link):
 
 
 def test_body_is_aborted_when_program_ends() -> None:
-    ended = Event()
+    stop = Event()
 
     def wait() -> None:
-        assert ended.wait(60)
+        assert stop.wait(60)
         raise LinkError("the connection broke", where="r", remedy="wait")
 
     with keeper(Ending()) as lease:
         assert lease.end_reason == ""
-        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(ended.set):
+        with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(stop.set):
             wait()
         assert "the connection broke" in str(caught.value.__cause__)
-        with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(ended.set):
+        with pytest.raises(RobotError, match="ended with exit code 7"), lease.run_while_leased(stop.set):
             pass
-        with pytest.raises(LockLostError), lease.run_while_leased(ended.set):
+        with pytest.raises(LockLostError), lease.run_while_leased(stop.set):
             raise LockLostError("aborted", where="r", remedy="ask")
 
 

@@ -45,7 +45,7 @@ def test_detail_names_connection_and_programs(connection: str, kind: str) -> Non
 )
 def test_failure_names_available_connections(text: str, detail: str, remedy: str) -> None:
     need = link_need(CAST[Role.RECEIVER], Role.RECEIVER, "tcp:127.0.0.1:5760", ("recorder",))
-    verdict, what, how = need.judge(CommandResult(text, 0))
+    verdict, problem, suggestion = need.judge(CommandResult(text, 0))
     assert verdict is Verdict.FAIL
-    assert detail in what
-    assert remedy in how
+    assert detail in problem
+    assert remedy in suggestion

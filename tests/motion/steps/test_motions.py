@@ -19,11 +19,11 @@ class ScriptedShell:
     robot = "rover"
 
     def __init__(self, *answers: str | LinkError) -> None:
-        self.asked: list[tuple[str, ...]] = []
+        self.prompts: list[tuple[str, ...]] = []
         self._answers = list(answers)
 
     def run(self, argv: tuple[str, ...], **_: object) -> Completed:
-        self.asked.append(tuple(argv[2:]))
+        self.prompts.append(tuple(argv[2:]))
         answer = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
         if isinstance(answer, LinkError):
             raise answer
@@ -45,15 +45,19 @@ def test_without_motion_no_order_is_given() -> None:
 
 def test_each_robot_is_stopped_once_and_leaving_waits_for_landing() -> None:
     name, reports = "t/a/.jobs/fly", list[str]()
-    drives = ScriptedShell("t/a/.jobs/drive stationary\n")
-    flies = ScriptedShell(f"{name} land\n", f"{name} land\n", f"{name} landed\n")
+    drive_shell = ScriptedShell("t/a/.jobs/drive stationary\n")
+    fly_shell = ScriptedShell(f"{name} land\n", f"{name} land\n", f"{name} landed\n")
     motions = Motions()
     motions.stop_notes = ("rover stops", "drone lands")
-    with motions.moving(mover(drives)), motions.moving(mover(flies, "drone")), motions.moving(mover(flies, "drone")):
+    with (
+        motions.moving(mover(drive_shell)),
+        motions.moving(mover(fly_shell, "drone")),
+        motions.moving(mover(fly_shell, "drone")),
+    ):
         assert motions.order_stop(reports.append)
         assert motions.order_stop(reports.append)
-    assert drives.asked == [("halt_motion", "the-operator", ".fieldkit/t/a")]
-    assert flies.asked == [drives.asked[0], *[("motion_states", name)] * 2]
+    assert drive_shell.prompts == [("halt_motion", "the-operator", ".fieldkit/t/a")]
+    assert fly_shell.prompts == [drive_shell.prompts[0], *[("motion_states", name)] * 2]
     assert {"stopping: rover stops", "stopping: drone lands"} < set(reports)
     assert [line.partition(",")[0] for line in reports if line.startswith("drone")] == [
         "drone: coming down (land)",
@@ -68,7 +72,7 @@ def test_no_robot_starts_to_move_after_the_order() -> None:
     assert motions.order_stop(reports.append)
     with pytest.raises(KeyboardInterrupt), motions.moving(mover(shell)):
         pytest.fail("it moves")
-    assert not shell.asked
+    assert not shell.prompts
     wait_until(lambda: bool(reports), Deadline.after(60))
     assert reports == ["stopping: no robot moves; stopping the programs on the robots"]
 

@@ -88,11 +88,11 @@ def test_without_permission_there_is_no_driver() -> None:
 
 
 def test_path_beyond_fence_or_speed_is_refused() -> None:
-    far = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
-    speed, fence = far.refusals(SCENE)
+    long_move = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
+    speed, fence = long_move.refusals(SCENE)
     assert speed.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
     assert fence.what == "its fence is 30 m from its place, but its path leads 32.0156 m away"
-    by_person = far.refusals(replace(SCENE, cast=CAST))
+    by_person = long_move.refusals(replace(SCENE, cast=CAST))
     assert [refusal.what for refusal in by_person] == [speed.what], "no fence if a person moves it"
     round_trip = move("robot: receiver, path: [{away: 25m}, {towards: 25m}, {away: 25m}], speed: 0.2m/s")
     assert not list(round_trip.refusals(SCENE)), "the fence limits the distance, not the length of the path"
@@ -187,10 +187,10 @@ class Link:
         self.status = iter(status)
         self.last = ""
         self.broken = broken
-        self.asked = Event()
+        self.was_asked = Event()
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        self.asked.set()
+        self.was_asked.set()
         if self.broken:
             raise LinkError("is out of range", where=self.robot, remedy="wait")
         self.written.append(argv[-2])
@@ -235,9 +235,9 @@ def test_lost_link_does_not_end_the_wait() -> None:
     link = Link(status=['{"phase": "out"}'])
     with lease_of(link) as lease:
         link.broken = True
-        link.asked.clear()
-        lease.wait(link.asked.is_set, Deadline.after(60))
-        assert link.asked.is_set()
+        link.was_asked.clear()
+        lease.wait(link.was_asked.is_set, Deadline.after(60))
+        assert link.was_asked.is_set()
         assert lease.status == {"phase": "out"}
 
 
@@ -300,8 +300,8 @@ def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]
 
 
 def test_early_stop_aborts_steps_inside(stopped: list[str]) -> None:
-    waits = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
-    step = schema.validate(schema.parse(json.dumps(waits), source="x.yaml"), MoveStep)
+    waiting_step = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
+    step = schema.validate(schema.parse(json.dumps(waiting_step), source="x.yaml"), MoveStep)
     field = Field(Link(after="out", status=[READY] * 4 + ['{"ended": "beyond the fence"}']))
     with pytest.raises(RobotError, match="it stopped on its path: beyond the fence") as caught:
         step.run(quick_scene(), field, lambda *_: None)

@@ -33,7 +33,7 @@ def step(text: str) -> FlyStep:
     return schema.validate(schema.parse(f"{{{text}, {DURING}}}", source="x.yaml"), FlyStep)
 
 
-def refused(text: str) -> list[str]:
+def refusal_texts(text: str) -> list[str]:
     return [refusal.what for refusal in step(text).refusals(Scene(Protocol.TCP, PERMITTED, "f"))]
 
 
@@ -65,7 +65,7 @@ def test_flight_is_refused_exactly_if_it_exceeds_a_limit(
     height_m: float, path: list[tuple[float, float, float]], speed_m_s: float
 ) -> None:
     legs = ", ".join(f"{{away: {away}m, left: {left}m, up: {up}m}}" for away, left, up in path)
-    reasons = refused(f"robot: {DRONE}, height: {height_m}m, speed: {speed_m_s}m/s, path: [{legs}]")
+    reasons = refusal_texts(f"robot: {DRONE}, height: {height_m}m, speed: {speed_m_s}m/s, path: [{legs}]")
     highest_m = height_m + sum(up for _, _, up in path)
     farthest_m = math.hypot(sum(away for away, _, _ in path), sum(left for _, left, _ in path))
     assert LIMITS.max_height_m is not None
@@ -77,7 +77,7 @@ def test_flight_is_refused_exactly_if_it_exceeds_a_limit(
 
 def test_robot_without_autopilot_is_refused() -> None:
     ground = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) is None)
-    reasons = refused(f"robot: {ground}, height: 1m")
+    reasons = refusal_texts(f"robot: {ground}, height: 1m")
     assert reasons[0] == "it cannot fly: its profile has no mavlink"
     assert "its profile has no limit for the height" in reasons
 

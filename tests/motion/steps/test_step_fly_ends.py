@@ -61,21 +61,21 @@ class Shell(LocalShell):
 
 @pytest.fixture
 def shell(tmp_path: Path) -> Iterator[Shell]:
-    made = Shell(tmp_path)
-    jobs.install(made, Deadline.after(30))
-    evidence.begin(made, FOLDER, "receiver", "lo")
-    yield made
+    test_shell = Shell(tmp_path)
+    jobs.install(test_shell, Deadline.after(30))
+    evidence.begin(test_shell, FOLDER, "receiver", "lo")
+    yield test_shell
     deadline = Deadline.after(120)
-    while running := jobs.list_running(made, Deadline.after(60)):
-        assert not deadline.expired, (running, log(made))
+    while running := jobs.list_running(test_shell, Deadline.after(60)):
+        assert not deadline.expired, (running, log(test_shell))
         time.sleep(0.1)
 
 
 def fly(
-    shell: Shell, where: int | str, waits: str, begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
+    shell: Shell, url: int | str, waits: str, is_begun: Callable[[], object], abort: OnAbort = OnAbort.LAND
 ) -> None:
     """Fly a drone at a UDP port or a connection; call `begun` when a step inside starts."""
-    connection = where if isinstance(where, str) else f"udpout:127.0.0.1:{where}"
+    connection = url if isinstance(url, str) else f"udpout:127.0.0.1:{url}"
     mavlink = mavlink_of(DUCKIEDRONE)
     assert mavlink is not None
     update = {
@@ -92,7 +92,7 @@ def fly(
 
     def announce(name: str, _: float | None) -> None:
         if name == "wait":
-            begun()
+            is_begun()
 
     schema.validate(schema.parse(step, source="x.yaml"), FlyStep).run(
         scene, IdleTestbed({Role.RECEIVER: shell}), announce

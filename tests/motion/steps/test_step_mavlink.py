@@ -40,13 +40,13 @@ START_S = 0.1005
 """Start of the steps inside, at the second message of each kind."""
 
 
-def mavlink(more: str = "", during: str = PING) -> MavlinkStep:
-    text = f"{{robot: receiver, {more + ', ' if more else ''}during: [{during}]}}"
+def mavlink(extra_keys: str = "", during: str = PING) -> MavlinkStep:
+    text = f"{{robot: receiver, {extra_keys + ', ' if extra_keys else ''}during: [{during}]}}"
     return schema.validate(schema.parse(text, source="x.yaml"), MavlinkStep)
 
 
 @pytest.mark.parametrize(
-    ("more", "message"),
+    ("extra_keys", "message"),
     [
         ("rates: {ATITUDE: 5Hz}", "no rate can be requested for 'ATITUDE'; possible: SYS_STATUS"),
         ("rates: {ATTITUDE: 5}", "has no unit"),
@@ -56,9 +56,9 @@ def mavlink(more: str = "", during: str = PING) -> MavlinkStep:
         ("system: 256", "less than or equal to 255"),
     ],
 )
-def test_invalid_keys_are_refused(more: str, message: str) -> None:
+def test_invalid_keys_are_refused(extra_keys: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        mavlink(more)
+        mavlink(extra_keys)
 
 
 def test_robot_without_autopilot_is_refused() -> None:
@@ -205,6 +205,6 @@ def test_sources_of_steps_inside_are_kept() -> None:
     )
     inner = PositionSources({Role.SENDER: topic, Role.RECEIVER: placed})
     outer = PositionSources({Role.SENDER: placed, Role.RECEIVER: file}, {Role.SENDER: Offset(1, 0.1)}, heights=True)
-    both = position_sources.merge(inner, outer)
-    assert both.robots == {Role.SENDER: topic, Role.RECEIVER: file}
-    assert (both.clocks, both.heights) == (outer.clocks, True)
+    merged = position_sources.merge(inner, outer)
+    assert merged.robots == {Role.SENDER: topic, Role.RECEIVER: file}
+    assert (merged.clocks, merged.heights) == (outer.clocks, True)

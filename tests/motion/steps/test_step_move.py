@@ -160,9 +160,9 @@ def test_move_within_limits_is_reduced_to_speed_and_fence() -> None:
     drone = resolved_move(f"robot: relay, {path}, within_limits: true, {PING}")
     assert drone.motion == model.Move(Role.RELAY, (Leg(60.0),), 2.0), "within the limits of the drone"
     assert not slow.within_limits, "the plan has the actual motion"
-    refused = resolved_move(f"robot: receiver, {path}, {PING}")
-    assert refused.motion.speed_m_s == 2.0
-    assert [refusal.what for refusal in refused.refusals(SCENE)] == [
+    refusals = resolved_move(f"robot: receiver, {path}, {PING}")
+    assert refusals.motion.speed_m_s == 2.0
+    assert [refusal.what for refusal in refusals.refusals(SCENE)] == [
         "its top speed is 0.22 m/s, but the move needs 2 m/s"
     ]
 
@@ -213,10 +213,10 @@ def test_adjustments_describe_the_reduction() -> None:
 
 def test_written_plan_is_read_unchanged() -> None:
     plan = los_plan().model_copy(update={"procedure": load_procedure("driveaway").resolved(CAST)})
-    again = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
-    assert again == plan.procedure
-    assert "within_limits" not in schema.dump(again)
-    assert "along" not in schema.dump(again)
+    reread = schema.validate(schema.parse(schema.dump(plan.procedure), source="trial.yaml"), Procedure)
+    assert reread == plan.procedure
+    assert "within_limits" not in schema.dump(reread)
+    assert "along" not in schema.dump(reread)
 
 
 lengths = st.floats(-30, 30).map(lambda metres: round(metres, 2))
@@ -244,17 +244,19 @@ def test_shortened_path_is_valid_in_a_procedure(path: list[Leg], fence_m: float)
     segments = [PathLeg.of(leg) for leg in geometry.clip_path(path, fence_m)]
     for segment, leg in zip(segments, path, strict=False):
         if segment is not None:
-            again = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)
-            assert again == segment
-            assert abs(again.leg.away_m) <= abs(leg.away_m) + 1e-9
-            assert again.leg.away_m * leg.away_m >= 0
-            assert again.leg.left_m * leg.left_m >= 0
+            reread = schema.validate(schema.parse(schema.dump(segment), source="x.yaml"), PathLeg)
+            assert reread == segment
+            assert abs(reread.leg.away_m) <= abs(leg.away_m) + 1e-9
+            assert reread.leg.away_m * leg.away_m >= 0
+            assert reread.leg.left_m * leg.left_m >= 0
 
 
 def test_driving_robot_has_columns_and_time_for_the_return() -> None:
     text = f"robot: receiver, path: [{{away: 2m}}], speed: 0.2m/s, {PING}"
-    drives = {role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in CAST.items()}
-    driving, moved = resolved_move(text, drives), resolved_move(text)
+    driving_robots = {
+        role: robot.model_copy(update={"abilities": frozenset({"drive"})}) for role, robot in CAST.items()
+    }
+    driving, moved = resolved_move(text, driving_robots), resolved_move(text)
     assert {column.name for column in driving.output_columns()} >= {
         "drive_out_m",
         "drive_back_off_m",

@@ -51,12 +51,12 @@ def write_bag(folder: Path, form: BagFormat, messages: Sequence[Message]) -> Pat
         old.set_compression(rosbag1.Writer.CompressionFormat.LZ4)
         old.chunk_threshold = 20_000
         with old:
-            own = {
+            channels = {
                 topic: old.add_connection(topic, "std_msgs/msg/String", typestore=types) for topic, *_ in messages[:3]
             }
             string = types.types["std_msgs/msg/String"]
             for topic, at_ns, text in messages:
-                old.write(own[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String"))
+                old.write(channels[topic], at_ns, types.serialize_ros1(string(data=text), "std_msgs/msg/String"))
         return path
     path = folder / "all"
     if form is BagFormat.MCAP and len(messages) > 100:
@@ -78,10 +78,10 @@ def in_chunks(path: Path, messages: Sequence[Message], compression: CompressionT
         writer.start(profile="ros2")
         definition, _ = TYPES.generate_msgdef("std_msgs/msg/String", ros_version=2)
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", definition.encode())
-        own = {topic: writer.register_channel(topic, "cdr", schema) for topic, *_ in messages[:3]}
+        channels = {topic: writer.register_channel(topic, "cdr", schema) for topic, *_ in messages[:3]}
         for topic, at_ns, text in messages:
             data = TYPES.serialize_cdr(TYPES.types["std_msgs/msg/String"](data=text), "std_msgs/msg/String")
-            writer.add_message(own[topic], at_ns, bytes(data), at_ns)
+            writer.add_message(channels[topic], at_ns, bytes(data), at_ns)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
 
@@ -225,7 +225,7 @@ def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def work_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -259,9 +259,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ids=lambda connection: " ".join(connection) if isinstance(connection, tuple) else "",
 )
 def test_impossible_requests_are_reported(
-    here: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
+    work_folder: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], code: int, output_text: str
 ) -> None:
-    write_bag(here, BagFormat.ROS1, expected(5))
+    write_bag(work_folder, BagFormat.ROS1, expected(5))
     Path("text.bag").write_text("a text")
     Path("packed.bag.gz").write_bytes(gzip.compress(b"a bag"))
     Path("empty.bag").touch()
@@ -271,10 +271,10 @@ def test_impossible_requests_are_reported(
     shutil.copyfile("all.bag", "all.db3")
     Path("zeros.mcap").write_bytes(bytes(1000))
     shutil.copyfile(KILLED / "bz2.bag.active", "killed.bag")
-    names = {path.name for path in here.iterdir()}
+    names = {path.name for path in work_folder.iterdir()}
     assert main(["bag", *words]) == code
     assert output_text in capsys.readouterr().err
-    assert {path.name for path in here.iterdir()} == names, "no file remains"
+    assert {path.name for path in work_folder.iterdir()} == names, "no file remains"
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.NONE])
@@ -301,9 +301,9 @@ def test_single_mcap_file_is_a_bag(
 
 
 def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
+    database = data_file(write_bag(tmp_path, BagFormat.SQLITE, expected(300)))
     cut = tmp_path / "cut.db3"
-    cut.write_bytes(whole.read_bytes()[:30_000])
+    cut.write_bytes(database.read_bytes()[:30_000])
     assert main(["bag", "check", str(cut)]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
     assert "there is no metadata.yaml" in output_text
@@ -317,10 +317,10 @@ def test_remedy_for_a_truncated_database(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_sparse_file_is_reported_in_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    whole = data_file(in_chunks(tmp_path / "all", expected(300)))
-    with whole.open("r+b") as opened:
+    bag = data_file(in_chunks(tmp_path / "all", expected(300)))
+    with bag.open("r+b") as opened:
         opened.truncate(1 << 42)
-    assert main(["bag", "check", str(whole)]) == EvidenceError.exit_code
+    assert main(["bag", "check", str(bag)]) == EvidenceError.exit_code
     assert "can be recovered" in capsys.readouterr().err
 
 

@@ -78,7 +78,7 @@ def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late
 
 
 @pytest.mark.parametrize(
-    ("made", "frame", "places"),
+    ("make_message", "frame", "places"),
     [
         (odometry, PLACED, [[0, 0, 0], [1, 2, 0]]),
         (stamped, "frame map", [[0, 0, 0], [1, 2, 0]]),
@@ -88,9 +88,9 @@ def write_bag(folder: Path, messages: Iterable[Any], topic: str = "/where", late
     ],
 )
 def test_every_message_type_has_positions(
-    tmp_path: Path, made: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
+    tmp_path: Path, make_message: Callable[[int, float, float], Any], frame: str, places: list[list[float]]
 ) -> None:
-    path = write_bag(tmp_path, [made(BEGAN_NS, 0.0, 0.0), made(BEGAN_NS + S, 1.0, 2.0)])
+    path = write_bag(tmp_path, [make_message(BEGAN_NS, 0.0, 0.0), make_message(BEGAN_NS + S, 1.0, 2.0)])
     samples = bag_positions.read_bag(path, PositionSource(topic="/where"))
     assert (samples.frame, samples.values.tolist()) == (frame, places)
     assert samples.times_ns.tolist() == [BEGAN_NS, BEGAN_NS + S]
@@ -117,8 +117,8 @@ def transform2(x: float, y: float, frame: str, child: str) -> Any:  # noqa: ANN4
 def test_ros_2_bags_and_the_child_frame_of_a_transform_tree(tmp_path: Path) -> None:
     kind = "tf2_msgs/msg/TFMessage"
     tree: Any = STORE2.types[kind]
-    both = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
-    path = write_ros2_bag(tmp_path, both, kind)
+    transforms = tree([transform2(1.0, 2.0, "world", "/base"), transform2(5.0, 5.0, "base", "wheel")])
+    path = write_ros2_bag(tmp_path, transforms, kind)
     samples = bag_positions.read_bag(path, PositionSource(topic="/where", child="base"))
     assert (samples.frame, samples.values.tolist()) == ("frame world", [[1, 2, 0]])
     with pytest.raises(EvidenceError, match="has positions in several frames: base, world"):

@@ -14,7 +14,7 @@ from fieldkit.ros.bags.formats import BagFormat
 from fieldkit.ros.bags.salvage import DamagedError
 from tests.ros.bags.test_bag_command import KILLED, data_file, expected, write_bag
 
-WHOLE = (KILLED / "open.bag.active").read_bytes()
+COMPLETE_BAG = (KILLED / "open.bag.active").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_a_record_longer_than_an_integer_of_the_platform_is_damaged(tmp_path: Pa
         list(salvage.messages(BagFormat.MCAP, bag))
 
 
-@given(st.integers(13, len(WHOLE)))
+@given(st.integers(13, len(COMPLETE_BAG)))
 def test_longer_file_recovers_no_less(tmp_path_factory: pytest.TempPathFactory, length: int) -> None:
     def saved(data: bytes) -> int:
         file: Path = tmp_path_factory.getbasetemp() / "cut.bag"
@@ -70,4 +70,4 @@ def test_longer_file_recovers_no_less(tmp_path_factory: pytest.TempPathFactory, 
             return count
         return count
 
-    assert saved(WHOLE[: length // 2]) <= saved(WHOLE[:length]) <= 266
+    assert saved(COMPLETE_BAG[: length // 2]) <= saved(COMPLETE_BAG[:length]) <= 266

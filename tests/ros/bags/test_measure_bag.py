@@ -47,10 +47,10 @@ print(bag_reader.answer({{"path": {str(path)!r}}})["messages"], {{"ruamel", "sql
 
 
 def test_a_bag_truncated_at_any_byte_is_refused_with_a_remedy(tmp_path: Path) -> None:
-    whole = write_bag(tmp_path / "scan.bag", {"/scan": 5}).read_bytes()
+    content = write_bag(tmp_path / "scan.bag", {"/scan": 5}).read_bytes()
     cut = tmp_path / "cut.bag"
-    for size in range(0, len(whole), 37):
-        cut.write_bytes(whole[:size])
+    for size in range(0, len(content), 37):
+        cut.write_bytes(content[:size])
         with pytest.raises(EvidenceError) as caught:
             bag.read(cut)
         assert caught.value.remedy
@@ -87,13 +87,13 @@ def test_a_missing_bag_is_refused(tmp_path: Path) -> None:
 
 
 def test_flipped_bytes_are_refused_or_read_but_raise_nothing_else(tmp_path: Path) -> None:
-    whole = write_bag(tmp_path / "scan.bag", {"/scan": 2}).read_bytes()
+    content = write_bag(tmp_path / "scan.bag", {"/scan": 2}).read_bytes()
     path = tmp_path / "flipped.bag"
     random = np.random.default_rng(5)
     # The index, which is read, is at the end; the padding of the header is omitted.
-    ends = [*range(120), *range(4100, len(whole))]
+    ends = [*range(120), *range(4100, len(content))]
     for at in random.choice(ends, 400, replace=False):
-        data = bytearray(whole)
+        data = bytearray(content)
         data[at] ^= 1 << int(random.integers(8))
         path.write_bytes(data)
         with contextlib.suppress(EvidenceError):
@@ -159,16 +159,16 @@ def test_a_damaged_ros2_bag_is_refused_or_read_but_raises_nothing_else(
 ) -> None:
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 3, "/odom": 2})
     target = path if damaged == "file" else path.parent / "metadata.yaml"
-    whole = target.read_bytes()
+    content = target.read_bytes()
     random = np.random.default_rng(5)
     for _ in range(150):
-        data = bytearray(whole)
+        data = bytearray(content)
         data[random.integers(len(data))] ^= 1 << int(random.integers(8))
         target.write_bytes(data)
         with contextlib.suppress(EvidenceError):
             bag.read(path)
-    for size in random.integers(0, len(whole) * 9 // 10, 20):
-        target.write_bytes(whole[:size])
+    for size in random.integers(0, len(content) * 9 // 10, 20):
+        target.write_bytes(content[:size])
         with pytest.raises(EvidenceError) as caught:
             bag.read(path)
         assert caught.value.remedy

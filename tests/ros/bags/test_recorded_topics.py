@@ -50,8 +50,11 @@ def read(folder: Path, *topics: str, duration_s: float = 5.0) -> RecordingRecept
 
 
 def test_discovery_is_of_the_slowest_topic_and_the_gap_of_any_topic(tmp_path: Path) -> None:
-    came = {"/scan": [BEGAN_NS + at for at in (S // 2, S, 5 * S)], "/imu": [BEGAN_NS + S + S // 4, BEGAN_NS + 4 * S]}
-    write(tmp_path, log({"/imu": BEGAN_NS, "/scan": BEGAN_NS}), came)
+    arrived_ns = {
+        "/scan": [BEGAN_NS + at for at in (S // 2, S, 5 * S)],
+        "/imu": [BEGAN_NS + S + S // 4, BEGAN_NS + 4 * S],
+    }
+    write(tmp_path, log({"/imu": BEGAN_NS, "/scan": BEGAN_NS}), arrived_ns)
     assert read(tmp_path, "/scan") == RecordingReception(discovered=True, messages=3, discovery_s=0.5, gap_s=4.0)
     assert read(tmp_path, "/scan", "/imu") == RecordingReception(
         discovered=True, messages=5, discovery_s=1.25, gap_s=4.0

@@ -35,7 +35,7 @@ def one_second(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def unpacks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[sandbox.SandboxedReader]:
+def unpacking_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[sandbox.SandboxedReader]:
     """Reader that unpacks 1 kB and is killed by the signals of the query, one per try, before it answers."""
     (tmp_path / "unpacks.py").write_text(_UNPACKS, encoding="utf-8")
     (tmp_path / "tmp").mkdir()
@@ -67,7 +67,7 @@ sandbox.serve(answer)
 
 
 @pytest.mark.parametrize(
-    ("signals", "why"),
+    ("signals", "reason"),
     [
         ([], None),
         ([signal.SIGKILL], None),  # as the kernel if memory is short
@@ -78,23 +78,23 @@ sandbox.serve(answer)
     ],
 )
 def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
-    unpacks: sandbox.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], why: str | None
+    unpacking_reader: sandbox.SandboxedReader, tmp_path: Path, signals: list[signal.Signals], reason: str | None
 ) -> None:
     question = {"signals": signals, "ended": str(tmp_path / "ended")}
-    if why is None:
-        assert unpacks.query(question, 1) == {"said": "whole"}
+    if reason is None:
+        assert unpacking_reader.query(question, 1) == {"said": "whole"}
     else:
-        with pytest.raises(sandbox.ReaderError, match=why):
-            unpacks.query(question, 1)
+        with pytest.raises(sandbox.ReaderError, match=reason):
+            unpacking_reader.query(question, 1)
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_the_limit_of_an_answer_grows_with_the_file(unpacks: sandbox.SandboxedReader) -> None:
+def test_the_limit_of_an_answer_grows_with_the_file(unpacking_reader: sandbox.SandboxedReader) -> None:
     large = sandbox.ANSWER_BYTES + 1000
-    assert len(unpacks.query({"says": large}, 4096)["said"]) == large
+    assert len(unpacking_reader.query({"says": large}, 4096)["said"]) == large
     with pytest.raises(sandbox.ReaderError, match="its contents exceed the limit for a file of its size"):
-        unpacks.query({"says": large}, 10)
-    assert len(unpacks.query({"says": 10}, 10)["said"]) == 10, "the next query is answered"
+        unpacking_reader.query({"says": large}, 10)
+    assert len(unpacking_reader.query({"says": 10}, 10)["said"]) == 10, "the next query is answered"
 
 
 def test_a_reader_needs_no_disk_space_if_it_unpacks_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,14 +78,24 @@ class Site:
             output_text, errors = process.communicate()
         return subprocess.CompletedProcess(argv, process.returncode, output_text, errors)
 
-    def bridge_line(self, over: str, *words: str) -> tuple[str, ...]:
-        line = ("bridge", "--from", "ros1", "--to", over, "--address", self.near.address, "--domain", str(DOMAIN))
+    def bridge_line(self, middleware_name: str, *words: str) -> tuple[str, ...]:
+        line = (
+            "bridge",
+            "--from",
+            "ros1",
+            "--to",
+            middleware_name,
+            "--address",
+            self.near.address,
+            "--domain",
+            str(DOMAIN),
+        )
         return (sys.executable, "-m", "fieldkit", *line, *words)
 
     @contextmanager
-    def bridge(self, over: str, *words: str) -> Iterator[Process]:
+    def bridge(self, middleware_name: str, *words: str) -> Iterator[Process]:
         """Run a bridge while the body runs; it is ready when the body starts."""
-        with self.started(self.near, *self.bridge_line(over, *words)) as process:
+        with self.started(self.near, *self.bridge_line(middleware_name, *words)) as process:
             assert process.stderr is not None
             output_text = process.stderr.readline()
             assert output_text.startswith("note: the bridge is up"), output_text + process.stderr.read()
@@ -95,14 +105,14 @@ class Site:
         """Run a ROS 1 node."""
         return self.started(self.near, "/usr/bin/python3", str(ENDS / "ros1_end.py"), verb)
 
-    def wire(self, verb: str, over: str, quality: str = "") -> AbstractContextManager[Process]:
+    def wire(self, verb: str, middleware_name: str, quality: str = "") -> AbstractContextManager[Process]:
         """Run a publisher or subscriber without ROS 1 on the other host."""
         topic = topics.describe(shipped(), "/scan", TYPE, parse_qos(quality), domain=DOMAIN, node=verb)
-        settings = {"listen/endpoints": f'["tcp/{self.far.address}:0"]'} if over == "zenoh" else {}
+        settings = {"listen/endpoints": f'["tcp/{self.far.address}:0"]'} if middleware_name == "zenoh" else {}
         network = {"address": self.far.address, "domain": DOMAIN, "node": verb, "settings": settings}
         samples = self.folder / "samples"
         samples.write_text("\n".join(map(scan, range(FOREIGN, FOREIGN + 50 * LIMIT_S))), encoding="ascii")
-        words = (verb, over, json.dumps(network), json.dumps(topic), str(samples))
+        words = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(samples))
         return self.started(self.far, sys.executable, str(ENDS / "wire_end.py"), *words)
 
 
@@ -150,15 +160,15 @@ def number_of_ros1(line: str) -> int:
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str) -> None:
+@pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
+def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware_name: str) -> None:
     """Both sides publish and subscribe: a sample that loops would arrive twice."""
     with (
-        site.wire("hear", over) as wire_subscriber,
+        site.wire("hear", middleware_name) as wire_subscriber,
         site.ros1("hear") as ros1_subscriber,
-        site.bridge(over, "--both", SCAN, "--json") as running,
+        site.bridge(middleware_name, "--both", SCAN, "--json") as running,
         site.ros1("say"),
-        site.wire("say", over),
+        site.wire("say", middleware_name),
     ):
         received_by_wire, received_by_ros1 = (
             received(wire_subscriber, number_of_cdr),
@@ -177,8 +187,11 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str)
 
     assert (running.returncode, errors) == (0, "")
     report = {(counts["source"], counts["target"]): counts for counts in json.loads(output_text)}
-    assert report.keys() == {("ros1", over), (over, "ros1")}
-    size_bytes = {"ros1": len(shipped().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)), over: len(scan(1)) // 2}
+    assert report.keys() == {("ros1", middleware_name), (middleware_name, "ros1")}
+    size_bytes = {
+        "ros1": len(shipped().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)),
+        middleware_name: len(scan(1)) // 2,
+    }
     for (source, _), counts in report.items():
         assert counts["messages"] >= ENOUGH
         assert counts["bytes"] == counts["messages"] * size_bytes[source]
@@ -188,13 +201,13 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, over: str)
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("over", mark_nightly(["dds", "zenoh"]))
-def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, over: str) -> None:
+@pytest.mark.parametrize("middleware_name", mark_nightly(["dds", "zenoh"]))
+def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, middleware_name: str) -> None:
     latched = ("rostopic", "pub", "--latch", "/scan", "sensor_msgs/LaserScan", "{header: {frame_id: once}}")
     late = "transient_local,depth=1"
-    with site.bridge(over, f"{SCAN}:{late}"), site.started(site.near, *latched):
+    with site.bridge(middleware_name, f"{SCAN}:{late}"), site.started(site.near, *latched):
         for _ in range(2):  # the second subscriber starts after the message was forwarded
-            with site.wire("hear", over, late) as subscriber:
+            with site.wire("hear", middleware_name, late) as subscriber:
                 assert subscriber.stdout is not None
                 received: Any = shipped().ros2.deserialize_cdr(bytes.fromhex(subscriber.stdout.readline()), TYPE)
                 assert received.header.frame_id == "once"
@@ -233,15 +246,15 @@ def test_missing_master_is_reported(site: Site) -> None:
     assert "roscore" in done.stderr
 
 
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
-def test_topic_of_another_type_is_detected_without_a_master(over: str) -> None:
+@pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
+def test_topic_of_another_type_is_detected_without_a_master(middleware_name: str) -> None:
     def described(kind: str) -> Topic:
         report = topics.describe(shipped(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
         return Topic.from_json(report)
 
-    settings = {"listen/endpoints": '["tcp/127.0.0.1:0"]'} if over == "zenoh" else {}
+    settings = {"listen/endpoints": '["tcp/127.0.0.1:0"]'} if middleware_name == "zenoh" else {}
     network = Network("127.0.0.1", discovery="peers", domain=DOMAIN, settings=settings)
-    running = middleware.adapter(over)(network)
+    running = middleware.adapter(middleware_name)(network)
     publisher = running.publisher(described("std_msgs/String"))
     assert running.other_types(described(TYPE)) == {"std_msgs::msg::dds_::String_"}
     assert running.other_types(described("std_msgs/String")) == set()

@@ -182,19 +182,19 @@ def test_of_robots_with_a_common_master_only_the_first_has_a_bridge() -> None:
     ],
 )
 def test_a_wrong_profile_is_reported_with_its_location(text: str, output_text: str, tmp_path: Path) -> None:
-    own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
-    file.write_text(own.replace("ros:\n  variant: ros1\n", f"ros:\n  variant: ros1\n  bridge: {text}\n"))
+    file.write_text(profile.replace("ros:\n  variant: ros1\n", f"ros:\n  variant: ros1\n  bridge: {text}\n"))
     with pytest.raises(ConfigurationError, match=output_text) as caught:
         schema.load(file, RobotProfile)
     assert "own.yaml:" in str(caught.value)
 
 
 def test_a_robot_with_ros_2_needs_no_bridge(tmp_path: Path) -> None:
-    own = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
+    profile = (ROOT / "robots" / "turtlebot3_burger.yaml").read_text(encoding="utf-8")
     file = tmp_path / "own.yaml"
-    asks = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
-    file.write_text(own.replace("ros:\n  variant: ros1\n", asks))
+    configuration = f"ros:\n  variant: ros2\n  bridge: {{to: dds, topics: ['{SCAN}']}}\n"
+    file.write_text(profile.replace("ros:\n  variant: ros1\n", configuration))
     with pytest.raises(ConfigurationError, match="needs no bridge"):
         schema.load(file, RobotProfile)
 

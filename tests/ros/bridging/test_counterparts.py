@@ -94,11 +94,11 @@ def ranges(variance: float) -> tuple[bytes, bytes]:
     """Return a range in the serialization of rosbags for Noetic and for Jazzy."""
     types = shipped()
     messages = []
-    for store, more in ((types.ros1, ()), (types.ros2, (variance,))):
+    for store, extra_fields in ((types.ros1, ()), (types.ros2, (variance,))):
         stamp = store.types["builtin_interfaces/msg/Time"](3, 4)
         numbers = {"seq": 0} if store is types.ros1 else {}
         header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="sonar", **numbers)
-        messages.append(store.types["sensor_msgs/msg/Range"](header, 0, 0.5, 0.25, 4.0, 1.5, *more))
+        messages.append(store.types["sensor_msgs/msg/Range"](header, 0, 0.5, 0.25, 4.0, 1.5, *extra_fields))
     ros1, ros2 = messages
     kind = "sensor_msgs/msg/Range"
     return bytes(types.ros1.serialize_ros1(ros1, kind)), bytes(types.ros2.serialize_cdr(ros2, kind))

@@ -22,7 +22,7 @@ def test_type_in_either_spelling_and_default_quality() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("text", "expected"),
     [
         ("", QosProfile()),
         ("sensor_data", PROFILES["sensor_data"]),
@@ -32,8 +32,8 @@ def test_type_in_either_spelling_and_default_quality() -> None:
         ("sensor_data,reliable", QosProfile(depth=5)),
     ],
 )
-def test_quality_is_a_profile_with_policies(text: str, wanted: QosProfile) -> None:
-    assert parse_qos(text) == wanted
+def test_quality_is_a_profile_with_policies(text: str, expected: QosProfile) -> None:
+    assert parse_qos(text) == expected
 
 
 @pytest.mark.parametrize("text", ["sensor", "depth=0", "default,,", "reliable,sensor_data", "depth=9999999", " "])

@@ -12,9 +12,9 @@ from pathlib import Path
 from fieldkit.agent.messaging import middleware
 from fieldkit.agent.messaging.middleware import Network, Topic
 
-verb, over = sys.argv[1:3]
+verb, middleware_name = sys.argv[1:3]
 network, described = map(json.loads, sys.argv[3:5])
-running = middleware.adapter(over)(Network(**network))
+running = middleware.adapter(middleware_name)(Network(**network))
 topic = Topic.from_json(described)
 pause = threading.Event()
 

@@ -58,8 +58,8 @@ def test_zenoh_reads_its_file(tmp_path: Path, transport: str) -> None:
     settings = tuning.recommended_settings("zenoh", transport)
     path.write_text(configurations.configuration_text("zenoh", transport, settings, COMMENT), encoding="utf-8")
     config = zenoh.Config.from_file(str(path))
-    for where, text in settings.items():
-        read, expected = json.loads(config.get_json(where)), json.loads(text)
+    for profile, text in settings.items():
+        read, expected = json.loads(config.get_json(profile)), json.loads(text)
         pairs = zip(read, expected, strict=True) if isinstance(expected, list) else []
         assert read == expected or all(
             {key: printed["config"][key] for key in other["config"]} == other["config"] for printed, other in pairs

@@ -82,9 +82,9 @@ def test_too_few_repeats_never_pass() -> None:
 
 
 def test_void_and_failed_repeats_do_not_count() -> None:
-    own = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
-    assert own.attempts == 6
-    assert judge(own).lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
+    measured_cell = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
+    assert measured_cell.attempts == 6
+    assert judge(measured_cell).lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
     # The loss of a void repeat proves nothing either.
     assert judge(cell([0, 0, 0, 0, 0, 90], status=[*5 * ["valid"], "void"])).passed
 
@@ -107,26 +107,26 @@ def test_no_valid_repeat_at_all_is_undecided() -> None:
 
 @pytest.mark.parametrize(("largest_s", "passed"), [(0.2, True), (0.201, False)])
 def test_a_delay_limit_applies_to_every_repeat(largest_s: float, passed: bool) -> None:
-    own = cell(5 * [0], delay_s=[0.01, 0.02, largest_s, 0.01, 0.01])
-    assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
+    measured_cell = cell(5 * [0], delay_s=[0.01, 0.02, largest_s, 0.01, 0.01])
+    assessment = judge(measured_cell, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert assessment.passed == passed
     assert bool(assessment.failed) == (not passed)
-    assert judge(own).passed
+    assert judge(measured_cell).passed
 
 
 def test_a_missing_delay_never_passes() -> None:
-    own = cell(5 * [0], delay_s=[0.01, 0.02, UNKNOWN, 0.01, 0.01])
-    assessment = judge(own, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
+    measured_cell = cell(5 * [0], delay_s=[0.01, 0.02, UNKNOWN, 0.01, 0.01])
+    assessment = judge(measured_cell, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert not assessment.failed
     assert "1 of 5 repeats have no value" in assessment.lacking[0]
-    assert judge(own).passed  # without a delay limit it is not needed
+    assert judge(measured_cell).passed  # without a delay limit it is not needed
 
 
 def test_a_censored_delay_never_passes() -> None:
     # More than 5 % were lost, so that the delay of 95 % of those sent is censored.
     lenient = LinkCriterion(0.5, 0.2)
-    own = cell(5 * [10], delay_sent_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
-    assessment = judge(own, criterion=lenient)
+    measured_cell = cell(5 * [10], delay_sent_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
+    assessment = judge(measured_cell, criterion=lenient)
     assert not assessment.failed
     assert "in 1 of 5 repeats too much was lost for a value over all sent items" in assessment.lacking[0]
     # The received samples were already late, so it fails whatever the lost ones would have been.
@@ -171,8 +171,8 @@ def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:
 
 
 def test_the_evidence_contains_every_repeat() -> None:
-    own = cell([0, 1, 0, 0, 1], delay_s=[0.01, 0.02, 0.03, UNKNOWN, 0.01])
-    text = "\n".join(candidates.evidence(judge(own), ONE_PERCENT))
+    measured_cell = cell([0, 1, 0, 0, 1], delay_s=[0.01, 0.02, 0.03, UNKNOWN, 0.01])
+    text = "\n".join(candidates.evidence(judge(measured_cell), ONE_PERCENT))
     assert "loss <= 0.01 in 5 of 5 repeats: in at least 55 % of all repeats, with 95 % confidence" in text
     assert "by repeat 0.0, 1.0, 0.0, 0.0, 1.0" in text
     assert "by repeat 10.0, 20.0, 30.0, 10.0, unknown in 1" in text

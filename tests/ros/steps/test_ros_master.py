@@ -94,10 +94,10 @@ def test_master_on_robot_without_ros_1_is_refused(tmp_path: Path, monkeypatch: p
 
 def test_preflight_checks_only_shared_masters() -> None:
     record = RecordStep.model_validate({"robot": "receiver", "topics": ("/scan",), "duration": "1s"})
-    own, shared = (
+    separate, shared = (
         {need.name: need for need in record.needs(Scene(Protocol.TCP, cast, "f"))} for cast in (CAST, SHARED)
     )
-    assert own.keys() == {"ROS"}
+    assert separate.keys() == {"ROS"}
     assert shared.keys() == {"ROS", "ROS master"}
     assert shared["ROS master"].missing_program == "rosbag", "no recording is tried without a master"
     assert shared["ROS"].argv[-3:] == ("sh", "-c", 'echo "$ROS_DISTRO $ROS_MASTER_URI"')
@@ -134,8 +134,8 @@ def test_battery_topics_of_shared_master_are_ambiguous() -> None:
 
 
 def test_profiles_hash_depends_on_sharing_but_not_on_addresses() -> None:
-    own, shared = (plan_of(cast).profiles_sha256 for cast in (CAST, SHARED))
-    assert own != shared
+    separate, shared = (plan_of(cast).profiles_sha256 for cast in (CAST, SHARED))
+    assert separate != shared
     moved = {
         role: robot.model_copy(update={"address": f"10.9.9.{number}", "ros_master": "10.9.9.2"})
         for number, (role, robot) in enumerate(SHARED.items())

@@ -182,10 +182,13 @@ def together(*several: str, within: str = "together") -> str:
     )
 
 
-@pytest.mark.parametrize("over", ["zenoh", "zenoh, discovery: router", "ros1"])
-def test_simultaneous_streams_need_different_domains(over: str) -> None:
+@pytest.mark.parametrize("middleware_name", ["zenoh", "zenoh, discovery: router", "ros1"])
+def test_simultaneous_streams_need_different_domains(middleware_name: str) -> None:
     """In one domain they would listen on the same ports of the receiver, the router or the master."""
-    keys = f"from: sender, to: receiver, over: {over}", f"from: relay, to: receiver, over: {over}, topic: /b"
+    keys = (
+        f"from: sender, to: receiver, over: {middleware_name}",
+        f"from: relay, to: receiver, over: {middleware_name}, topic: /b",
+    )
     with pytest.raises(ConfigurationError, match=r"is used twice at the same time on .*; give one another domain"):
         schema.validate(schema.parse(together(*keys), source="x.yaml"), Procedure)
     schema.validate(schema.parse(together(keys[0], f"{keys[1]}, domain: 7"), source="x.yaml"), Procedure)
@@ -200,7 +203,7 @@ def test_streams_of_dds_may_share_a_domain_but_not_a_pair_in_a_capture() -> None
 
 
 @pytest.mark.parametrize(
-    ("over", "remedy"),
+    ("middleware_name", "remedy"),
     [
         ("dds", "pip install cyclonedds"),
         ("zenoh", "pip install eclipse-zenoh"),
@@ -208,8 +211,8 @@ def test_streams_of_dds_may_share_a_domain_but_not_a_pair_in_a_capture() -> None
         ("ros2", "setup files"),
     ],
 )
-def test_missing_middleware_fails_with_remedy(over: str, remedy: str) -> None:
-    step = topics(f"over: {over}")
+def test_missing_middleware_fails_with_remedy(middleware_name: str, remedy: str) -> None:
+    step = topics(f"over: {middleware_name}")
     needs = list(step.needs(SCENE))
     assert [need.role for need in needs] == [Role.SENDER, Role.RECEIVER]
     verdict, detail, remedy_text = needs[0].judge(
@@ -250,11 +253,11 @@ def trial(
     *,
     loss: str,
     topology: str = "masterless",
-    more: str = "",
+    extra_keys: str = "",
 ) -> Path:
     """Run a trial of one repeat; return its folder."""
     text = PROCEDURE.format(topology=topology, topics=f"{{from: sender, to: receiver, {keys}}}")
-    return trial_of(folder, monkeypatch, text + more, SITE.replace("LOSS", loss))
+    return trial_of(folder, monkeypatch, text + extra_keys, SITE.replace("LOSS", loss))
 
 
 def trial_of(folder: Path, monkeypatch: pytest.MonkeyPatch, procedure: str, site: str) -> Path:
@@ -315,9 +318,9 @@ def test_topics_with_router_and_master_and_several_publishers(
         for number, role in enumerate(("sender", "relay"), start=1)
     ]
     text = "".join(f"        - topics: {keys}\n" for keys in stream_keys)
-    more = f"{zenoh}  - together:\n      during:\n{text}"
+    extra_keys = f"{zenoh}  - together:\n      during:\n{text}"
     ros1 = "over: ros1, rate: 50Hz, duration: 1s"
-    row_values = row(trial(tmp_path, monkeypatch, ros1, loss="0%", topology="master", more=more))
+    row_values = row(trial(tmp_path, monkeypatch, ros1, loss="0%", topology="master", extra_keys=extra_keys))
     for name in ("", "z.", "zenoh1.", "zenoh2.", "ros11.", "ros12."):
         assert row_values[f"{name}topic_sent"] == row_values[f"{name}topic_received"] != "0"
     for name in ("", "z."):

@@ -84,8 +84,8 @@ def test_each_robot_records_with_its_recorder_until_stopped() -> None:
 
 
 def test_odometry_needs_facing() -> None:
-    (refused,) = track("{sender: {topic: /odom}}").refusals(SCENE)
-    assert "facing: away, towards, left or right" in refused.remedy
+    (refusal,) = track("{sender: {topic: /odom}}").refusals(SCENE)
+    assert "facing: away, towards, left or right" in refusal.remedy
     assert not list(track("{sender: {topic: /odom, facing: left}}").refusals(SCENE))
 
 

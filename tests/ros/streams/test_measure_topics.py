@@ -70,9 +70,9 @@ def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> d
 
 @given(st.sets(st.integers(0, 49)), st.lists(st.integers(0, 49), max_size=5))
 def test_losses_are_samples_that_never_arrived(lost: set[int], again: list[int]) -> None:
-    there = [number for number in range(50) if number not in lost]
+    arrived_numbers = [number for number in range(50) if number not in lost]
     repeated = [number for number in again if number not in lost]
-    result = measured(published(50), arrived([*there, *repeated]))
+    result = measured(published(50), arrived([*arrived_numbers, *repeated]))
     assert (result["topic_sent"], result["topic_received"]) == (50, 50 - len(lost))
     assert result["topic_loss"] == pytest.approx(len(lost) / 50)
     assert result["topic_repeated"] == len(repeated)
@@ -213,12 +213,12 @@ def test_two_streams_of_one_pair_have_separate_fragments(seed: int) -> None:
     for number in range(30):
         port, size = draw.choice([DATA, OTHER_DATA]), draw.choice([100, 3000, 9000])
         src, dst = (SENDER, RECEIVER) if draw.random() < 0.8 else (RECEIVER, SENDER)
-        whole = (
+        expected = (
             IP(src=src, dst=dst, id=number % 3)
             / UDP(sport=port, dport=port)
             / bytes(draw.randrange(256) for _ in range(size))
         )
-        cut.append((port, fragment(whole, 1480)))  # type: ignore[no-untyped-call]
+        cut.append((port, fragment(expected, 1480)))  # type: ignore[no-untyped-call]
         if draw.random() < 0.3:  # between two fragments packet_port the last packet
             alone = IP(src=SENDER, dst=RECEIVER, id=number % 3, flags="DF") / UDP(sport=OTHER_DATA, dport=OTHER_DATA)
             cut[-1:] = [(port, cut[-1][1][:1]), (OTHER_DATA, [alone]), (port, cut[-1][1][1:])]

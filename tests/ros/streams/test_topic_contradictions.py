@@ -42,8 +42,8 @@ def with_samples(rows: Sequence[Row], change: Callable[[int, Row], Row | None]) 
     return (*(row for row in rows if not is_sample(row)), *(row for row in changed if row is not None))
 
 
-def changed(made: TopicAttempt, end: str, rows: Sequence[Row]) -> TopicAttempt:
-    return replace(made, sent=tuple(rows)) if end == "sent" else replace(made, received=tuple(rows))
+def changed(attempt: TopicAttempt, end: str, rows: Sequence[Row]) -> TopicAttempt:
+    return replace(attempt, sent=tuple(rows)) if end == "sent" else replace(attempt, received=tuple(rows))
 
 
 def later(row: Row, by_ns: int) -> Row:
@@ -60,8 +60,8 @@ def require_noticed(reasons: list[str], measured: Measured, before: Measured) ->
             continue
         assert isinstance(now, float), f"{name} is {now}, not {value}"
         assert isinstance(value, float), f"{name} is {now}, not {value}"
-        most = max(topic_captures.SLOW_S, 0.1 * now) if name.endswith("_s") else 0.0
-        assert now == pytest.approx(value, abs=most + 1e-4), f"{name} is {now}, not {value}"
+        tolerance = max(topic_captures.SLOW_S, 0.1 * now) if name.endswith("_s") else 0.0
+        assert now == pytest.approx(value, abs=tolerance + 1e-4), f"{name} is {now}, not {value}"
 
 
 @pytest.mark.parametrize("signed", [True, False], ids=["signed", "unsigned"])
@@ -80,9 +80,9 @@ SHIFTS = (HOUR, -HOUR, 50 * MS, -50 * MS, 10 * MS, -2 * MS, SECOND)
 @pytest.mark.parametrize("shift_ns", SHIFTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_path: Path) -> None:
-    made = KINDS[kind]
-    received = with_samples(made.received, lambda _, row: later(row, shift_ns))
-    reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
+    attempt = KINDS[kind]
+    received = with_samples(attempt.received, lambda _, row: later(row, shift_ns))
+    reasons, _ = topic_attempts.judge_attempt(replace(attempt, received=received), tmp_path)
     assert reasons
     which = "earlier than their packets" if shift_ns < 0 else "later than its capture for every sample"
     which = "from before its start or after its end" if abs(shift_ns) == HOUR else which
@@ -91,9 +91,9 @@ def test_a_log_with_shifted_arrivals_is_noticed(kind: str, shift_ns: int, tmp_pa
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_log_without_half_of_the_arrivals_is_noticed(kind: str, tmp_path: Path) -> None:
-    made = KINDS[kind]
-    received = with_samples(made.received, lambda place, row: row if place % 2 else None)
-    reasons, _ = topic_attempts.judge_attempt(replace(made, received=received), tmp_path)
+    attempt = KINDS[kind]
+    received = with_samples(attempt.received, lambda place, row: row if place % 2 else None)
+    reasons, _ = topic_attempts.judge_attempt(replace(attempt, received=received), tmp_path)
     if kind == "reliable with samples given up":  # nothing behind a gap need ever be handed over
         assert reasons
         return
@@ -113,7 +113,7 @@ def other_sending(place: int, row: Row) -> Row:
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "expected_reason"),
     [
         (other_numbers, "numbers that the publisher's log does not have"),
         (other_sizes, "with a size other than 1016 bytes"),
@@ -122,15 +122,15 @@ def other_sending(place: int, row: Row) -> Row:
 )
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_subscribers_log_with_one_wrong_field_is_noticed(
-    kind: str, change: Callable[[int, Row], Row], why: str, tmp_path: Path
+    kind: str, change: Callable[[int, Row], Row], expected_reason: str, tmp_path: Path
 ) -> None:
-    made = replace(KINDS[kind], received=with_samples(KINDS[kind].received, change))
-    reasons, _ = topic_attempts.judge_attempt(made, tmp_path)
-    assert any(why in reason for reason in reasons)
+    attempt = replace(KINDS[kind], received=with_samples(KINDS[kind].received, change))
+    reasons, _ = topic_attempts.judge_attempt(attempt, tmp_path)
+    assert any(expected_reason in reason for reason in reasons)
 
 
 @pytest.mark.parametrize(
-    ("change", "why"),
+    ("change", "expected_reason"),
     [
         (other_numbers, "does not number its samples from 0 on"),
         (other_sizes, "the publisher's log has 1 sample with a size other"),
@@ -139,28 +139,30 @@ def test_a_subscribers_log_with_one_wrong_field_is_noticed(
     ],
 )
 def test_a_publishers_log_with_one_wrong_field_is_noticed(
-    change: Callable[[int, Row], Row | None], why: str, tmp_path: Path
+    change: Callable[[int, Row], Row | None], expected_reason: str, tmp_path: Path
 ) -> None:
-    made = KINDS["best effort with losses"]
-    reasons, _ = topic_attempts.judge_attempt(replace(made, sent=with_samples(made.sent, change)), tmp_path)
-    assert any(why in reason for reason in reasons)
+    attempt = KINDS["best effort with losses"]
+    reasons, _ = topic_attempts.judge_attempt(replace(attempt, sent=with_samples(attempt.sent, change)), tmp_path)
+    assert any(expected_reason in reason for reason in reasons)
 
 
 def test_the_same_change_in_both_logs_is_noticed_by_the_captures(tmp_path: Path) -> None:
-    made = KINDS["reliable over UDP"]
+    attempt = KINDS["reliable over UDP"]
 
     def earlier(_: int, row: Row) -> Row:
         return (*row[:3], row[3] - 30 * MS, row[4])
 
-    both = replace(made, sent=with_samples(made.sent, earlier), received=with_samples(made.received, earlier))
+    both = replace(
+        attempt, sent=with_samples(attempt.sent, earlier), received=with_samples(attempt.received, earlier)
+    )
     reasons, _ = topic_attempts.judge_attempt(both, tmp_path)
     assert any("another time of sending than in its capture" in reason for reason in reasons)
 
 
 @pytest.mark.parametrize("signed", [True, False])
 def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp_path: Path) -> None:
-    made = KINDS["reliable over UDP"]
-    topic_attempts.write(made, tmp_path, signed=signed)
+    attempt = KINDS["reliable over UDP"]
+    topic_attempts.write(attempt, tmp_path, signed=signed)
     sent = (tmp_path / "sender-topic.bin").read_bytes()
     (tmp_path / "receiver-topic.bin").write_bytes(sent)
     log = topic_samples.read_log(tmp_path / "receiver-topic.bin")
@@ -171,8 +173,8 @@ def test_the_publishers_log_is_not_accepted_as_the_subscribers(signed: bool, tmp
 
 def test_the_log_of_another_topic_is_noticed(tmp_path: Path) -> None:
     topic_attempts.write(KINDS["over TCP"], tmp_path)
-    sent, came = (topic_samples.read_log(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
-    (publisher, subscriber) = topic_checks.check_logs(replace(PLAN, topic="/other"), sent, came)
+    sent, received = (topic_samples.read_log(tmp_path / f"{role}-topic.bin") for role in ("sender", "receiver"))
+    (publisher, subscriber) = topic_checks.check_logs(replace(PLAN, topic="/other"), sent, received)
     assert "publisher's log is of another topic" in publisher
     assert "subscriber's log is of another topic" in subscriber
 
@@ -193,15 +195,15 @@ def test_a_record_from_outside_the_attempt_is_noticed(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_samples_in_the_log_that_never_arrived_are_noticed(kind: str, tmp_path: Path) -> None:
     """The subscriber's capture lacks ten samples that are in its log."""
-    made = KINDS[kind]
+    attempt = KINDS[kind]
     few = replace(
-        made,
-        receiver_frames=tuple(frame for frame in made.receiver_frames if not is_data(frame) or frame.time_ns % 4),
+        attempt,
+        receiver_frames=tuple(frame for frame in attempt.receiver_frames if not is_data(frame) or frame.time_ns % 4),
     )
-    sent_again = [row for row in made.sent if is_sample(row)]
-    there = {row[2] for row in made.received if is_sample(row)}
-    extra = [later(row, topic_attempts.AHEAD + 2 * MS) for row in sent_again if row[2] not in there]
-    received = tuple(sorted((*made.received, *extra), key=lambda row: row[4]))
+    sent_again = [row for row in attempt.sent if is_sample(row)]
+    arrived = {row[2] for row in attempt.received if is_sample(row)}
+    extra = [later(row, topic_attempts.AHEAD + 2 * MS) for row in sent_again if row[2] not in arrived]
+    received = tuple(sorted((*attempt.received, *extra), key=lambda row: row[4]))
     if extra:
         reasons, _ = topic_attempts.judge_attempt(replace(few, received=received), tmp_path)
         assert any("are not in its capture" in reason for reason in reasons)
@@ -213,16 +215,16 @@ def is_data(frame: Frame) -> bool:
 
 def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
     """The program stopped for 15 samples; its queue of 10 has the newest."""
-    made = KINDS["reliable over UDP"]
-    resumed = next(row for place, row in enumerate(filter(is_sample, made.received)) if place == 30)[4]
+    attempt = KINDS["reliable over UDP"]
+    resumed = next(row for place, row in enumerate(filter(is_sample, attempt.received)) if place == 30)[4]
 
-    def held(place: int, row: Row) -> Row | None:
+    def delayed(place: int, row: Row) -> Row | None:
         if not 15 <= place < 30:
             return row
         return None if place < 20 else (*row[:4], resumed - MS)
 
     reasons, measured = topic_attempts.judge_attempt(
-        replace(made, received=with_samples(made.received, held)), tmp_path
+        replace(attempt, received=with_samples(attempt.received, delayed)), tmp_path
     )
     assert reasons == []
     assert measured.values["topic_received"] == SAMPLES - 5
@@ -231,15 +233,17 @@ def test_an_overflowed_queue_is_no_contradiction(tmp_path: Path) -> None:
 
 def test_a_capture_without_heads_limits_the_number_of_arrivals(tmp_path: Path) -> None:
     """As with the shorter snap length of older captures: Zenoh's heads were not captured."""
-    made = KINDS["over TCP"]
-    cut = replace(made, sender_frames=shorter(made.sender_frames), receiver_frames=shorter(made.receiver_frames))
+    attempt = KINDS["over TCP"]
+    cut = replace(
+        attempt, sender_frames=shorter(attempt.sender_frames), receiver_frames=shorter(attempt.receiver_frames)
+    )
     assert topic_attempts.judge_attempt(cut, tmp_path)[0] == []
-    early = with_samples(made.received, lambda _, row: later(row, -20 * MS))
+    early = with_samples(attempt.received, lambda _, row: later(row, -20 * MS))
     assert (
         "earlier than their bytes in its capture"
         in topic_attempts.judge_attempt(replace(cut, received=early), tmp_path)[0][0]
     )
-    few = with_samples(made.received, lambda place, row: row if place < 8 else None)
+    few = with_samples(attempt.received, lambda place, row: row if place < 8 else None)
     assert (
         "are not in the subscriber's log" in topic_attempts.judge_attempt(replace(cut, received=few), tmp_path)[0][0]
     )
@@ -265,15 +269,15 @@ def shorter(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 def test_a_change_in_any_range_of_a_field_is_noticed(
     kind: str, end: str, field: int, some: tuple[int, int], by: int, *, folder: Path
 ) -> None:
-    made, (first, count) = KINDS[kind], some
-    rows: list[Row] = list(getattr(made, end))
-    before = topic_attempts.judge_attempt(made, folder)[1]
+    attempt, (first, count) = KINDS[kind], some
+    rows: list[Row] = list(getattr(attempt, end))
+    before = topic_attempts.judge_attempt(attempt, folder)[1]
     for place in range(first, min(first + count, len(rows))):
         row = list(rows[place])
         row[field] = row[field] + by if field else by % 7 + 1
         rows[place] = (row[0], abs(row[1]) % 2**32, row[2], row[3], row[4])
     try:
-        reasons, measured = topic_attempts.judge_attempt(changed(made, end, rows), folder)
+        reasons, measured = topic_attempts.judge_attempt(changed(attempt, end, rows), folder)
     except EvidenceError:
         return
     require_noticed(reasons, measured, before)
@@ -288,16 +292,16 @@ def test_a_change_in_any_range_of_a_field_is_noticed(
 def test_missing_or_duplicated_records_are_noticed(
     kind: str, end: str, chosen: set[int], twice: bool, folder: Path
 ) -> None:
-    made = KINDS[kind]
-    before = topic_attempts.judge_attempt(made, folder)[1]
-    rows: Sequence[Row] = getattr(made, end)
+    attempt = KINDS[kind]
+    before = topic_attempts.judge_attempt(attempt, folder)[1]
+    rows: Sequence[Row] = getattr(attempt, end)
     times = [1 + twice if place in chosen else 1 if twice or place not in chosen else 0 for place in range(len(rows))]
     if not twice:
         times = [int(place not in chosen) for place in range(len(rows))]
-    kept = tuple(row for row, count in zip(rows, times, strict=True) for _ in range(count))
-    if not kept:
+    repeated_rows = tuple(row for row, count in zip(rows, times, strict=True) for _ in range(count))
+    if not repeated_rows:
         return
-    reasons, measured = topic_attempts.judge_attempt(changed(made, end, kept), folder)
+    reasons, measured = topic_attempts.judge_attempt(changed(attempt, end, repeated_rows), folder)
     if kind == "reliable with samples given up" and end == "received" and not twice:
         return  # behind a gap nothing shows whether the middleware handed a sample over
     require_noticed(reasons, measured, before)
@@ -305,8 +309,8 @@ def test_missing_or_duplicated_records_are_noticed(
 
 @given(end=st.sampled_from(["sender", "receiver"]), place=st.integers(0), bit=st.integers(0, 7))
 def test_a_flipped_bit_in_a_log_with_a_checksum_is_noticed(end: str, place: int, bit: int, folder: Path) -> None:
-    made = KINDS["over TCP"]
-    topic_attempts.write(made, folder)
+    attempt = KINDS["over TCP"]
+    topic_attempts.write(attempt, folder)
     path = folder / f"{end}-topic.bin"
     content = bytearray(path.read_bytes())
     content[place % len(content)] ^= 1 << bit

@@ -38,34 +38,34 @@ def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
 
 
 def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> None:
-    whole = write_log(tmp_path / "log")
-    for length in range(len(records.MAGIC), len(whole)):
-        (tmp_path / "cut").write_bytes(whole[:length])
+    log = write_log(tmp_path / "log")
+    for length in range(len(records.MAGIC), len(log)):
+        (tmp_path / "cut").write_bytes(log[:length])
         parsed = topic_samples.read_log(tmp_path / "cut")
         assert not parsed.whole
         assert len(parsed.samples) == min(max((length - len(records.MAGIC)) // topic_samples.RECORD_BYTES - 2, 0), 3)
 
 
 def test_a_log_with_a_wrong_count_is_rejected(tmp_path: Path) -> None:
-    whole, size = write_log(tmp_path / "log"), topic_samples.RECORD_BYTES
+    log, size = write_log(tmp_path / "log"), topic_samples.RECORD_BYTES
     start = len(records.MAGIC) + 2 * size
-    for damaged in (whole[:start] + whole[start + size :], whole + whole[-size:]):
+    for damaged in (log[:start] + log[start + size :], log + log[-size:]):
         (tmp_path / "log").write_bytes(damaged)
         with pytest.raises(EvidenceError, match="does not have the number of samples"):
             topic_samples.read_log(tmp_path / "log")
 
 
-@given(zeros=st.integers(0, 5000), ended=st.booleans())
+@given(zeros=st.integers(0, 5000), has_end=st.booleans())
 def test_zeros_after_the_last_record_are_ignored(
-    zeros: int, ended: bool, tmp_path_factory: pytest.TempPathFactory
+    zeros: int, has_end: bool, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     """A killed writer leaves zeros: between two records, or between its last record and the end of the file."""
     log = tmp_path_factory.getbasetemp() / "zeros"
-    whole = write_log(log)
-    log.write_bytes(whole[: None if ended else -topic_samples.RECORD_BYTES] + bytes(zeros))
+    content = write_log(log)
+    log.write_bytes(content[: None if has_end else -topic_samples.RECORD_BYTES] + bytes(zeros))
     parsed = topic_samples.read_log(log)
     assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
-    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, ended)
+    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, has_end)
     assert parsed.samples.sequence.tolist() == [0, 1, 2]
 
 

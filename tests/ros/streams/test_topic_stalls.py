@@ -29,9 +29,9 @@ def measured(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -
 
 @given(st.sets(st.integers(1, 98), max_size=95))
 def test_consecutive_lost_samples_are_overdue_by_one_interval_each(lost: set[int]) -> None:
-    there = [number for number in range(100) if number not in lost]
-    result = measured(published(100), arrived(there))
-    overdue_s = [(later - earlier - 1) * 0.1 for earlier, later in pairwise(there)]
+    arrived_numbers = [number for number in range(100) if number not in lost]
+    result = measured(published(100), arrived(arrived_numbers))
+    overdue_s = [(later - earlier - 1) * 0.1 for earlier, later in pairwise(arrived_numbers)]
     assert result["stall_s"] == pytest.approx(max(overdue_s), abs=1e-6)
     assert result["stalls"] == sum(duration_s > 0.30001 for duration_s in overdue_s)
 
@@ -78,5 +78,5 @@ def test_without_complete_logs_the_columns_are_empty() -> None:
 
 
 def test_its_columns_equal_those_of_other_flows() -> None:
-    own = [column.name for column in stalls.declare_columns("topic", "the topic", 0)]
-    assert [column.name for column in topic_stalls.COLUMNS] == own
+    names = [column.name for column in stalls.declare_columns("topic", "the topic", 0)]
+    assert [column.name for column in topic_stalls.COLUMNS] == names

@@ -34,10 +34,10 @@ class Still:
 class Planned:
     """Plans its next wake time, each time that it wakes, by the next entry of a list: a delay, or None for never."""
 
-    def __init__(self, name: str, after_ns: Sequence[int | None], woke: list[tuple[int, str]]) -> None:
+    def __init__(self, name: str, after_ns: Sequence[int | None], wakes: list[tuple[int, str]]) -> None:
         self._name = name
         self._after_ns = list(after_ns)[::-1]
-        self._woke = woke
+        self._woke = wakes
         self._wake_ns = self._next_ns(0)
 
     def _next_ns(self, now_ns: int) -> int | None:
@@ -63,8 +63,8 @@ RECEIVERS = st.lists(st.sets(st.sampled_from(NAMES)), min_size=len(RECEIVED_AT_N
 def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
     plans: dict[str, list[int | None]], receivers: list[set[str]]
 ) -> None:
-    woke: list[tuple[int, str]] = []
-    agents = Agents(Still(), {name: Planned(name, plan, woke) for name, plan in plans.items()})
+    wakes: list[tuple[int, str]] = []
+    agents = Agents(Still(), {name: Planned(name, plan, wakes) for name, plan in plans.items()})
     expected: list[tuple[int, str]] = []
     programs = {name: Planned(name, plan, expected) for name, plan in plans.items()}
     state = State((0.0, 0.0, 0.0))
@@ -77,7 +77,7 @@ def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
             for name in NAMES:
                 if programs[name].next_wake_ns() == at_ns:
                     programs[name].wake(at_ns, state, ())
-        assert woke == expected
+        assert wakes == expected
         planned_ns = [wake_ns for program in programs.values() if (wake_ns := program.next_wake_ns()) is not None]
         assert agents.next_wake_ns() == min(planned_ns, default=None)
 

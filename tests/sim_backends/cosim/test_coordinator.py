@@ -254,15 +254,15 @@ def test_different_runs_have_different_digests(setting: Setting, other: Setting)
     assert (first.digest == second.digest) == same
 
 
-HERE = State((0.0, 0.0, 0.0))
+ORIGIN = State((0.0, 0.0, 0.0))
 SENT = Packet(7, "a", "b", 10, ("a to b", 3), 100, 110, "udp")
-ARRIVED = Fate(SENT, (HERE, HERE), (HERE, HERE), arrived_ns=120, counted_ns=130)
+ARRIVED = Fate(SENT, (ORIGIN, ORIGIN), (ORIGIN, ORIGIN), arrived_ns=120, counted_ns=130)
 
 
-def digest(entered: Sequence[Fate], ended: Sequence[Fate], end_ns: int = 130) -> str:
+def digest(entered: Sequence[Fate], left_network: Sequence[Fate], end_ns: int = 130) -> str:
     """Return the digest of one window."""
     event_digest = EventDigest()
-    event_digest.add_window(end_ns, entered, ended)
+    event_digest.add_window(end_ns, entered, left_network)
     return event_digest.hexdigest()
 
 

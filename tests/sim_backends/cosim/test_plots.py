@@ -35,15 +35,15 @@ def texts(svg: bytes) -> list[str]:
     )
 
 
-def drawn(form: Format) -> list[bytes]:
+def draw_all(form: Format) -> list[bytes]:
     return [log_figure([PANEL], form), run_figure("a run", PATHS_M, FLOWS, form)]
 
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_equal_figures_are_equal_files_in_every_format(form: Format) -> None:
-    figures = drawn(form)
+    figures = draw_all(form)
     assert all(figure.startswith(MAGIC[form]) for figure in figures)
-    assert figures == drawn(form)
+    assert figures == draw_all(form)
 
 
 def test_each_curve_has_one_label_and_zeros_have_a_separate_line() -> None:

@@ -104,10 +104,10 @@ def messages() -> dict[str, Any]:
     }
 
 
-def location_event(messages: dict[str, Any], **more: object) -> Any:  # noqa: ANN401 (a class made at run time)
+def location_event(messages: dict[str, Any], **options: object) -> Any:  # noqa: ANN401 (a class made at run time)
     event = messages["LocationEvent"]()
     for location in LOCATIONS:
-        added = event.locations.add(nemId=location.nem, **more)
+        added = event.locations.add(nemId=location.nem, **options)
         added.position.latitudeDegrees = location.latitude_deg
         added.position.longitudeDegrees = location.longitude_deg
         added.position.altitudeMeters = location.altitude_m
@@ -237,8 +237,8 @@ def network() -> Iterator[None]:
 
 def received(listener: EventListener, limit_s: float = 0.0) -> list[SerializedEvent]:
     events: list[SerializedEvent] = []
-    while (more := listener.receive(limit_s)) is not None:
-        events += more
+    while (event := listener.receive(limit_s)) is not None:
+        events += event
     return events
 
 
@@ -292,22 +292,22 @@ traffic:
 def publishing(*positions_m: tuple[float, float, float], losses: Sequence[SerializedEvent] = ()) -> Iterator[None]:
     """Publish path losses and locations of NEM 1, 2, ... repeatedly, with a malformed datagram before them."""
     publisher = EventPublisher(CHANNEL, "lo")
-    frame, ended = LocalFrame(TURIN), threading.Event()
+    frame, closed = LocalFrame(TURIN), threading.Event()
     velocity = EmaneVelocity(90.0, 0.0, 2.0)
     locations = [NemLocation(nem, *frame.geodetic(position), velocity) for nem, position in enumerate(positions_m, 1)]
 
     def publish() -> None:
-        while not ended.is_set():
+        while not closed.is_set():
             publisher.publish([SerializedEvent(ALL_NEMS, LOCATION, b"\x0a\x05")])
             publisher.publish([*losses, SerializedEvent(ALL_NEMS, LOCATION, encode_locations(locations))])
-            ended.wait(0.05)
+            closed.wait(0.05)
 
     thread = threading.Thread(target=publish)
     thread.start()
     try:
         yield
     finally:
-        ended.set()
+        closed.set()
         thread.join()
         publisher.close()
 

@@ -16,13 +16,17 @@ LIMIT_S = 60.0
 DRIVEN_M = 0.1
 
 
-def plain(value: Any) -> Any:  # noqa: ANN401 (of rclpy)
+def to_json_value(value: Any) -> Any:  # noqa: ANN401 (of rclpy)
     """Return a message as values that JSON can represent."""
     if hasattr(value, "get_fields_and_field_types"):
-        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+        return {name: to_json_value(getattr(value, name)) for name in value.get_fields_and_field_types()}
     if isinstance(value, (str, int, float)):
         return value
-    return [plain(item) for item in value.tolist()] if hasattr(value, "tolist") else [plain(item) for item in value]
+    return (
+        [to_json_value(item) for item in value.tolist()]
+        if hasattr(value, "tolist")
+        else [to_json_value(item) for item in value]
+    )
 
 
 def drive(node: Any, received: list[Any]) -> None:  # noqa: ANN401 (of rclpy)
@@ -46,12 +50,14 @@ def main(count: int, kinds: dict[str, str]) -> None:
         message_type = getattr(importlib.import_module(f"{package}.msg"), name)
 
         def append(message: object, into: list[Any] = received[topic]) -> None:
-            into.append(plain(message))
+            into.append(to_json_value(message))
 
         node.create_subscription(message_type, topic, append, qos_profile_sensor_data)
     logged: list[Any] = []
     log_type = importlib.import_module("rcl_interfaces.msg").Log
-    node.create_subscription(log_type, "/rosout", lambda line: logged.append(plain(line)), qos_profile_rosout_default)
+    node.create_subscription(
+        log_type, "/rosout", lambda line: logged.append(to_json_value(line)), qos_profile_rosout_default
+    )
     deadline_s = time.monotonic() + LIMIT_S
 
     def missing() -> bool:

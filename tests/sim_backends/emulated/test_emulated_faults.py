@@ -28,7 +28,7 @@ LONG_S = 60.0
 BOOT_ID = "/proc/sys/kernel/random/boot_id"
 RECORD = '. /opt/ros/noetic/setup.bash && rosbag record --duration=1 -O "$0" /scan && ls "$0.bag"'
 VOLATILE = ("/tmp/mine", "/run/mine", "/dev/shm/mine")
-KEPT = ("/root/mine", "/home/mine", "/var/log/mine")
+PERSISTENT = ("/root/mine", "/home/mine", "/var/log/mine")
 
 
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
@@ -91,10 +91,12 @@ def test_the_duration_of_a_fault_is_returned(up: EmulatedTestbed) -> None:
     wait_healed(up.shells[Role.RECEIVER], lambda: "sensors" in names(up.shells[Role.RECEIVER]))
 
 
-@pytest.mark.parametrize("away", FIXED_ROLES)
-def test_a_robot_out_of_range_is_unreachable_and_without_the_relay_all_are(up: EmulatedTestbed, away: Role) -> None:
+@pytest.mark.parametrize("unreachable", FIXED_ROLES)
+def test_a_robot_out_of_range_is_unreachable_and_without_the_relay_all_are(
+    up: EmulatedTestbed, unreachable: Role
+) -> None:
     assert reaches(up, Role.SENDER, Role.RECEIVER)
-    with inject_until_exit(up, Fault(FaultKind.OUT_OF_RANGE, away, 1.5)):
+    with inject_until_exit(up, Fault(FaultKind.OUT_OF_RANGE, unreachable, 1.5)):
         wait_until(lambda: not reaches(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
     assert reaches(up, Role.SENDER, Role.RECEIVER), "back in its place"
 
@@ -108,7 +110,7 @@ def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(up: EmulatedTes
         'touch "$@"; mkdir -p /tmp/deep/er; setsid -f sleep 1000 >/dev/null 2>&1',
         "sh",
         *VOLATILE,
-        *KEPT,
+        *PERSISTENT,
     )
     boot_id = output_of(sender, "cat", BOOT_ID)
     start_s = time.monotonic()
@@ -118,8 +120,10 @@ def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(up: EmulatedTes
     assert "sleep" not in names(sender)
     assert re.fullmatch(r"[0-9a-f-]{36}\n", boot_id)
     assert output_of(sender, "cat", BOOT_ID) not in {boot_id, output_of(up.shells[Role.RECEIVER], "cat", BOOT_ID)}
-    left = output_of(sender, "sh", "-c", 'ls -d "$@" /tmp/deep 2>/dev/null; true', "sh", *VOLATILE, *KEPT).split()
-    assert sorted(left) == sorted(KEPT)
+    left = output_of(
+        sender, "sh", "-c", 'ls -d "$@" /tmp/deep 2>/dev/null; true', "sh", *VOLATILE, *PERSISTENT
+    ).split()
+    assert sorted(left) == sorted(PERSISTENT)
     assert "224.0.0.0/4" in output_of(sender, "ip", "route")
     assert reaches(up, Role.RECEIVER, Role.SENDER)
 

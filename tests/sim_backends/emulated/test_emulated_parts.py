@@ -189,9 +189,9 @@ class TestPlacement:
         assert self.LAWN.crossings(*ends) != [()], "the sender is behind the wall"
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
-        bare = self.LAWN.model_copy(update={"lines": {}})
+        without_lines = self.LAWN.model_copy(update={"lines": {}})
         with pytest.raises(ConfigurationError, match="no line for the places of robots in the scenario los"):
-            placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), bare)
+            placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), without_lines)
 
 
 class TestRequirements:
@@ -314,9 +314,9 @@ class TestSystem:
             cast_for(Topology.MASTER), Role.SENDER, ros=RosChoice.BUILTIN, login=keys[0], host_key=keys[1]
         )
         setup.write_text(rootfs.setup_script(spec, setup), encoding="utf-8")
-        shown = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
+        command = f'. {shlex.quote(str(setup))} && echo "$PATH" && echo "$ROS_DISTRO $ROS_MASTER_URI"'
         result = subprocess.run(
-            ["/bin/sh", "-c", shown], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
+            ["/bin/sh", "-c", command], capture_output=True, text=True, check=True, env={"PATH": "/bin"}
         )
         assert result.stdout == f"{setup.parent}/bin:/bin\nnoetic http://127.0.0.1:11311\n"
 

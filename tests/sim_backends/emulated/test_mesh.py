@@ -41,7 +41,7 @@ LONG_S = 60.0
 
 @dataclass(frozen=True)
 class Row:
-    up: RunningRobots[str]
+    robots: RunningRobots[str]
     laptop: Laptop
 
 
@@ -62,15 +62,15 @@ def row() -> Iterator[Row]:
 
 
 @pytest.fixture(scope="module")
-def first(row: Row) -> Iterator[SshShell]:
+def first_shell(row: Row) -> Iterator[SshShell]:
     """The shell of the first robot, once its routing daemon has found the route to the last one."""
     with ExitStack() as stack:
         shell = SshShell(
             "r1",
-            connect=row.up.robots["r1"].connect,
+            connect=row.robots.robots["r1"].connect,
             user=USER,
-            host_key=row.up.host_keys["r1"],
-            private_key=row.up.private_key,
+            host_key=row.robots.host_keys["r1"],
+            private_key=row.robots.private_key,
         )
         stack.callback(shell.close)
         wait_until(lambda: routes_over_neighbours(shell) and reaches_last(shell), Deadline.after(LONG_S))
@@ -100,57 +100,57 @@ def ping(shell: SshShell, name: str, *options: str) -> str:
 
 
 @pytest.mark.emulated
-def test_each_of_five_hops_decrements_the_time_to_live(first: SshShell) -> None:
-    wait_until(lambda: reaches_last(first), Deadline.after(LONG_S))
+def test_each_of_five_hops_decrements_the_time_to_live(first_shell: SshShell) -> None:
+    wait_until(lambda: reaches_last(first_shell), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
-def test_a_traceroute_follows_the_row(first: SshShell) -> None:
+def test_a_traceroute_follows_the_row(first_shell: SshShell) -> None:
     def expired_at(ttl: int) -> list[str]:
         return re.findall(
-            r"From (\S+) icmp_seq=1 Time to live exceeded", ping(first, "r6", "-c", "1", "-t", str(ttl))
+            r"From (\S+) icmp_seq=1 Time to live exceeded", ping(first_shell, "r6", "-c", "1", "-t", str(ttl))
         )
 
     for ttl, (_, name) in enumerate(pairwise(NAMES[:-1]), 1):
         wait_until(lambda: expired_at(ttl) == [ADDRESSES[name]], Deadline.after(LONG_S))  # noqa: B023 (called immediately)
-    wait_until(lambda: "ttl=60" in ping(first, "r6", "-c", "1", "-t", "5"), Deadline.after(LONG_S))
+    wait_until(lambda: "ttl=60" in ping(first_shell, "r6", "-c", "1", "-t", "5"), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
-def test_only_neighbours_receive_each_other(row: Row, first: SshShell) -> None:
+def test_only_neighbours_receive_each_other(row: Row, first_shell: SshShell) -> None:
     before = delivered(row)
-    wait_until(lambda: reaches_last(first), Deadline.after(LONG_S))
+    wait_until(lambda: reaches_last(first_shell), Deadline.after(LONG_S))
     receivers = {pair for pair, frames in delivered(row).items() if frames > before.get(pair, 0)}
     assert receivers == {*pairwise(NAMES), *pairwise(reversed(NAMES))}
 
 
 def delivered(row: Row) -> dict[tuple[str, str], int]:
     """Return the number of frames that each robot has received from each other one."""
-    links = row.up.medium.stats().links
+    links = row.robots.medium.stats().links
     return {pair: link.delivered for pair, link in links.items() if LAPTOP_NAME not in pair}
 
 
 @pytest.mark.emulated
-def test_every_route_is_from_babel_and_leads_over_the_neighbour(first: SshShell) -> None:
-    wait_until(lambda: routes_over_neighbours(first), Deadline.after(LONG_S))
+def test_every_route_is_from_babel_and_leads_over_the_neighbour(first_shell: SshShell) -> None:
+    wait_until(lambda: routes_over_neighbours(first_shell), Deadline.after(LONG_S))
 
 
 @pytest.mark.emulated
-def test_the_laptop_reaches_the_ssh_server_of_the_last_robot_over_all_others(row: Row, first: SshShell) -> None:
-    wait_until(lambda: reaches_last(first), Deadline.after(LONG_S))
+def test_the_laptop_reaches_the_ssh_server_of_the_last_robot_over_all_others(row: Row, first_shell: SshShell) -> None:
+    wait_until(lambda: reaches_last(first_shell), Deadline.after(LONG_S))
     # TCP retries until r6 has found the reverse route too.
     with row.laptop.reach(ADDRESSES["r6"], LONG_S) as stream:
         assert stream.recv(4) == b"SSH-"
 
 
 @pytest.mark.emulated
-def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first: SshShell) -> None:
+def test_a_multicast_reaches_neighbours_and_is_not_forwarded(first_shell: SshShell) -> None:
     neighbours = {"fe80::aff:fe2a:2", "fe80::aff:fe2a:fe"}
     receivers: set[str] = set()
     deadline = Deadline.after(LONG_S)
     # Their answers leave at the same time, and may collide.
     while not receivers >= neighbours and not deadline.expired:
-        text = output_of(first, "ping", "-n", "-c", "2", "-i", "0.2", "-W", "1", "ff02::1%wlan0")
+        text = output_of(first_shell, "ping", "-n", "-c", "2", "-i", "0.2", "-W", "1", "ff02::1%wlan0")
         receivers.update(re.findall(r"bytes from (\S+?)%wlan0:", text))
     assert receivers - {"fe80::aff:fe2a:1"} == neighbours
 

@@ -25,7 +25,7 @@ from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
 from tests.helpers.sshd import wait_until
 
-AWAY = Move(Role.SENDER, (Leg(away_m=0.4),), 2.0)
+MOVE = Move(Role.SENDER, (Leg(away_m=0.4),), 2.0)
 FAR = Move(Role.SENDER, (Leg(away_m=1e5),), 5.0)
 
 
@@ -75,7 +75,7 @@ def test_a_robot_moves_along_its_path_and_returns_to_its_place(mobility: Mobilit
     place = medium.position_of(Role.SENDER)
     assert place is not None
     others = medium.positions_of(Role.RELAY) + medium.positions_of(Role.RECEIVER)
-    with mobility.moving(AWAY):
+    with mobility.moving(MOVE):
         wait(lambda: not motion_threads())  # there are no more updates after the end of the path
         assert medium.position_of(Role.SENDER) == pytest.approx((place[0] - 0.4, *place[1:]))
         assert medium.calls[-1][1][CAST[Role.SENDER].name] == (0.0, 0.0, 0.0)
@@ -140,7 +140,7 @@ def test_a_moving_robot_that_returns_into_range_is_at_its_current_position(
 
 
 def test_two_robots_can_move_at_the_same_time(mobility: Mobility, medium: RecordingMedium) -> None:
-    with mobility.moving(AWAY), mobility.moving(Move(Role.RECEIVER, (Leg(left_m=0.3), Leg(away_m=-0.2)), 2.0)):
+    with mobility.moving(MOVE), mobility.moving(Move(Role.RECEIVER, (Leg(left_m=0.3), Leg(away_m=-0.2)), 2.0)):
         wait(lambda: not motion_threads())
         sender, receiver = medium.position_of(Role.SENDER), medium.position_of(Role.RECEIVER)
     assert sender is not None
@@ -155,7 +155,7 @@ def test_two_robots_can_move_at_the_same_time(mobility: Mobility, medium: Record
 def test_the_track_equals_the_positions_of_the_medium_and_discards_old_ones(
     mobility: Mobility, medium: RecordingMedium
 ) -> None:
-    with mobility.moving(AWAY):
+    with mobility.moving(MOVE):
         wait(lambda: not motion_threads())
     track = mobility.track(0)
     assert [
@@ -181,7 +181,7 @@ def test_the_update_period_depends_on_the_speed(mobility: Mobility, medium: Reco
 
 def test_moving_without_a_placement_is_an_error(medium: RecordingMedium) -> None:
     empty = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None)
-    with pytest.raises(RobotError, match="no places"), empty.moving(AWAY):
+    with pytest.raises(RobotError, match="no places"), empty.moving(MOVE):
         raise AssertionError
 
 
@@ -264,10 +264,14 @@ def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: Reco
 
 
 def test_lasers_detect_robots_in_place_and_not_those_out_of_range(medium: RecordingMedium) -> None:
-    shown: list[Mapping[str, Vector]] = []
-    mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, write_positions=shown.append)
+    detections: list[Mapping[str, Vector]] = []
+    mobility = Mobility(
+        CAST, cast("MediumClient", medium), load_world("lawn"), None, write_positions=detections.append
+    )
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
-    assert shown[-1] == medium.calls[-1][0]
+    assert detections[-1] == medium.calls[-1][0]
     mobility.set_out_of_range(Role.RELAY)  # no radio reaches another one, but the others are where they were
     assert medium.calls[-1][0] == {}
-    assert shown[-1] == {name: place_m for name, place_m in shown[0].items() if name != CAST[Role.RELAY].name}
+    assert detections[-1] == {
+        name: place_m for name, place_m in detections[0].items() if name != CAST[Role.RELAY].name
+    }

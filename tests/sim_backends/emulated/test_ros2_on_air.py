@@ -93,12 +93,21 @@ def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
 
 
 @contextmanager
-def listening(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Iterator[Iterator[Any]]:
+def listening(
+    up: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object
+) -> Iterator[Iterator[Any]]:
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone receives."""
     network_settings = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
     quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
     description = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
-    command = (sys.executable, str(WIRE_END), "hear", over, json.dumps(network_settings), json.dumps(description))
+    command = (
+        sys.executable,
+        str(WIRE_END),
+        "hear",
+        middleware_name,
+        json.dumps(network_settings),
+        json.dumps(description),
+    )
     with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         try:
@@ -110,9 +119,9 @@ def listening(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: 
             process.communicate()
 
 
-def receive(up: EmulatedTestbed, over: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
+def receive(up: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
     """Return the first message of `listening`."""
-    with listening(up, over, topic, kind, **network) as messages:
+    with listening(up, middleware_name, topic, kind, **network) as messages:
         return next(messages)
 
 
@@ -262,9 +271,9 @@ def test_zenoh_scouts_across_the_medium(multicast: EmulatedTestbed) -> None:
 @pytest.mark.emulated
 def test_unicast_peers_need_no_multicast() -> None:
     with lab(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}") as up:
-        for role, over in ((Role.SENDER, "dds"), (Role.RECEIVER, "zenoh")):
+        for role, middleware_name in ((Role.SENDER, "dds"), (Role.RECEIVER, "zenoh")):
             peers = (up.robots[role].spec.ip,)
-            odom = receive(up, over, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
+            odom = receive(up, middleware_name, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
             assert odom.child_frame_id == "base_footprint"
 
 
@@ -278,15 +287,15 @@ def test_zenoh_works_with_a_router_on_the_relay() -> None:
 
 
 @pytest.mark.emulated
-@pytest.mark.parametrize("over", ["dds", "zenoh"])
+@pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
 def test_a_late_subscriber_gets_the_transforms_from_every_sensor_to_the_world(
-    multicast: EmulatedTestbed, over: str
+    multicast: EmulatedTestbed, middleware_name: str
 ) -> None:
     """The look-up of tf2: from the frame of a message up to the frame in which the robot was switched on."""
     parent_of = {
         transform.child_frame_id: transform.header.frame_id
         for topic in ("/tf_static", "/tf")
-        for transform in receive(multicast, over, topic, "tf2_msgs/TFMessage").transforms
+        for transform in receive(multicast, middleware_name, topic, "tf2_msgs/TFMessage").transforms
     }
     for topic in ros_of(load_profile("turtlebot3_burger")).topics:
         frame = topic.frame

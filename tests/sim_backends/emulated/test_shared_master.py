@@ -30,9 +30,9 @@ SETUP = "/opt/ros/noetic/setup.bash"
 LONG_S = 60.0
 
 
-def backend(more: str = "") -> EmulatedBackend:
+def backend(extra_keys: str = "") -> EmulatedBackend:
     text = DEFAULT_SITE.read_text(encoding="utf-8")
-    document = schema.parse(f"{text}\nros_master: relay\n{more}", source="fieldkit.yaml")
+    document = schema.parse(f"{text}\nros_master: relay\n{extra_keys}", source="fieldkit.yaml")
     return EmulatedBackend(schema.validate(document, Site), document)
 
 

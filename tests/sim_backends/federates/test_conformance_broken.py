@@ -196,8 +196,8 @@ def net(broken: Callable[[Net, list[Arrival], list[Drop], int], Outcome]) -> typ
 
 class DropsAtBorders(Net):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
-        kept = [packet for packet in packets if packet.enters_ns > self.last_ns]
-        return super().advance(to_ns, kept, states)
+        remaining = [packet for packet in packets if packet.enters_ns > self.last_ns]
+        return super().advance(to_ns, remaining, states)
 
 
 class RefusesNegativeTimes(Net):
@@ -315,8 +315,8 @@ class Transmits(Net):
 
 def random_delay(self: Net, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
     lost = [arrival for arrival in arrivals if random.random() < 0.5]
-    kept = [arrival for arrival in arrivals if arrival not in lost]
-    return kept, [Drop(arrival.packet_id, "bad luck") for arrival in lost]
+    remaining = [arrival for arrival in arrivals if arrival not in lost]
+    return remaining, [Drop(arrival.packet_id, "bad luck") for arrival in lost]
 
 
 def as_answer(kind: MessageKind) -> Alter:
@@ -432,7 +432,7 @@ NETWORK_CASES = [
     Broken(
         "exactly_once",
         physics(net(lambda _, arrived, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
-        "the fate of packet 99 was reported, which it never got",
+        "the fate of packet 99 was reported, but it was not sent to the network",
     ),
     Broken("exactly_once", physics(net(lambda _, arrived, drops, to_ns: (arrived[::-1], drops))), "order of time"),
     Broken("exactly_once", physics(AnnouncesTooLate), "before the announced next event"),

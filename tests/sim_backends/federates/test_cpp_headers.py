@@ -56,8 +56,8 @@ def test_a_malformed_frame_is_refused_with_its_position(program: Path) -> None:
     assert error(program, hello[:6] + b"\1" + hello[7:]) == "byte 6: the reserved field is 1, not 0"
     assert error(program, hello[:24] + b"\2" + hello[25:]).startswith("byte 24: protocol version 2")
     assert error(program, physics[:36] + b"\5" + physics[37:]) == "byte 36: agent 5 was not announced"
-    many = physics[:32] + b"\xff\xff\xff\xff" + physics[36:]
-    assert error(program, many).startswith("byte 32: 4294967295 items of at least 8 bytes do not fit")
+    oversized = physics[:32] + b"\xff\xff\xff\xff" + physics[36:]
+    assert error(program, oversized).startswith("byte 32: 4294967295 items of at least 8 bytes do not fit")
 
 
 def test_the_headers_of_a_program_are_part_of_its_name() -> None:

@@ -251,13 +251,13 @@ def served(address: str, **settings: object) -> threading.Thread:
 def test_either_side_may_listen_and_be_first(*, federate_listens: bool, coordinator_first: bool) -> None:
     port = free_port()
     schemes = ("tcp-listen", "tcp") if federate_listens else ("tcp", "tcp-listen")
-    address, where = (f"{scheme}:127.0.0.1:{port}" for scheme in schemes)
+    address, other_address = (f"{scheme}:127.0.0.1:{port}" for scheme in schemes)
     if coordinator_first:
         timer = threading.Timer(0.15, served, [address])
         timer.start()
     else:
         served(address)
-    with closing(open_physics(where, HELLO, 20.0)) as physics:
+    with closing(open_physics(other_address, HELLO, 20.0)) as physics:
         assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
 
 
@@ -277,9 +277,9 @@ def test_heartbeats_are_shorter_than_the_deadline() -> None:
 
 def test_a_token_is_needed_beyond_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    for where in ("tcp:192.0.2.1:7000", "tcp-listen:0.0.0.0:7000"):
+    for address in ("tcp:192.0.2.1:7000", "tcp-listen:0.0.0.0:7000"):
         with pytest.raises(ConfigurationError, match="there is no token"):
-            open_physics(where, HELLO, 1.0)
+            open_physics(address, HELLO, 1.0)
     with pytest.raises(ConfigurationError, match="is not an address"):
         open_physics("tcp:localhost", HELLO, 1.0)
 

@@ -40,12 +40,12 @@ def test_busybox_reads_the_archive(tmp_path: Path) -> None:
     files = {"init": (0o755, b"#!/bin/sh\n"), "lib/x/odd": (0o644, bytes(range(7))), "lib/empty": (0o600, b"")}
     archive = cpio_archive(files, ("proc",))
     subprocess.run(("/bin/busybox", "cpio", "-id"), input=archive, cwd=tmp_path, check=True, capture_output=True)
-    found = {str(path.relative_to(tmp_path)): path for path in tmp_path.rglob("*")}
-    assert set(found) == {"init", "lib", "lib/x", "lib/x/odd", "lib/empty", "proc"}
-    assert {name: found[name].read_bytes() for name in files} == {
+    unpacked = {str(path.relative_to(tmp_path)): path for path in tmp_path.rglob("*")}
+    assert set(unpacked) == {"init", "lib", "lib/x", "lib/x/odd", "lib/empty", "proc"}
+    assert {name: unpacked[name].read_bytes() for name in files} == {
         name: content for name, (_, content) in files.items()
     }
-    assert {name: found[name].stat().st_mode & 0o777 for name in files} == {
+    assert {name: unpacked[name].stat().st_mode & 0o777 for name in files} == {
         name: mode for name, (mode, _) in files.items()
     }
     assert len(archive) % 4 == 0

@@ -29,10 +29,10 @@ def test_the_newest_kernel_with_hwsim_is_used(tmp_path: Path) -> None:
         (tmp_path / "boot" / f"vmlinuz-{version}").touch()
         if has_hwsim:
             (modules / "mac80211_hwsim.ko").touch()
-    found = find_kernel((tmp_path / "missing", tmp_path))
-    assert found is not None
-    assert found.image.name == "vmlinuz-6.1.0-50-amd64"
-    assert found.modules == tmp_path / "lib/modules/6.1.0-50-amd64"
+    kernel = find_kernel((tmp_path / "missing", tmp_path))
+    assert kernel is not None
+    assert kernel.image.name == "vmlinuz-6.1.0-50-amd64"
+    assert kernel.modules == tmp_path / "lib/modules/6.1.0-50-amd64"
 
 
 @pytest.mark.parametrize("sectors", [4, 39])

@@ -161,7 +161,7 @@ def read_all(lines: RequestLines) -> list[bytes]:
 @pytest.mark.skipif(Path("/sys/module/mac80211_hwsim").exists(), reason="this kernel has loaded hwsim")
 def test_without_hwsim_the_program_says_how_to_load_it() -> None:
     argv = (sys.executable, "-m", "sim_backends.linux_wifi.medium_program")
-    ended = subprocess.run(argv, input="", capture_output=True, text=True, timeout=DEADLINE_S, check=False)
-    assert ended.returncode == 2
-    assert "MAC80211_HWSIM" in ended.stderr
-    assert "modprobe mac80211_hwsim" in ended.stderr
+    result = subprocess.run(argv, input="", capture_output=True, text=True, timeout=DEADLINE_S, check=False)
+    assert result.returncode == 2
+    assert "MAC80211_HWSIM" in result.stderr
+    assert "modprobe mac80211_hwsim" in result.stderr

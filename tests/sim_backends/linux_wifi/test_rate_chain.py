@@ -73,7 +73,7 @@ def test_any_chain_has_few_tries_and_its_report_adds_up(
     chain = rate_chain(chain_stages, frequency_mhz, max_tries=max_tries)
     assert len(chain.modes) <= max_tries
     for attempts in range(1, len(chain.modes) + 1):
-        made = chain.tries_made(attempts)
-        on_air = sum(count for count, skipped in zip(made, chain.skipped, strict=False) if not skipped)
+        tries = chain.tries_made(attempts)
+        on_air = sum(count for count, skipped in zip(tries, chain.skipped, strict=False) if not skipped)
         assert on_air == attempts
-        assert all(0 <= count <= 255 for count in made)
+        assert all(0 <= count <= 255 for count in tries)

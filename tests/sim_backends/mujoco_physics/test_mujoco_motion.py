@@ -62,7 +62,7 @@ def iris(name: str = "iris", east_m: float = 0.0, up_m: float = 5.0) -> AgentSta
     return AgentStart(name, "iris", State((east_m, -3.0, up_m), heading_rad=0.0), True)
 
 
-def after(
+def state_after(
     simulation: MujocoPhysics, seconds: float, commands: Mapping[str, Any] | None = None
 ) -> Mapping[str, State]:
     return simulation.advance(round(seconds * 1e9), commands or {})
@@ -80,9 +80,9 @@ def test_a_robot_above_the_ground_falls_freely() -> None:
 
 def test_robots_drive_straight_at_the_commanded_speed() -> None:
     simulation = physics(husky(), burger())
-    after(simulation, 0, {"husky": Twist(1.0), "burger": Twist(0.2)})
-    before = after(simulation, 1)
-    later = after(simulation, 4)
+    state_after(simulation, 0, {"husky": Twist(1.0), "burger": Twist(0.2)})
+    before = state_after(simulation, 1)
+    later = state_after(simulation, 4)
     for name, speed_m_s, slip in (("husky", 1.0, 0.001), ("burger", 0.2, 0.004)):
         driven_m = later[name].position_m[0] - before[name].position_m[0]
         assert driven_m == pytest.approx(3 * speed_m_s, rel=slip)
@@ -92,9 +92,9 @@ def test_robots_drive_straight_at_the_commanded_speed() -> None:
 def test_turning_rates_follow_from_friction() -> None:
     """A skid-steered robot turns where the moments of friction vanish; one with two wheels rolls."""
     simulation = physics(husky(), burger())
-    after(simulation, 0, {"husky": Twist(0.0, 1.0), "burger": Twist(0.0, 1.0)})
-    before = after(simulation, 1.5)
-    later = after(simulation, 2.5)
+    state_after(simulation, 0, {"husky": Twist(0.0, 1.0), "burger": Twist(0.0, 1.0)})
+    before = state_after(simulation, 1.5)
+    later = state_after(simulation, 2.5)
     base_m, track_m = HUSKY.wheels.axles_m[0], HUSKY.wheels.track_m / 2
     expected = {"husky": 1.875 * track_m**2 / (base_m**2 + track_m**2), "burger": 1.0}
     for name, rate_rad_s in expected.items():
@@ -106,8 +106,8 @@ def test_turning_rates_follow_from_friction() -> None:
 def test_the_speed_changes_at_the_limit_of_the_drive_or_of_friction() -> None:
     slippery = vars(HUSKY_A200) | {"friction": 0.1}
     simulation = physics(husky(), husky("slippery", north_m=4.0), bodies={"slippery": slippery})
-    after(simulation, 0, dict.fromkeys(("husky", "slippery"), Twist(1.0)))
-    first, second = after(simulation, 0.15), after(simulation, 0.25)
+    state_after(simulation, 0, dict.fromkeys(("husky", "slippery"), Twist(1.0)))
+    first, second = state_after(simulation, 0.15), state_after(simulation, 0.25)
     expected_m_s2 = {"husky": HUSKY_A200.acceleration_m_s2, "slippery": 0.1 * GRAVITY_M_S2}
     for name, limit_m_s2 in expected_m_s2.items():
         gained_m_s = second[name].velocity_m_s[0] - first[name].velocity_m_s[0]
@@ -119,7 +119,7 @@ def test_friction_holds_a_robot_on_a_slope_up_to_its_coefficient() -> None:
     slippery = vars(HUSKY_A200) | {"friction": 0.2}
     agents = husky(up_m=height_m), husky("slippery", north_m=5.0, up_m=height_m)
     simulation = physics(*agents, obstacles=(ramp(20, 20),), bodies={"slippery": slippery})
-    first, second = after(simulation, 1), after(simulation, 2)
+    first, second = state_after(simulation, 1), state_after(simulation, 2)
     assert math.dist(first["husky"].position_m, second["husky"].position_m) < 1e-4
     normal_m_s2 = GRAVITY_M_S2 / math.hypot(1, grade)
     slid_m_s = math.dist(first["slippery"].velocity_m_s, second["slippery"].velocity_m_s)
@@ -129,11 +129,11 @@ def test_friction_holds_a_robot_on_a_slope_up_to_its_coefficient() -> None:
 def test_robots_stop_at_a_wall_and_do_not_pass_it() -> None:
     simulation = physics(husky(), burger(east_m=2.5), iris(up_m=1.0), obstacles=(WALL,))
     commands = {"husky": Twist(1.0), "burger": Twist(0.2), "iris": Velocity((3.0, 0.0, 0.0))}
-    after(simulation, 0, commands)
+    state_after(simulation, 0, commands)
     # The drone tips over at the wall, so that its centre comes nearer to it than its radius.
     reach_m = {"husky": 0.9874 / 2, "burger": 0.07 - 0.032, "iris": 0.1}
     for tenth in range(1, 50):
-        states = after(simulation, tenth / 10)
+        states = state_after(simulation, tenth / 10)
         for name, length_m in reach_m.items():
             assert states[name].position_m[0] < FACE_M - length_m + 0.05
     for name in ("husky", "burger"):
@@ -150,8 +150,8 @@ def test_a_robot_climbs_a_ramp_to_raised_ground_but_not_its_side() -> None:
     }
     obstacles = (ramp(math.degrees(0.15), 4, 3.0), raised)
     simulation = physics(husky(), burger("blocked", east_m=10.0), obstacles=obstacles)
-    after(simulation, 0, {"husky": Twist(1.0), "blocked": Twist(-0.2)})
-    states = after(simulation, 7.5)
+    state_after(simulation, 0, {"husky": Twist(1.0), "blocked": Twist(-0.2)})
+    states = state_after(simulation, 7.5)
     east_m, north_m, up_m = states["husky"].position_m
     assert east_m == pytest.approx(7.3, abs=0.1)
     assert (north_m, up_m) == pytest.approx((0.0, 4 * math.tan(0.15) + 0.39), abs=0.01)
@@ -161,28 +161,28 @@ def test_a_robot_climbs_a_ramp_to_raised_ground_but_not_its_side() -> None:
 
 def test_a_quadrotor_reaches_the_commanded_velocity_and_holds_its_height() -> None:
     simulation = physics(iris())
-    after(simulation, 0, {"iris": Velocity((3.0, 1.0, 0.0), 1.0)})
-    lowest_m = min(after(simulation, tenth / 10)["iris"].position_m[2] for tenth in range(60))
-    state = after(simulation, 6)["iris"]
+    state_after(simulation, 0, {"iris": Velocity((3.0, 1.0, 0.0), 1.0)})
+    lowest_m = min(state_after(simulation, tenth / 10)["iris"].position_m[2] for tenth in range(60))
+    state = state_after(simulation, 6)["iris"]
     assert state.velocity_m_s == pytest.approx((3.0, 1.0, 0.0), abs=0.01)
     assert state.heading_rad == pytest.approx(1.0, abs=1e-3)
     assert lowest_m == pytest.approx(5.0, abs=0.1)
-    after(simulation, 6, {"iris": Velocity((0.0, 0.0, -9.0))})
-    assert after(simulation, 8)["iris"].velocity_m_s[2] == pytest.approx(-1.5, abs=0.01)
+    state_after(simulation, 6, {"iris": Velocity((0.0, 0.0, -9.0))})
+    assert state_after(simulation, 8)["iris"].velocity_m_s[2] == pytest.approx(-1.5, abs=0.01)
 
 
 def test_a_quadrotor_turns_on_the_ground_and_takes_off() -> None:
     simulation = physics(iris(up_m=0.0))
-    after(simulation, 0, {"iris": Velocity(yaw_rad=3.0)})
-    assert after(simulation, 3)["iris"].position_m[2] == pytest.approx(0.0, abs=1e-3)
-    after(simulation, 3, {"iris": Velocity((0.0, 0.0, 1.0))})
-    assert after(simulation, 5)["iris"].position_m[2] == pytest.approx(1.75, abs=0.05)
+    state_after(simulation, 0, {"iris": Velocity(yaw_rad=3.0)})
+    assert state_after(simulation, 3)["iris"].position_m[2] == pytest.approx(0.0, abs=1e-3)
+    state_after(simulation, 3, {"iris": Velocity((0.0, 0.0, 1.0))})
+    assert state_after(simulation, 5)["iris"].position_m[2] == pytest.approx(1.75, abs=0.05)
 
 
 def test_robots_at_rest_do_not_drift() -> None:
     simulation = physics(husky(), burger(), iris())
-    settled = after(simulation, 1)
-    states = after(simulation, 6)
+    settled = state_after(simulation, 1)
+    states = state_after(simulation, 6)
     for name, state in states.items():
         assert math.dist(state.position_m, settled[name].position_m) < 1e-6
         assert math.hypot(*state.velocity_m_s) < 1e-6

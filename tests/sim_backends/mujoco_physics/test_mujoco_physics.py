@@ -66,9 +66,9 @@ def test_a_copy_continues_as_the_original() -> None:
     original.advance(0, COMMANDS)
     original.advance(155_000_000, {})
     original.advance(155_000_000, {"cy": Velocity()})
-    twin = copy.deepcopy(original)
+    copied = copy.deepcopy(original)
     before = dict(original.advance(155_000_000, {}))
-    expected = dict(twin.advance(400_000_000, {"ann": Twist()}))
+    expected = dict(copied.advance(400_000_000, {"ann": Twist()}))
     assert dict(original.advance(155_000_000, {})) == before
     assert dict(original.advance(400_000_000, {"ann": Twist()})) == expected
 

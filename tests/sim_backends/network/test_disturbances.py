@@ -57,8 +57,8 @@ def test_a_lost_node_sends_nothing_and_packets_in_flight_arrive() -> None:
 
 
 def test_a_cut_link_carries_nothing_in_both_directions_and_others_continue() -> None:
-    sends = [(number * MS, *ends, 100) for number in range(40) for ends in (("a", "b"), ("b", "a"), ("a", "c"))]
-    result = run_each_ms(packets(sends), LinkCut("b", "a", 10 * MS, 20 * MS))
+    messages = [(number * MS, *ends, 100) for number in range(40) for ends in (("a", "b"), ("b", "a"), ("a", "c"))]
+    result = run_each_ms(packets(messages), LinkCut("b", "a", 10 * MS, 20 * MS))
     assert result.dropped == {
         (flow, number): OUT_OF_RANGE for flow in ("a to b", "b to a") for number in range(10, 20)
     }

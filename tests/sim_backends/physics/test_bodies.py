@@ -43,11 +43,11 @@ def run_commands(commands: list[tuple[int, str, Twist]], cuts: list[int]) -> tup
     """Return the states after 4.5 s; time is divided at the times of the commands and at `cuts`."""
     bodies = two_bodies()
     by_time = {at_ns: (name, twist) for at_ns, name, twist in commands}
-    given: dict[str, Twist] = {}
+    twists: dict[str, Twist] = {}
     for at_ns in sorted({*by_time, *cuts, 4000 * MS}):
-        bodies.advance(at_ns, given)
-        given = dict([by_time[at_ns]] if at_ns in by_time else [])
-    return dict(bodies.advance(4500 * MS, given)), bodies
+        bodies.advance(at_ns, twists)
+        twists = dict([by_time[at_ns]] if at_ns in by_time else [])
+    return dict(bodies.advance(4500 * MS, twists)), bodies
 
 
 @settings(max_examples=25)

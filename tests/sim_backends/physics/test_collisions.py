@@ -120,9 +120,9 @@ def test_bodies_do_not_overlap_and_errors_stay_within_the_limits(legs: list[tupl
     at_ms = 0
     states_by_ms = {0: (bodies.advance(0, {}), dict(bodies.limits_m_s2))}
     for ms, twists in legs:
-        given = dict(zip(names, twists, strict=True))
+        commands = dict(zip(names, twists, strict=True))
         for offset_ms in range(0, ms, 37):
-            states = bodies.advance((at_ms + offset_ms) * MS, given if not offset_ms else {})
+            states = bodies.advance((at_ms + offset_ms) * MS, commands if not offset_ms else {})
             states_by_ms[at_ms + offset_ms] = states, dict(bodies.limits_m_s2)
             for first, second in combinations(names, 2):
                 distance_m = math.dist(states[first].position_m, states[second].position_m)

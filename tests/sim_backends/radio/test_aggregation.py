@@ -20,6 +20,8 @@ from sim_backends.radio.frames import Frame, TransmissionAttempt
 from sim_backends.radio.high_throughput import format_modes
 from sim_backends.radio.links import RETRIES_EXHAUSTED
 from sim_backends.radio.modes import CW_MIN, SHORT_RETRY_LIMIT, SLOT_NS, WifiMode, response_ns
+from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.rate_control import FixedRate
 from sim_backends.radio.wifi import Wifi
 from tests.helpers.stations import HEADERS_BYTES, FixedPowers, saturate
 
@@ -73,6 +75,21 @@ def test_a_single_frame_is_answered_by_an_ack_and_has_a_delimiter_only_in_vht_an
         assert (single.size_bytes, single.response_bytes) == (size_bytes, 14)
     assert session(VHT80_9).build_aggregate(frames(2), VHT80_9).response_bytes == 32
     assert session(HE80_11).build_aggregate(frames(2), HE80_11).response_bytes == 56
+
+
+def test_each_subframe_but_the_last_is_padded_to_four_bytes() -> None:
+    padded, last = SUBFRAME_BYTES + 2, SUBFRAME_BYTES
+    assert SUBFRAME_BYTES % 4 == 2
+    assert session(VHT80_9).build_aggregate(frames(3), VHT80_9).size_bytes == 2 * padded + last
+
+
+def test_a_recipient_ignores_frames_that_it_has_received() -> None:
+    agreement = session(VHT80_9)
+    first, second, third = agreement.build_aggregate(frames(3), VHT80_9).frames
+    assert agreement.receive([second]) == []
+    assert agreement.receive([first]) == [first, second]
+    assert agreement.receive([first, second]) == []
+    assert agreement.receive([third, first]) == [third]
 
 
 def test_only_frames_to_the_receiver_of_the_first_are_aggregated() -> None:
@@ -145,10 +162,10 @@ def bianchi_bit_s(mode: WifiMode, stations: int) -> float:
     airtime_ns, aifs_ns = mode.airtime_ns(aggregate.size_bytes), mode.band.best_effort_aifs_ns
     success_ns = airtime_ns + mode.band.sifs_ns + response_ns(mode, aggregate.response_bytes) + aifs_ns
     collision_ns = airtime_ns + mode.band.sifs_ns + SLOT_NS + 20_000 + aifs_ns
-    idle, one = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
-    slot_ns = idle * SLOT_NS + one * success_ns + (1 - idle - one) * collision_ns
+    idle, single = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
+    slot_ns = idle * SLOT_NS + single * success_ns + (1 - idle - single) * collision_ns
     assert CCA_TIME_NS < SLOT_NS
-    return one * len(aggregate.frames) * 8000 / slot_ns * 1e9
+    return single * len(aggregate.frames) * 8000 / slot_ns * 1e9
 
 
 # ns-3 3.37, `benchmarks.high_throughput_vs_ns3`: payloads of 1000 bytes, Mbit/s.
@@ -172,10 +189,10 @@ def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order(
     arrived = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
     attempts = [attempt for attempt in log if attempt.number]
     assert arrived == list(range(500))
-    again = [attempt for attempt in attempts if attempt.number > 1]
-    assert 0.02 < len(again) / len(attempts) < 0.5
+    retries = [attempt for attempt in attempts if attempt.number > 1]
+    assert 0.02 < len(retries) / len(attempts) < 0.5
     together = {attempt.start_ns for attempt in attempts if attempt.number == 1}
-    assert any(attempt.start_ns in together for attempt in again), "sent again together with new frames"
+    assert any(attempt.start_ns in together for attempt in retries), "sent again together with new frames"
 
 
 def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> None:
@@ -192,6 +209,56 @@ def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> Non
     assert {attempt.number for attempt in log} == set(range(1, SHORT_RETRY_LIMIT + 1))
     counters = wifi.counters()["a", "b"]
     assert (counters.sent, counters.lost, counters.delivered) == (3, 3, 0)
+
+
+def test_frames_are_sent_again_until_their_block_ack_arrives() -> None:
+    """Without any Block Ack, frames are delivered once and given up later, but not reported as lost."""
+    channel = AggregatingPowers("ab", HT20_7)
+    channel.rows[1][0] = 0.0
+    rates: list[tuple[int, int]] = []
+    attempt_numbers: list[int] = []
+
+    class RecordedRate(FixedRate):
+        @override
+        def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
+            attempt_numbers.append(attempt)
+            return super().choose(now_ns, packet, attempt)
+
+        @override
+        def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+            rates.append((acknowledged, attempts))
+
+    channel.rate_control = lambda transmitter, receiver: RecordedRate(HT20_7)  # type: ignore[method-assign]
+    wifi: Wifi[int] = Wifi(channel, 1)
+    wifi.use_meter()
+    losses: list[int] = []
+    wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
+    starts_ns: set[int] = set()
+    wifi.log_attempts(lambda attempt: starts_ns.add(attempt.start_ns) if attempt.number else None)
+    for number in range(3):
+        wifi.send(0, "a", number, 1028, "b")
+    assert [payload for _, _, payload, _, _ in wifi.deliveries(10**10)] == [0, 1, 2]
+    assert losses == []
+    counters = wifi.counters()["a", "b"]
+    assert (counters.sent, counters.lost, counters.delivered) == (3, 0, 3)
+    exchanges = len(starts_ns)
+    assert attempt_numbers == [min(number, SHORT_RETRY_LIMIT) for number in range(1, exchanges + 1)]
+    assert all(acknowledged == 0 for acknowledged, _ in rates)
+    assert sum(attempts for _, attempts in rates) == 3 * SHORT_RETRY_LIMIT
+    (station,) = wifi.sample(10**10, 0)["a"].stations
+    assert (station.tx_packets, station.tx_failures) == (3, 3)
+
+
+def test_a_frame_given_up_does_not_block_the_frames_after_it() -> None:
+    channel = AggregatingPowers("ab", HT20_7)
+    wifi: Wifi[int] = Wifi(channel, 1)
+    receivable = channel.rows
+    channel.rows = [[power * 1e-9 for power in row] for row in receivable]
+    wifi.send(0, "a", 0, 1028, "b")
+    assert wifi.deliveries(10**9) == []
+    channel.rows = receivable
+    wifi.send(10**9, "a", 1, 1028, "b")
+    assert [payload for _, _, payload, _, _ in wifi.deliveries(2 * 10**9)] == [1]
 
 
 def test_frames_of_a_station_that_is_switched_off_are_lost_once() -> None:

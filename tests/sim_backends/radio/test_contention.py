@@ -8,10 +8,10 @@ from sim_backends.radio.contention import EventQueue
 
 class EventLog:
     def __init__(self) -> None:
-        self.seen: list[tuple[int, object]] = []
+        self.events: list[tuple[int, object]] = []
 
     def record(self, at_ns: int, name: object) -> None:
-        self.seen.append((at_ns, name))
+        self.events.append((at_ns, name))
 
 
 def test_simultaneous_events_run_in_the_order_of_scheduling() -> None:
@@ -23,7 +23,7 @@ def test_simultaneous_events_run_in_the_order_of_scheduling() -> None:
     events.schedule_start(10, 2)
     events.schedule_start(10, 1)
     events.advance(10)
-    assert event_log.seen == [(10, "first"), (10, "third"), (10, 2), (10, 1)], "a rescheduled start runs last"
+    assert event_log.events == [(10, "first"), (10, "third"), (10, 2), (10, 1)], "a rescheduled start runs last"
 
 
 def test_a_rescheduled_start_happens_once() -> None:
@@ -33,9 +33,9 @@ def test_a_rescheduled_start_happens_once() -> None:
         events.schedule_start(at_ns, 7)
         assert (events.starts[7][0], events.next_ns()) == (at_ns, at_ns)
     events.advance(19)
-    assert event_log.seen == []
+    assert event_log.events == []
     events.advance(100)
-    assert event_log.seen == [(20, 7)]
+    assert event_log.events == [(20, 7)]
     assert (events.starts, events.next_ns()) == ({}, None)
 
 
@@ -44,7 +44,7 @@ def test_a_call_may_schedule_another_for_the_same_time() -> None:
     events = EventQueue(lambda at_ns, index: events.at(at_ns, event_log.record, index))
     events.schedule_start(10, 3)
     events.advance(10)
-    assert event_log.seen == [(10, 3)]
+    assert event_log.events == [(10, 3)]
 
 
 @given(st.lists(st.tuples(st.integers(0, 20), st.booleans(), st.integers(0, 4))), st.integers(1, 7))
@@ -65,5 +65,5 @@ def test_events_run_in_order_of_time_and_then_of_scheduling(
         events.advance(now_ns)
         next_ns = events.next_ns()
         assert next_ns is None or next_ns > now_ns
-    assert [name for _, name in event_log.seen] == sorted(expected, key=lambda name: expected[name])
-    assert [at_ns for at_ns, _ in event_log.seen] == sorted(at_ns for at_ns, _ in expected.values())
+    assert [name for _, name in event_log.events] == sorted(expected, key=lambda name: expected[name])
+    assert [at_ns for at_ns, _ in event_log.events] == sorted(at_ns for at_ns, _ in expected.values())

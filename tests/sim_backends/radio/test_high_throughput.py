@@ -12,7 +12,7 @@ from sim_backends.radio.high_throughput import HighThroughput, PhyCapability, fo
 from sim_backends.radio.modes import ack_ns, control_mode
 
 
-# Tables 19-27 ff. (HT), 21-29 ff. (VHT) and 27-79 ff. (HE), Mbit/s.
+# Tables 19-27 ff. (HT), 21-29 ff. (VHT) and those of 27.5 (HE), Mbit/s.
 @pytest.mark.parametrize(
     ("phy_format", "width_mhz", "streams", "guard_ns", "rates"),
     [

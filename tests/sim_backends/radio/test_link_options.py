@@ -38,8 +38,8 @@ def test_invalid_options_are_named_in_the_error(text: str, message: str) -> None
 
 
 def test_given_values_apply_to_every_link() -> None:
-    given = options("{loss: 10%, delay: 5ms, jitter: 1ms, rate: 20Mbit/s, queue_packets: 7}")
-    links = mesh(given, ["a", "b", "c"])
+    link_options = options("{loss: 10%, delay: 5ms, jitter: 1ms, rate: 20Mbit/s, queue_packets: 7}")
+    links = mesh(link_options, ["a", "b", "c"])
     assert set(links) == {("a", "b"), ("b", "a"), ("a", "c"), ("c", "a"), ("b", "c"), ("c", "b")}
     expected = LinkParameters(
         rate_bit_s=20_000_000, delay_ns=5_000_000, jitter_ns=1_000_000, loss=0.1, queue_packets=7

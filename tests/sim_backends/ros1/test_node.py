@@ -43,9 +43,9 @@ def test_messages_pass_between_nodes_and_to_ros(master: str) -> None:
             assert subscriber.receive(after_s(30)) == body
         subscriber.close()
         until(lambda: publisher.connections == 0)
-        shown = subprocess.run(("rostopic", "info", "/data"), capture_output=True, text=True, timeout=60, check=True)
-        assert "Type: std_msgs/UInt8MultiArray" in shown.stdout
-        assert " * /a (http://127.0.0.1:" in shown.stdout
+        result = subprocess.run(("rostopic", "info", "/data"), capture_output=True, text=True, timeout=60, check=True)
+        assert "Type: std_msgs/UInt8MultiArray" in result.stdout
+        assert " * /a (http://127.0.0.1:" in result.stdout
         assert publisher.publish(b"", after_s(30)) == 0
         with pytest.raises(TimeoutError):
             subscriber.receive(after_s(0.01))
@@ -54,8 +54,8 @@ def test_messages_pass_between_nodes_and_to_ros(master: str) -> None:
 def test_another_type_and_a_node_that_has_exited_are_ignored(master: str) -> None:
     with closing(RosNode("/a", master)) as a, closing(RosNode("/b", master)) as b:
         with socket.create_server(("127.0.0.1", 0)) as server:
-            gone = f"http://127.0.0.1:{server.getsockname()[1]}/"
-        call(master, "registerPublisher", "/gone", "/data2", MESSAGE.name, gone)
+            closed_address = f"http://127.0.0.1:{server.getsockname()[1]}/"
+        call(master, "registerPublisher", "/gone", "/data2", MESSAGE.name, closed_address)
         strings = b.subscribe("/data2", OTHER, after_s(30))
         bytes_of = b.subscribe("/data3", MESSAGE, after_s(30))
         publishers = [a.publish(f"/data{number}", MESSAGE, after_s(30)) for number in (2, 3)]

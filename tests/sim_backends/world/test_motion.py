@@ -1,4 +1,4 @@
-"""Way-points: continuous motion at the given speed, with corners at the times of their distance."""
+"""Waypoints: continuous motion at the given speed, with corners at the times of their distance."""
 
 import math
 from itertools import pairwise

@@ -29,15 +29,15 @@ class ScriptedOperator:
     """An operator with one answer to all questions; records the questions."""
 
     answer: str
-    asked: list[str] = field(default_factory=list)
+    questions: list[str] = field(default_factory=list)
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
         assert not may_skip
-        self.asked.append(request)
+        self.questions.append(request)
         return DONE
 
     def enter(self, question: Question) -> str:
-        self.asked.append(question.text)
+        self.questions.append(question.text)
         answer = question.read(self.answer)
         assert answer is not None
         return answer
@@ -51,12 +51,12 @@ def ignore(name: str, expected_s: float | None) -> None:
     """Ignore a phase."""
 
 
-def run_and_view(step: AskStep, here: Path, operator: ScriptedOperator | None = None) -> View:
-    here.mkdir(parents=True)
+def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None = None) -> View:
+    folder.mkdir(parents=True)
     testbed = IdleTestbed()
     testbed.operator = operator or UNATTENDED
-    step.run(replace(SCENE, laptop_folder=here), testbed, ignore)
-    return View(SCENE, AttemptEvidence(here))
+    step.run(replace(SCENE, laptop_folder=folder), testbed, ignore)
+    return View(SCENE, AttemptEvidence(folder))
 
 
 @pytest.mark.parametrize(
@@ -147,10 +147,10 @@ def test_usual_answer_is_used_without_operator(tmp_path: Path) -> None:
 def test_question_is_asked_once_per_trial_or_repeat(tmp_path: Path, each: str, times: int) -> None:
     operator, step = ScriptedOperator("7"), ask(f"{WIND}, each: {each}")
     views = [run_and_view(step, tmp_path / "trial" / "repeats" / name, operator) for name in ("b", ".a", "c")]
-    assert len(operator.asked) == times
+    assert len(operator.questions) == times
     assert [step.measure(view).values for view in views] == [{"wind": 7.0}] * 3
     run_and_view(step, tmp_path / "other" / "repeats" / "a", operator)
-    assert len(operator.asked) == times + 1
+    assert len(operator.questions) == times + 1
 
 
 @pytest.mark.parametrize("text", ["", "\n", "strong\n", "99\n", "3\n4\n"])
@@ -175,7 +175,7 @@ def test_wait_ends_after_its_time_or_by_operator() -> None:
     operator, testbed = ScriptedOperator(""), IdleTestbed()
     testbed.operator = operator
     wait("until: open the door").run(SCENE, testbed, ignore)
-    assert operator.asked == ["open the door"]
+    assert operator.questions == ["open the door"]
     phases: list[tuple[str, float | None]] = []
     wait("duration: 1ms").run(SCENE, testbed, lambda *phase: phases.append(phase))
     assert phases == [("wait", 0.001)]

@@ -13,7 +13,7 @@ from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
-from fieldkit.steps import capabilities
+from fieldkit.steps import base
 from fieldkit.steps.kinds.capture import CaptureStep
 from fieldkit.steps.scene import Announce, Scene
 from tests.helpers.casts import CAST, los_plan
@@ -45,7 +45,7 @@ def run(home: Path, patch: pytest.MonkeyPatch, prepare: Callable[[], None], barr
 
     patch.setattr(jobs, "start", start)
     patch.setattr(jobs, "stop", stop)
-    patch.setattr(capabilities, "prepare", prepared)
+    patch.setattr(base, "prepare", prepared)
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(home, robot=role) for role in step.robots}
     try:
@@ -79,7 +79,7 @@ def test_step_inside_waits_for_captures_with_sudo(tmp_path: Path, monkeypatch: p
     slow = CAST[Role.SENDER].model_copy(update={"profile": profile.model_copy(update={"tools": tools})})
     monkeypatch.setattr(jobs, "start", start)
     monkeypatch.setattr(jobs, "stop", lambda *_, **__: 0)
-    monkeypatch.setattr(capabilities, "prepare", prepared)
+    monkeypatch.setattr(base, "prepare", prepared)
     step = schema.validate(schema.parse(TEXT, source="x.yaml"), CaptureStep)
     shells = {role: LocalShell(tmp_path, robot=role) for role in step.robots}
     step.run(Scene(Protocol.TCP, CAST | {Role.SENDER: slow}, "f"), IdleTestbed(shells), lambda *_: None)

@@ -93,11 +93,11 @@ def test_link_is_observed_from_the_other_end() -> None:
 
 def test_killed_process_is_observed_on_the_robot_itself() -> None:
     step = fault("robot: receiver, kind: kill, process: nc.traditional")
-    (role, watch), (_, heals) = lines(step)
+    (role, watch), (_, recovery) = lines(step)
     assert role is Role.RECEIVER
     assert watch.startswith('sh -c \'echo "watching $1"; while :; do ')
     assert watch.endswith(" sh nc.traditional 0.1 2> fault-kill-watch.txt")
-    assert "sh SECONDS 0.1 fault-kill-watch.txt ' up ' 10 > fault-kill.txt" in heals
+    assert "sh SECONDS 0.1 fault-kill-watch.txt ' up ' 10 > fault-kill.txt" in recovery
     assert step.roles() == {Role.RECEIVER}
 
 
@@ -117,11 +117,11 @@ def test_commands_of_a_fault_have_one_line() -> None:
 def test_interval_depends_on_variant_of_ping(tool: PingTool, root: bool, options: str) -> None:
     tools = replace(expected(TURTLEBOT), ping=tool, root=root)
     scene = replace(SCENE, variants={Role.SENDER: tools})
-    (role, watch), (_, heals) = lines(fault("robot: relay, kind: reboot"), scene)
+    (role, watch), (_, recovery) = lines(fault("robot: relay, kind: reboot"), scene)
     assert role is Role.SENDER
     assert watch == f"env LC_ALL=C ping {options} 10.42.0.3 2> fault-reboot-ping.txt"
     answers = 5 if "0.2" in options else 10
-    assert f"'bytes from' {answers} >" in heals
+    assert f"'bytes from' {answers} >" in recovery
 
 
 def test_steps_inside_a_fault_are_included() -> None:
@@ -141,9 +141,9 @@ def test_steps_inside_a_fault_can_be_excluded() -> None:
 
 
 def test_two_faults_of_one_kind_are_refused() -> None:
-    again = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
+    nested_twice = NESTED + "  - fault: {robot: sender, kind: out-of-range, for: 1s}\n"
     with pytest.raises(ConfigurationError, match="a fault out-of-range is defined twice"):
-        schema.validate(schema.parse(again, source="x"), Procedure)
+        schema.validate(schema.parse(nested_twice, source="x"), Procedure)
 
 
 def test_written_procedure_with_faults_is_read_unchanged() -> None:

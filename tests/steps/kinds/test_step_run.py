@@ -77,7 +77,7 @@ def test_variables_are_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    ("text", "line", "why"),
+    ("text", "line", "reason"),
     [
         ("robot: sender\ncommand: a {distanse}", 2, "no variable {distanse}; did you mean '{distance}'"),
         ("robot: sender\nargv:\n- a\n- '{repeats}'", 4, "no variable {repeats}; did you mean '{repeat}'"),
@@ -108,9 +108,11 @@ def test_variables_are_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         ("robot: sender\ncommand: a\nexpect: {code: []}", 3, "at least 1"),
     ],
 )
-def test_invalid_keys_are_refused_with_line(text: str, line: int, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_keys_are_refused_with_line(
+    text: str, line: int, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(ROOT)
-    with pytest.raises(ConfigurationError, match=why) as caught:
+    with pytest.raises(ConfigurationError, match=reason) as caught:
         run_step(text)
     assert caught.value.where == f"run.yaml:{line}"
 

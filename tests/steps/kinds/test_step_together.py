@@ -145,9 +145,9 @@ def test_transfers_cross_at_the_same_time(robots: IdleTestbed) -> None:
 @pytest.mark.emulated
 def test_first_failure_stops_the_others_and_is_reported(robots: IdleTestbed) -> None:
     started = "touch {0}; sleep 50; touch {0}.done"
-    fails = "until [ -e a ] && [ -e b ]; do sleep 0.01; done; exit 7"
+    failing = "until [ -e a ] && [ -e b ]; do sleep 0.01; done; exit 7"
     with pytest.raises(RobotError, match="c ended with 7"):
-        run(together(a=started.format("a"), b=started.format("b"), c=fails), robots)
+        run(together(a=started.format("a"), b=started.format("b"), c=failing), robots)
     assert not running(robots)
     assert not list(folder(robots).glob("*.done"))
 
@@ -212,11 +212,11 @@ def test_interrupt_ends_waits_of_other_threads(robots: IdleTestbed) -> None:
         if name == "wait":
             started.set()
 
-    waits = TogetherStep.model_validate({"during": [WAIT, WAIT]})
+    waiting_step = TogetherStep.model_validate({"during": [WAIT, WAIT]})
     threads_before = threading.active_count()
     threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(KeyboardInterrupt):
-        waits.run(Scene(Protocol.TCP, CAST, FOLDER), robots, announce)
+        waiting_step.run(Scene(Protocol.TCP, CAST, FOLDER), robots, announce)
     wait_until(lambda: threading.active_count() == threads_before, Deadline.after(30))
 
 
@@ -330,7 +330,7 @@ def load(steps: str) -> Procedure:
 
 
 @pytest.mark.parametrize(
-    ("steps", "what", "line"),
+    ("steps", "message", "line"),
     [
         ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
         (SAME_PORT, "port 1234 is used twice at the same time on receiver; give one another port", 4),
@@ -367,10 +367,10 @@ def load(steps: str) -> Procedure:
         ),
     ],
 )
-def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, what: str, line: int) -> None:
+def test_steps_that_cannot_run_simultaneously_are_refused_with_line(steps: str, message: str, line: int) -> None:
     with pytest.raises(ConfigurationError) as caught:
         load(steps)
-    assert what in caught.value.what
+    assert message in caught.value.what
     assert caught.value.where == f"x.yaml:{(HEAD + RECORD).count(chr(10)) + line}"
 
 

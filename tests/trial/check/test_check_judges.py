@@ -38,7 +38,7 @@ def only(findings: Sequence[Finding], check: str) -> Finding:
     return finding
 
 
-def heard(robot: Robot, **sections: CommandResult) -> list[Finding]:
+def judge_radio(robot: Robot, **sections: CommandResult) -> list[Finding]:
     """Judge the radio; an underscore in the name of a section is replaced by a hyphen."""
     base = {"interface": output_text("ip/6.1.0/up.txt")}
     report = Report(robot.name)
@@ -58,25 +58,25 @@ def heard(robot: Robot, **sections: CommandResult) -> list[Finding]:
     ],
 )
 def test_an_interface_must_be_up_and_connected(file: str, code: int, status: Verdict, detail: str) -> None:
-    finding = only(heard(SENDER, interface=output_text(file, code)), "interface wlan0")
+    finding = only(judge_radio(SENDER, interface=output_text(file, code)), "interface wlan0")
     assert finding.status is status
     assert detail in finding.detail
     assert bool(finding.remedy) == (status is FAIL)
 
 
 def test_an_interface_with_another_address_is_a_failure() -> None:
-    finding = only(heard(RECEIVER), "interface wlan0")
+    finding = only(judge_radio(RECEIVER), "interface wlan0")
     assert (finding.status, finding.detail) == (FAIL, "has 10.42.0.1/24, not 10.42.0.2")
 
 
 def test_offloads_are_for_the_record() -> None:
-    finding = only(heard(SENDER, offloads=output_text("ethtool/6.1/tun.txt")), "offloads")
+    finding = only(judge_radio(SENDER, offloads=output_text("ethtool/6.1/tun.txt")), "offloads")
     assert (finding.status, finding.detail) == (OK, "GSO on, TSO off, GRO on")
-    assert only(heard(SENDER), "offloads").status is OK
+    assert only(judge_radio(SENDER), "offloads").status is OK
 
 
 def test_a_station_has_access_point_channel_signal_and_rate() -> None:
-    findings = heard(
+    findings = judge_radio(
         SENDER,
         wifi_info=output_text("iw/info-station.txt"),
         wifi_link=output_text("iw/link-station.txt"),
@@ -93,12 +93,12 @@ def test_a_signal_near_the_sensitivity_is_a_warning() -> None:
     # The TurtleBot's sensitivity is -82 dBm.
     for dbm, status in ((-72, OK), (-73, WARN)):
         weak = CommandResult(link.text.replace("-65 dBm", f"{dbm} dBm"), 0)
-        findings = heard(SENDER, wifi_info=output_text("iw/info-station.txt"), wifi_link=weak)
+        findings = judge_radio(SENDER, wifi_info=output_text("iw/info-station.txt"), wifi_link=weak)
         assert only(findings, "Wi-Fi").status is status
 
 
 def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
-    findings = heard(
+    findings = judge_radio(
         SENDER,
         wifi_info=output_text("iw/info-station.txt"),
         wifi_link=output_text("iw/link-station.txt"),
@@ -109,18 +109,22 @@ def test_power_save_is_a_warning_with_the_command_that_disables_it() -> None:
 
 
 def test_a_station_without_a_network_fails() -> None:
-    findings = heard(SENDER, wifi_info=output_text("iw/info-txpower.txt"), wifi_link=output_text("iw/link-none.txt"))
+    findings = judge_radio(
+        SENDER, wifi_info=output_text("iw/info-txpower.txt"), wifi_link=output_text("iw/link-none.txt")
+    )
     assert only(findings, "Wi-Fi").status is FAIL
 
 
 def test_an_access_point_counts_its_stations_and_needs_no_power_save() -> None:
-    findings = heard(RELAY, wifi_info=output_text("iw/info-ap.txt"), wifi_stations=output_text("iw/stations-ap.txt"))
+    findings = judge_radio(
+        RELAY, wifi_info=output_text("iw/info-ap.txt"), wifi_stations=output_text("iw/stations-ap.txt")
+    )
     assert only(findings, "Wi-Fi").detail == "AP 'xx', channel 1, 1 stations, -57 dBm"
     assert "power save" not in {finding.check for finding in findings}
 
 
 def test_a_station_whose_profile_has_an_access_point_is_a_warning() -> None:
-    findings = heard(
+    findings = judge_radio(
         RELAY, wifi_info=output_text("iw/info-station.txt"), wifi_link=output_text("iw/link-station.txt")
     )
     finding = only(findings, "Wi-Fi")
@@ -130,37 +134,39 @@ def test_a_station_whose_profile_has_an_access_point_is_a_warning() -> None:
 
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
     ibss = CommandResult(output_text("iw/info-station.txt").text.replace("managed", "IBSS"), 0)
-    findings = heard(SENDER, wifi_info=ibss, wifi_link=output_text("iw/link-ibss.txt"))
+    findings = judge_radio(SENDER, wifi_info=ibss, wifi_link=output_text("iw/link-ibss.txt"))
     assert only(findings, "Wi-Fi").detail == "IBSS 'knowhere', at 02:11:87:86:a3:0f, channel 11"
 
 
 def test_outputs_of_the_kernels_wifi_stack_are_read_in_every_mode() -> None:
-    station = heard(
+    station = judge_radio(
         SENDER, wifi_info=output_text("iw/info-hwsim-station-6.txt"), wifi_link=output_text("iw/link-hwsim-6.txt")
     )
     assert only(station, "Wi-Fi").detail == "managed 'lawn', at 02:00:00:00:00:00, channel 6, -30 dBm, 1.0 MBit/s"
-    relay = heard(
+    relay = judge_radio(
         RELAY,
         wifi_info=output_text("iw/info-hwsim-ap-6.txt"),
         wifi_stations=output_text("iw/stations-hwsim-ap-6.txt"),
     )
     assert only(relay, "Wi-Fi").detail == "AP 'lawn', channel 6, 2 stations, -30 dBm"
-    ibss = heard(
+    ibss = judge_radio(
         SENDER, wifi_info=output_text("iw/info-hwsim-ibss-5.txt"), wifi_link=output_text("iw/link-hwsim-ibss-6.txt")
     )
     assert only(ibss, "Wi-Fi").detail == "IBSS 'lawn', at 26:9f:2e:55:bf:8b, channel 6"
-    down = heard(SENDER, wifi_info=output_text("iw/info-hwsim-down-5.txt"), wifi_link=output_text("iw/link-none.txt"))
+    down = judge_radio(
+        SENDER, wifi_info=output_text("iw/info-hwsim-down-5.txt"), wifi_link=output_text("iw/link-none.txt")
+    )
     assert only(down, "Wi-Fi").detail == "not associated with a network"
 
 
 def test_an_interface_without_a_radio_has_no_wifi_findings() -> None:
-    findings = heard(SENDER, wifi_info=output_text("iw/no-wifi.txt", 1))
+    findings = judge_radio(SENDER, wifi_info=output_text("iw/no-wifi.txt", 1))
     assert {finding.check for finding in findings} == {"interface wlan0", "control", "offloads"}
 
 
 def test_a_radio_without_iw_is_a_warning() -> None:
     ether = CommandResult(output_text("ip/6.1.0/up.txt").text.replace("link/none", "link/ether b8:27:eb:94:14:9a"), 0)
-    findings = heard(SENDER, interface=ether, wireless=CommandResult("/sys/class/net/wlan0/phy80211", 0))
+    findings = judge_radio(SENDER, interface=ether, wireless=CommandResult("/sys/class/net/wlan0/phy80211", 0))
     assert only(findings, "Wi-Fi").remedy == "sudo apt-get install iw"
 
 
@@ -204,8 +210,12 @@ def test_a_disk_with_unknown_space_fails() -> None:
 
 
 def test_the_laptop_must_hold_an_attempt_and_should_hold_the_trial() -> None:
-    whole = size.trial_bytes(PLAN)
-    for free, status in ((size.RESERVE_BYTES + whole, OK), (size.RESERVE_BYTES + whole - 1, WARN), (0, FAIL)):
+    size_bytes = size.trial_bytes(PLAN)
+    for free, status in (
+        (size.RESERVE_BYTES + size_bytes, OK),
+        (size.RESERVE_BYTES + size_bytes - 1, WARN),
+        (0, FAIL),
+    ):
         report = Report("laptop")
         system.judge_disk_space(PLAN, free, Path("/trials"), report)
         assert only(report.findings, "disk").status is status
@@ -228,15 +238,15 @@ LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 0
 
 
 def test_a_port_in_use_fails_on_the_receiver_only() -> None:
-    taken = CommandResult(LISTENER, 0)
-    finding = only(probed(Role.RECEIVER, listeners=taken), "port 1234")
+    port_in_use = CommandResult(LISTENER, 0)
+    finding = only(probed(Role.RECEIVER, listeners=port_in_use), "port 1234")
     assert finding.status is FAIL
     assert "1234" in finding.remedy
     assert (
         only(probed(Role.RECEIVER, listeners=CommandResult(LISTENER.replace("04D2", "04D3"), 0)), "port 1234").status
         is OK
     )
-    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=taken)}
+    assert "port 1234" not in {finding.check for finding in probed(Role.SENDER, listeners=port_in_use)}
 
 
 def test_a_low_battery_is_a_warning() -> None:
@@ -266,7 +276,7 @@ def test_an_error_of_an_hour_is_reported_in_hours() -> None:
 
 
 def installed(plan: Plan = PLAN) -> dict[str, CommandResult]:
-    asked = software.commands(plan, Role.SENDER)
+    commands = software.commands(plan, Role.SENDER)
     tools = "\n".join(
         f"==> {name} <==\n{text}\n==> exit 0 <=="
         for name, text in {
@@ -278,7 +288,7 @@ def installed(plan: Plan = PLAN) -> dict[str, CommandResult]:
             "recorder": "Usage: rosbag record TOPIC1 [TOPIC2 TOPIC3...]",
         }.items()
     )
-    return dict.fromkeys(asked, CommandResult("/usr/bin/it", 0)) | {
+    return dict.fromkeys(commands, CommandResult("/usr/bin/it", 0)) | {
         "tools": CommandResult(tools, 0),
         "ROS": CommandResult("noetic http://127.0.0.1:11311", 0),
     }
@@ -330,9 +340,9 @@ def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, prog
 
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
-    refused = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
+    result = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
     (failed,) = [
-        finding for finding in judged(installed() | {"right to capture": refused}) if finding.status is not OK
+        finding for finding in judged(installed() | {"right to capture": result}) if finding.status is not OK
     ]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
@@ -381,7 +391,7 @@ def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
 )
 def test_the_route_of_ssh_is_detected(connection: str, control: Control, status: Verdict, detail: str) -> None:
     finding = only(
-        heard(SENDER.model_copy(update={"control": control}), control=CommandResult(connection, 0)), "control"
+        judge_radio(SENDER.model_copy(update={"control": control}), control=CommandResult(connection, 0)), "control"
     )
     assert finding.status is status
     assert detail in finding.detail
@@ -389,11 +399,11 @@ def test_the_route_of_ssh_is_detected(connection: str, control: Control, status:
 
 @pytest.mark.parametrize("file", ["ip/6.1.0/nope.txt", "busybox/1.35.0/ip-nope.txt"])
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
-    refused = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
-    sections = installed() | {"right to capture": refused, "interface": output_text(file, 1)}
+    result = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
+    sections = installed() | {"right to capture": result, "interface": output_text(file, 1)}
     assert "right to capture" not in {finding.check for finding in judged(sections)}
-    there = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
-    assert only(there, "right to capture").status is FAIL
+    findings = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
+    assert only(findings, "right to capture").status is FAIL
 
 
 @pytest.mark.parametrize(
@@ -439,5 +449,5 @@ def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:
 
 
 def test_no_remedy_names_an_unknown_file() -> None:
-    finding = only(heard(SENDER, control=CommandResult("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
+    finding = only(judge_radio(SENDER, control=CommandResult("10.42.0.254 51000 10.42.0.1 22", 0)), "control")
     assert finding.remedy == "write control: radio in the site file, or give host another network"

@@ -31,8 +31,8 @@ USER = section("user", b"1000\n")
 
 def with_tools(**names: str) -> RobotProfile:
     """The TurtleBot with programs under other names, and ROS in its PATH."""
-    bare = ros_of(TURTLEBOT).command.model_copy(update={"setup": ()})
-    ros = ros_of(TURTLEBOT).model_copy(update={"variants": {"ros1": bare}})
+    without_setup = ros_of(TURTLEBOT).command.model_copy(update={"setup": ()})
+    ros = ros_of(TURTLEBOT).model_copy(update={"variants": {"ros1": without_setup}})
     return TURTLEBOT.model_copy(update={"tools": TURTLEBOT.tools.model_copy(update=names), "ros": ros})
 
 

@@ -34,7 +34,7 @@ FIRST = RepeatId(Protocol.TCP, 1)
 
 
 @pytest.fixture
-def broken(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+def incomplete(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     """Repeats whose evidence is incomplete."""
     robots_with_evidence(monkeypatch)
     names: set[str] = set()
@@ -49,8 +49,8 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     return names
 
 
-def with_a_failed_repeat(out: Path, broken: set[str]) -> Path:
-    broken.add(str(FIRST))
+def with_a_failed_repeat(out: Path, incomplete: set[str]) -> Path:
+    incomplete.add(str(FIRST))
     outcome = run_trial(TWO, IdleTestbed(), out, lambda _: None)
     assert outcome is not None
     assert (outcome.valid, outcome.failed) == (1, 1)
@@ -64,9 +64,9 @@ def redo(folder: Path, received: list[Event] | None = None) -> Outcome:
     return outcome
 
 
-def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path, broken: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, broken)
-    broken.clear()
+def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path, incomplete: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, incomplete)
+    incomplete.clear()
     unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
     assert unasked is not None
     assert unasked.failed == 1, "failed repeats are not repeated without the option"
@@ -81,12 +81,12 @@ def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path
     demand_agreement(folder)
 
 
-def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: Path, broken: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, broken)
+def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: Path, incomplete: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, incomplete)
     assert redo(folder).failed == 1
     assert [row["status"] for row in rows(folder) if row["repeat"] == "1"] == ["void"] * 5 + ["failed"]
     demand_agreement(folder)
-    broken.clear()
+    incomplete.clear()
     assert redo(folder).failed == 0
     demand_agreement(folder)
     received: list[Event] = []
@@ -96,8 +96,8 @@ def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: P
 
 def moments(folder: Path, stride: int) -> Iterator[Path]:
     """Yield the trial's folder after a kill at every `stride`-th write while a repeat is run again."""
-    moment, kept = 1 - stride, folder.with_name("kept")
-    shutil.copytree(folder, kept)
+    moment, saved = 1 - stride, folder.with_name("kept")
+    shutil.copytree(folder, saved)
     while True:
         moment += stride
         pid = os.fork()
@@ -108,16 +108,16 @@ def moments(folder: Path, stride: int) -> Iterator[Path]:
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         yield folder
         shutil.rmtree(folder)
-        shutil.copytree(kept, folder)
+        shutil.copytree(saved, folder)
         if code == 0:
             return
         assert code == KILLED
 
 
 @pytest.mark.parametrize("stride", STRIDES)
-def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, broken: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, broken)
-    broken.clear()
+def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, incomplete: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, incomplete)
+    incomplete.clear()
     count = 0
     for died in moments(folder, stride):
         count += stride
@@ -128,15 +128,15 @@ def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, broken: s
     assert count > 10, "too few writes were interrupted"
 
 
-def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, broken: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, broken)
+def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, incomplete: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, incomplete)
     journal.append(folder, JournalEntry(1, Protocol.TCP, 2, 0, Status.PLANNED))
     with pytest.raises(EvidenceError, match="tcp-02 is planned again, although it was valid"):
         redo(folder)
 
 
-def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(tmp_path: Path, broken: set[str]) -> None:
-    folder = with_a_failed_repeat(tmp_path, broken)
+def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(tmp_path: Path, incomplete: set[str]) -> None:
+    folder = with_a_failed_repeat(tmp_path, incomplete)
     (folder / store.REPEATS / "tcp-01.failed3" / "ping.txt").write_text(PING, encoding="utf-8")
     with pytest.raises(EvidenceError, match="evidence is not what was measured"):
         redo(folder)

@@ -43,12 +43,12 @@ def begin(out: Path, repeats: int) -> tuple[Ledger, Plan, Path]:
 
 
 def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
-    begun = to.begin(repeat)
+    entry = to.begin(repeat)
     partial = store.open_attempt(folder, repeat)
     (partial / "ping.txt").write_text(PING, encoding="ascii")
-    to.measured(begun)
+    to.measured(entry)
     measured = gates.judge(plan, repeat, AttemptEvidence(partial)).measured
-    to.commit(partial, replace(begun, status=Status.VALID), measured)
+    to.commit(partial, replace(entry, status=Status.VALID), measured)
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def trial(tmp_path: Path) -> Path:
     return folder
 
 
-def again(folder: Path) -> Ledger:
+def reopened(folder: Path) -> Ledger:
     return Ledger(store.read_plan(folder), folder, Stop())
 
 
@@ -98,7 +98,7 @@ def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypat
 def test_a_small_trial_writes_every_row_immediately(trial: Path) -> None:
     plan = store.read_plan(trial)
     before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
-    keep(again(trial), plan, trial, list(plan.order())[2])
+    keep(reopened(trial), plan, trial, list(plan.order())[2])
     after = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
     assert after.startswith(before)
     assert after.count("\n") == before.count("\n") + 1
@@ -114,7 +114,7 @@ def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
 
     monkeypatch.setattr(gates, "judge", never)
     monkeypatch.setattr(manifest.Manifest, "add", never)
-    to = again(trial)
+    to = reopened(trial)
     assert to.differences == {}
     assert (to.done, to.counts(Status.VALID)) == (2, 2)
     to.summarize()
@@ -125,9 +125,9 @@ def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkey
     plan = store.read_plan(trial)
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
-    keep(again(trial), plan, trial, list(plan.order())[2])
+    keep(reopened(trial), plan, trial, list(plan.order())[2])
     assert (trial / store.TRIAL_CSV).read_bytes() == table, "the process is killed here"
-    again(trial).summarize()
+    reopened(trial).summarize()
     assert manifest.verify(trial) == []
     assert rebuild(trial).changed == ()
     assert (trial / store.TRIAL_CSV).read_bytes().startswith(table)
@@ -137,7 +137,7 @@ def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.
     """Another version of fieldkit measures other rows; an edited journal is still reported as changed."""
     with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
         file.write("changed\n")
-    again(trial).summarize()
+    reopened(trial).summarize()
     head, line = rows.head, rows.line
     monkeypatch.setattr(rows, "head", lambda table: f"more,{head(table)}")
     monkeypatch.setattr(rows, "line", lambda row, table: f",{line(row, table)}")
@@ -153,7 +153,7 @@ def rot(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("befalls", "what"),
+    ("befalls", "changes"),
     [
         (rot, {CHANGED: "changed"}),
         (Path.unlink, {CHANGED: "missing"}),
@@ -165,14 +165,14 @@ def rot(path: Path) -> None:
 def test_checksums_are_kept_and_differences_reported(
     trial: Path,
     befalls: Callable[[Path], object],
-    what: dict[str, str],
+    changes: dict[str, str],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
     befalls(trial / CHANGED)
-    output_text = [f"{name}: {kind}" for name, kind in what.items()]
-    to = again(trial)
-    assert to.differences == what
+    output_text = [f"{name}: {kind}" for name, kind in changes.items()]
+    to = reopened(trial)
+    assert to.differences == changes
     to.summarize()
     assert set(output_text) <= set(manifest.verify(trial))
     with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
@@ -192,7 +192,7 @@ def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:
     text = (trial / journal.JOURNAL_FILE).read_text(encoding="utf-8")
     (trial / journal.JOURNAL_FILE).write_text(text.replace("valid", "failed", 1), encoding="utf-8")
     (trial / "repeats/tcp-01").rename(trial / "repeats/tcp-01.failed1")
-    to = again(trial)
+    to = reopened(trial)
     assert to.differences.items() >= {("trial.yaml", "changed"), ("journal.jsonl", "changed")}
     to.summarize()
     assert "trial.yaml: changed" in manifest.verify(trial)
@@ -229,13 +229,13 @@ def test_a_table_is_not_rebuilt_from_changed_evidence(trial: Path) -> None:
     (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
     rot(trial / CHANGED)
     with pytest.raises(EvidenceError, match=rf"evidence is not what was measured: {CHANGED}: changed"):
-        again(trial)
+        reopened(trial)
 
 
 def test_a_missing_table_is_rebuilt_and_reported(trial: Path) -> None:
     table = (trial / store.TRIAL_CSV).read_bytes()
     (trial / store.TRIAL_CSV).unlink()
-    to = again(trial)
+    to = reopened(trial)
     assert to.differences == {store.TRIAL_CSV: "changed"}
     to.summarize()
     assert (trial / store.TRIAL_CSV).read_bytes() == table
@@ -244,10 +244,10 @@ def test_a_missing_table_is_rebuilt_and_reported(trial: Path) -> None:
 def test_a_missing_or_invalid_manifest_is_reported(trial: Path) -> None:
     (trial / store.MANIFEST_FILE).write_text("nonsense\n", encoding="utf-8")
     with pytest.raises(EvidenceError, match="no readable manifest: not a line of a manifest: nonsense") as caught:
-        again(trial)
+        reopened(trial)
     assert caught.value.remedy == "restore the file from a copy"
     (trial / store.MANIFEST_FILE).unlink()
-    assert again(trial).differences.keys() == {store.MANIFEST_FILE}
+    assert reopened(trial).differences.keys() == {store.MANIFEST_FILE}
 
 
 def test_a_report_leaves_out_changed_evidence_with_a_note(trial: Path) -> None:

@@ -37,7 +37,7 @@ def robot(tmp_path: Path, request: pytest.FixtureRequest) -> LocalShell:
     return LocalShell(home, userland_path(request.param, tmp_path / "bin"), "turtlebot-1")
 
 
-def quiet(event: Event) -> None:
+def fail_on_event(event: Event) -> None:
     raise AssertionError(event)
 
 
@@ -59,25 +59,25 @@ def begin(robot: LocalShell, holder: Holder) -> None:
 
 
 def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         with (
             pytest.raises(
                 RobotError, match=r"turtlebot-1: anna@one holds it since \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
             ) as caught,
-            locked({Role.SENDER: robot}, BERT, sink=quiet),
+            locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
         assert re.search(r"; expires in (1 h 00 min|59 min \d\d s)$", caught.value.what)
         assert caught.value.remedy == "wait, resume that trial if it is yours, or end it: fieldkit abort"
-    with locked({Role.SENDER: robot}, BERT, sink=quiet):
+    with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
         begin(robot, BERT)
 
 
 def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     assert locks.holder(robot) is None
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=60):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event, ttl_s=60):
         lock = locks.holder(robot)
         assert lock is not None
         assert lock.holder == ANNA
@@ -88,7 +88,10 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
 
 
 def test_the_same_trial_can_lock_its_robot_again(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet), locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with (
+        locked({Role.SENDER: robot}, ANNA, sink=fail_on_event),
+        locked({Role.SENDER: robot}, ANNA, sink=fail_on_event),
+    ):
         begin(robot, ANNA)
 
 
@@ -102,7 +105,7 @@ def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell
 
     for turn in range(3):
         with ThreadPoolExecutor(len(holders)) as pool:
-            won = [holder for holder, taken in zip(holders, pool.map(take, holders), strict=True) if taken]
+            won = [holder for holder, is_locked in zip(holders, pool.map(take, holders), strict=True) if is_locked]
         (winner,) = won
         assert record(robot)[:2] == ["held", winner.token]
         alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: in the next round, laptops compete to replace it
@@ -122,9 +125,9 @@ def test_a_lock_number_that_was_used_and_removed_is_not_valid(robot: LocalShell)
 
 
 def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         alter(robot, (4, "1"))
-        with locked({Role.SENDER: robot}, BERT, sink=quiet):
+        with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
             with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b") as caught:
                 begin(robot, ANNA)
             assert caught.value.exit_code == 3
@@ -132,17 +135,20 @@ def test_an_expired_lock_is_replaced_and_its_holder_is_notified(robot: LocalShel
 
 
 def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         alter(robot, (2, "another-boot"), (4, "1"))
-        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
+        with (
+            pytest.raises(RobotError, match="anna@one holds it"),
+            locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
+        ):
             raise AssertionError("taken twice")
         alter(robot, (5, "99999999999"), (6, "99999999999"))  # the robot's clock is in the past: it has no battery
-        with locked({Role.SENDER: robot}, BERT, sink=quiet):
+        with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
             begin(robot, BERT)
 
 
 def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet, ttl_s=1000):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event, ttl_s=1000):
         fresh = record(robot)
         begin(robot, ANNA)
         assert record(robot) == fresh
@@ -154,22 +160,22 @@ def test_begin_renews_at_half_time_and_not_before(robot: LocalShell) -> None:
 
 
 def test_an_expired_lock_without_a_new_holder_is_renewed(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         alter(robot, (4, "1"))
         begin(robot, ANNA)
         assert int(record(robot)[4]) > 1
 
 
 def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         evidence.begin(robot, jobs.work_folder("older", "udp-03-1"), "sender", "lo")
         for folder in (FOLDER, jobs.work_folder("older", "udp-03-1")):
             argv = ("sh", "-c", "trap '' INT; echo up; while :; do sleep 0.05; done")
             jobs.start(robot, Job(folder=folder, name="capture", argv=argv, limit_s=60, log="log", ready="log:up"))
-        (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
-        assert ended.error is None
-        assert [line.split()[0] for line in ended.jobs] == [
+        (aborted,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
+        assert aborted.error is None
+        assert [line.split()[0] for line in aborted.jobs] == [
             ".fieldkit/older/udp-03-1/capture",
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
@@ -181,30 +187,33 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
         ):
             begin(robot, ANNA)
     with (
-        locked({Role.SENDER: robot}, BERT, sink=quiet),
+        locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         pytest.raises(LockLostError, match="bert@two locked the robot"),
     ):
         begin(robot, ANNA)
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
 
 
-@pytest.mark.parametrize("says", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
-def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_path: Path, says: str) -> None:
+@pytest.mark.parametrize("output", ["", "exit 1", "echo no zone", "echo no zone; echo 1800000000"])
+def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_path: Path, output: str) -> None:
     (tmp_path / "bin" / "date").unlink(missing_ok=True)
-    (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{says}\n", encoding="ascii")
+    (tmp_path / "bin" / "date").write_text(f"#!/bin/sh\n{output}\n", encoding="ascii")
     (tmp_path / "bin" / "date").chmod(0o755)
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
-        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
+        with (
+            pytest.raises(RobotError, match="anna@one holds it"),
+            locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
+        ):
             raise AssertionError("taken")
-        assert [ended.locked for ended in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
+        assert [result.locked for result in locks.abort({"turtlebot-1": robot}, "bert@two").values()] == [True]
 
 
 def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
     for content in ("", "held", "held trial-b boot x y z 1 bert trial"):
         (robot.home / ".fieldkit" / "lock.7").write_text(content, encoding="ascii")
-        with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+        with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
             begin(robot, ANNA)
         for path in (robot.home / ".fieldkit").glob("lock.*"):
             path.unlink()
@@ -212,22 +221,25 @@ def test_a_torn_record_does_not_block_for_long(robot: LocalShell) -> None:
 
 def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
     """An older fieldkit leaves such a record if the power fails just after it was written."""
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         (robot.home / ".fieldkit" / "lock.9").touch()
-        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: robot}, BERT, sink=quiet):
+        with (
+            pytest.raises(RobotError, match="anna@one holds it"),
+            locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
+        ):
             raise AssertionError("taken twice")
         begin(robot, ANNA)
     assert record(robot)[0] == "free"
 
 
 def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         for path in (robot.home / ".fieldkit").glob("lock.*"):
             path.unlink()
         begin(robot, ANNA)
         with (
             pytest.raises(RobotError, match=r"somebody holds it since .*, for trial-a"),
-            locked({Role.SENDER: robot}, BERT, sink=quiet),
+            locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
 
@@ -243,7 +255,7 @@ def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path
             encoding="ascii",
         )
         (tmp_path / "bin" / name).chmod(0o755)
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         synced, linked, folder = calls.read_text(encoding="ascii").splitlines()
         assert re.fullmatch(r"sync held new-lock\.\d+", synced)
         assert linked.startswith("ln held new-lock.")
@@ -252,7 +264,7 @@ def test_a_record_is_on_the_disk_before_it_is_a_lock(robot: LocalShell, tmp_path
 
 
 def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
         lock = locks.holder(robot)
@@ -264,30 +276,30 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
 
 
 def test_a_job_of_a_trial_that_lost_its_lock_does_not_start(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         alter(robot, (4, "1"))
-        with locked({Role.SENDER: robot}, BERT, sink=quiet):
+        with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
             for call in (jobs.start, jobs.run):
-                one = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
+                job = Job(folder=FOLDER, name=call.__name__, argv=("touch", "started"), limit_s=5, log="log")
                 with pytest.raises(LockLostError, match=r"bert@two locked the robot at .* for trial-b"):
-                    call(robot, one)
+                    call(robot, job)
     assert not (robot.home / FOLDER / "started").exists()
 
 
 def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tmp_path: Path) -> None:
     called, go = robot.home / "called", robot.home / "go"
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet), ThreadPoolExecutor(1) as pool:
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event), ThreadPoolExecutor(1) as pool:
         real = "busybox df" if (tmp_path / "bin" / "df").exists() else "/bin/df"
         (tmp_path / "bin" / "df").unlink(missing_ok=True)
-        waits = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
-        (tmp_path / "bin" / "df").write_text(waits, encoding="ascii")  # called after the lock was checked
+        wrapper = f'#!/bin/sh\ntouch "{called}"; until [ -e "{go}" ]; do sleep 0.01; done; exec {real} "$@"\n'
+        (tmp_path / "bin" / "df").write_text(wrapper, encoding="ascii")  # called after the lock was checked
         (tmp_path / "bin" / "df").chmod(0o755)
-        begun = pool.submit(begin, robot, ANNA)
+        submitted = pool.submit(begin, robot, ANNA)
         wait_until(called.exists, Deadline.after(30))
         assert locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
         go.touch()
-        begun.result(30)
+        submitted.result(30)
         with pytest.raises(LockLostError, match="the trial was aborted by bert@two"):
             jobs.run(robot, Job(folder=FOLDER, name="job", argv=("touch", "started"), limit_s=5, log="log"))
     assert not (robot.home / FOLDER / "started").exists()
@@ -295,9 +307,9 @@ def test_no_job_starts_in_a_folder_created_during_an_abort(robot: LocalShell, tm
 
 def test_aborting_a_free_robot_reports_no_lock(robot: LocalShell) -> None:
     for _ in range(2):
-        (ended,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
-        assert (ended.locked, ended.error) == (False, None)
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+        (aborted,) = locks.abort({"turtlebot-1": robot}, "bert@two").values()
+        assert (aborted.locked, aborted.error) == (False, None)
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         pass
     assert not locks.abort({"turtlebot-1": robot}, "bert@two")["turtlebot-1"].locked
 
@@ -307,7 +319,7 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
     plan = plain_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
     shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
-    with locked({Role.SENDER: robot}, anna, sink=quiet):
+    with locked({Role.SENDER: robot}, anna, sink=fail_on_event):
         robots = Robots(plan, IdleTestbed(shells))
         robots.require_locks()
         locks.abort({"turtlebot-1": robot}, "bert@two")
@@ -316,7 +328,7 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
 
 
 def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> None:
-    with locked({Role.SENDER: robot}, ANNA, sink=quiet):
+    with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         locks.abort({"turtlebot-1": robot}, "bert@two")
         with pytest.raises(LockLostError):
@@ -347,8 +359,8 @@ def cast(tmp_path: Path) -> dict[Role, Unreachable]:
 
 
 def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
-    with locked({Role.SENDER: cast[Role.SENDER]}, BERT, sink=quiet):
-        with pytest.raises(RobotError, match="zoe: bert@two holds it"), locked(cast, ANNA, sink=quiet):
+    with locked({Role.SENDER: cast[Role.SENDER]}, BERT, sink=fail_on_event):
+        with pytest.raises(RobotError, match="zoe: bert@two holds it"), locked(cast, ANNA, sink=fail_on_event):
             raise AssertionError("taken")
         assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
 
@@ -367,9 +379,13 @@ def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unr
     with ExitStack() as stack:
         stack.enter_context(locked(cast, ANNA, sink=lambda event: None))
         cast[Role.RECEIVER].left = 0
-        gone = LinkError("did not answer", where="eve")
-        ended = locks.abort({"abe": cast[Role.RECEIVER], "eve": gone, "zoe": cast[Role.SENDER]}, "bert@two")
-    assert {name: one.error is None for name, one in ended.items()} == {"abe": False, "eve": False, "zoe": True}
+        link_error = LinkError("did not answer", where="eve")
+        results = locks.abort({"abe": cast[Role.RECEIVER], "eve": link_error, "zoe": cast[Role.SENDER]}, "bert@two")
+    assert {name: result.error is None for name, result in results.items()} == {
+        "abe": False,
+        "eve": False,
+        "zoe": True,
+    }
     assert record(cast[Role.SENDER])[:2] == ["aborted", "trial-a"]
 
 
@@ -382,15 +398,15 @@ def test_the_user_of_this_machine_has_a_name() -> None:
 def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, Unreachable]) -> None:
     # A trial without a session uses its name as the token, which may be longer than the name of a socket.
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
-    with locked_exclusively(cast, anna, sink=quiet):
+    with locked_exclusively(cast, anna, sink=fail_on_event):
         with (
             pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
-            locked_exclusively(cast, anna, sink=quiet),
+            locked_exclusively(cast, anna, sink=fail_on_event),
         ):
             raise AssertionError("two run it")
         for shell in cast.values():
             begin(shell, anna)
-    with locked_exclusively(cast, anna, sink=quiet):
+    with locked_exclusively(cast, anna, sink=fail_on_event):
         begin(cast[Role.SENDER], anna)
 
 
@@ -399,7 +415,7 @@ def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Rol
     done: list[str] = []
     for shell in cast.values():
         shell.close = lambda name=shell.robot: done.append(name)  # type: ignore[method-assign,misc]
-    with pytest.raises(KeyboardInterrupt), locked(cast, ANNA, sink=quiet):
+    with pytest.raises(KeyboardInterrupt), locked(cast, ANNA, sink=fail_on_event):
         raise KeyboardInterrupt
     assert done == ["abe", "zoe"]
     assert {record(shell)[0] for shell in cast.values()} == {"free"}

@@ -54,18 +54,18 @@ class Recorder:
         self.events: list[Event] = []
         self.holder: Holder | None = None
 
-    def note(self, what: str) -> None:
-        self.done.append(what)
-        if what in self.failing:
-            raise self.failing[what]
+    def note(self, event: str) -> None:
+        self.done.append(event)
+        if event in self.failing:
+            raise self.failing[event]
 
     @contextmanager
-    def around(self, what: str) -> Iterator[None]:
-        self.note(what)
+    def around(self, event: str) -> Iterator[None]:
+        self.note(event)
         try:
             yield
         finally:
-            self.done.append(f"{what} ends")
+            self.done.append(f"{event} ends")
 
     def cast(self, topology: Topology) -> Cast:
         assert topology is Topology.MASTER
@@ -87,32 +87,32 @@ class Recorder:
 @pytest.fixture
 def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
     def make(**failing: BaseException) -> Recorder:
-        made = Recorder(failing)
+        recording = Recorder(failing)
 
         def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
             assert (cast, shells) == (CAST, TESTBED.shells)
-            made.note("meet")
+            recording.note("meet")
 
-        def held(shells: Shells, holder: Holder, *, sink: Sink) -> AbstractContextManager[None]:
+        def lock(shells: Shells, holder: Holder, *, sink: Sink) -> AbstractContextManager[None]:
             assert shells == TESTBED.shells
-            made.holder = holder
-            return made.around("hold")
+            recording.holder = holder
+            return recording.around("hold")
 
         def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop) -> Outcome:
             assert testbed is TESTBED
-            made.note(f"run_{plan.distance}")
+            recording.note(f"run_{plan.distance}")
             return Outcome(out / plan.trial, (), 2, 0)
 
         def resume_trial(folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, failed: bool) -> Outcome:
             assert testbed is TESTBED
-            made.note("resume")
+            recording.note("resume")
             return Outcome(folder, (), 2, 0)
 
         monkeypatch.setattr(preflight, "connect_all", meet)
-        monkeypatch.setattr(locks, "held", held)
+        monkeypatch.setattr(locks, "locked_exclusively", lock)
         monkeypatch.setattr(runner, "run_trial", run_trial)
         monkeypatch.setattr(resumption, "resume_trial", resume_trial)
-        return made
+        return recording
 
     return make
 
@@ -129,14 +129,14 @@ def notes(recorder: Recorder) -> list[str]:
 def test_trials_run_one_after_the_other_on_robots_opened_once(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
-    made, out = recorder(), tmp_path / "trials"
-    ended = made.run(plans(), out)
-    begun = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
-    assert made.done == [*begun, "hold ends", "open ends"]
-    assert [one and one.valid for one in ended] == [2, 2, 2]
-    assert made.holder == Holder(plans()[0].session, runtime.user_at_host(), plans()[0].trial)
+    recording, out = recorder(), tmp_path / "trials"
+    outcomes = recording.run(plans(), out)
+    events = ["open", "meet", "hold", "run_10ft", "run_20ft", "run_30ft"]
+    assert recording.done == [*events, "hold ends", "open ends"]
+    assert [outcome and outcome.valid for outcome in outcomes] == [2, 2, 2]
+    assert recording.holder == Holder(plans()[0].session, runtime.user_at_host(), plans()[0].trial)
     assert out.is_dir()
-    assert notes(made) == []
+    assert notes(recording) == []
 
 
 @pytest.mark.parametrize(
@@ -150,11 +150,11 @@ def test_trials_run_one_after_the_other_on_robots_opened_once(
 def test_robots_are_released_if_one_cannot_be_reached_or_locked(
     recorder: Callable[..., Recorder], tmp_path: Path, failing: str, error: FieldkitError, done: list[str]
 ) -> None:
-    made = recorder(**{failing: error})
+    recording = recorder(**{failing: error})
     with pytest.raises(type(error)):
-        made.run(plans(), tmp_path)
-    assert made.done == done
-    assert notes(made) == []
+        recording.run(plans(), tmp_path)
+    assert recording.done == done
+    assert notes(recording) == []
 
 
 @pytest.mark.parametrize("error", [RobotError("x"), KeyboardInterrupt()])
@@ -165,41 +165,41 @@ def test_robots_are_released_if_one_cannot_be_reached_or_locked(
 def test_a_stopped_trial_unlocks_the_robots_and_reports_trials_not_started(
     recorder: Callable[..., Recorder], tmp_path: Path, error: BaseException, failing: str, expected_notes: list[str]
 ) -> None:
-    made = recorder(**{failing: error})
+    recording = recorder(**{failing: error})
     with pytest.raises(type(error)):
-        made.run(plans(), tmp_path)
-    assert made.done[-3:] == [failing, "hold ends", "open ends"]
-    assert notes(made) == expected_notes
+        recording.run(plans(), tmp_path)
+    assert recording.done[-3:] == [failing, "hold ends", "open ends"]
+    assert notes(recording) == expected_notes
 
 
 def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
     (tmp_path / "file").touch()
-    made = recorder()
+    recording = recorder()
     with pytest.raises(ConfigurationError):
-        made.run(plans(), tmp_path / "file")
-    assert made.done == []
+        recording.run(plans(), tmp_path / "file")
+    assert recording.done == []
 
 
-def resume(made: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
+def resume(recording: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
     return resumption.resume(
-        folder, backend, made, failed=False, sink=made.events.append, operator=Nobody(), stop=Stop()
+        folder, backend, recording, failed=False, sink=recording.events.append, operator=Nobody(), stop=Stop()
     )
 
 
 def test_a_trial_is_resumed_through_the_same_steps(recorder: Callable[..., Recorder], tmp_path: Path) -> None:
-    made, plan = recorder(), plain_plan()
+    recording, plan = recorder(), plain_plan()
     folder = store.create(tmp_path, plan)
-    assert resume(made, folder) == Outcome(folder, (), 2, 0)
-    assert made.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
-    assert made.holder == Holder(plan.session, runtime.user_at_host(), plan.trial)
+    assert resume(recording, folder) == Outcome(folder, (), 2, 0)
+    assert recording.done == ["open", "meet", "hold", "resume", "hold ends", "open ends"]
+    assert recording.holder == Holder(plan.session, runtime.user_at_host(), plan.trial)
 
 
 def test_a_trial_of_another_backend_is_rejected_before_robots_are_opened(
     recorder: Callable[..., Recorder], tmp_path: Path
 ) -> None:
-    made, folder = recorder(), store.create(tmp_path, plain_plan())
+    recording, folder = recorder(), store.create(tmp_path, plain_plan())
     with pytest.raises(ConfigurationError):
-        resume(made, folder, "emulated")
-    assert made.done == []
+        resume(recording, folder, "emulated")
+    assert recording.done == []

@@ -55,9 +55,9 @@ def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: P
     with pytest.raises(KeyboardInterrupt):
         robots.fetch("x", into, clean=True)
     robots.close_connections()
-    kept = into.rename(tmp_path / "kept")
+    saved = into.rename(tmp_path / "kept")
     wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
-    assert list(kept.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
+    assert list(saved.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
     assert not into.exists()
 
 
@@ -90,8 +90,8 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     assert robots.unfetched.by_robot() == {"turtlebot-1": [attempts["udp-01-1"]]}
     robots.delete_remote(attempts["udp-01-1"])
     robots.delete_remote()
-    kept = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
-    assert kept == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}
+    remaining = {role: sorted(path.name for path in (tmp_path / role / ".fieldkit").glob("*/*")) for role in shells}
+    assert remaining == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}
 
 
 class Rebooted(LocalShell):
@@ -115,8 +115,10 @@ def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
     output_text = robots.fetch("x", tmp_path, clean=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
     assert sorted(output_text) == sorted(reasons)
-    shown = hosts.without_effects(["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *output_text])
-    assert sorted(shown) == sorted(["scan.bag: there is no bag", *reasons])
+    listed = hosts.without_effects(
+        ["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *output_text]
+    )
+    assert sorted(listed) == sorted(["scan.bag: there is no bag", *reasons])
 
 
 class Impatient(LocalShell):

@@ -45,7 +45,7 @@ def of_two() -> Plan:
     return plan().model_copy(update={"repeats": 2})
 
 
-def ended(events: list[Event]) -> list[RepeatEnded]:
+def repeat_ends(events: list[Event]) -> list[RepeatEnded]:
     return [event for event in events if isinstance(event, RepeatEnded)]
 
 
@@ -65,7 +65,7 @@ def test_the_remaining_time_is_estimated_from_finished_repeats(
     ticks = clock()
     monkeypatch.setattr("fieldkit.trial.running.runner.time.monotonic", lambda: next(ticks))
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    void, first, second = ended(events)
+    void, first, second = repeat_ends(events)
     assert (void.status, void.left_s) == (Status.VOID, 2 * of_two().procedure.expected_s(Protocol.TCP))
     assert first.status is Status.VALID
     assert first.left_s == first.left_most_s >= STEP_S, "the duration of the finished repeat with its void attempts"
@@ -77,14 +77,14 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
 ) -> None:
     stop, fetch = Stop(), Robots.fetch
 
-    def asked(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def recorded_fetch(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
         stop.after_repeat = not remote.endswith("tcp-01-1")
         return fetch(self, remote, into, clean=clean)
 
-    monkeypatch.setattr(Robots, "fetch", asked)
+    monkeypatch.setattr(Robots, "fetch", recorded_fetch)
     with pytest.raises(KeyboardInterrupt):
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append, stop)
-    assert [event.status for event in ended(events)] == [Status.VOID, Status.VALID]
+    assert [event.status for event in repeat_ends(events)] == [Status.VOID, Status.VALID]
 
 
 def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
@@ -134,7 +134,7 @@ def test_the_remedy_of_a_failed_step_is_reported(
 
     monkeypatch.setattr(Robots, "measure", measure)
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    reasons_and_remedies = [(event.reason, event.remedy) for event in ended(events)]
+    reasons_and_remedies = [(event.reason, event.remedy) for event in repeat_ends(events)]
     assert reasons_and_remedies[0] == ("sending began too late", "a larger `idle` leaves it more time")
     assert not any(remedy for _, remedy in reasons_and_remedies[1:])
 
@@ -161,16 +161,18 @@ def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch:
         JournalEntry(2, repeat.protocol, 1, 1, Status.RUNNING),
         JournalEntry(3, repeat.protocol, 1, 1, Status.MEASURED),
     )
-    fetch, gone = Robots.fetch, "turtlebot-1: it has no folder .fieldkit/x/tcp-01-1 any more"
+    fetch, message = Robots.fetch, "turtlebot-1: it has no folder .fieldkit/x/tcp-01-1 any more"
 
     def gone_once(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
-        return [gone] if remote.endswith("tcp-01-1") else fetch(self, remote, into, clean=clean)
+        return [message] if remote.endswith("tcp-01-1") else fetch(self, remote, into, clean=clean)
 
     monkeypatch.setattr(Robots, "fetch", gone_once)
     resume_trial(folder, IdleTestbed(), lambda _: None)
     first = journal.ended(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
-    assert first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {gone}"
+    assert (
+        first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {message}"
+    )
 
 
 def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
@@ -193,8 +195,8 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
     assert note in events
-    kept = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
-    assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in kept.read_text(encoding="utf-8")
+    unfetched = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
+    assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in unfetched.read_text(encoding="utf-8")
     events.clear()
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
@@ -216,7 +218,7 @@ def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
 
     monkeypatch.setattr(gates, "judge", exhausted)
     run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
-    void, exhausting, *valid = ended(events)
+    void, exhausting, *valid = repeat_ends(events)
     assert exhausting.reason == "this machine has too little memory to measure it"
     assert [attempt.status for attempt in (void, exhausting, *valid)] == [
         Status.VOID,
@@ -264,8 +266,8 @@ def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
     folder = only(tmp_path)
     remote = f"~/.fieldkit/{folder.name}/tcp-01-1"
     for role in Robots(of_two(), IdleTestbed())._roles:
-        kept = folder / "repeats/tcp-01.void1" / unfetched_file(role)
-        assert kept.read_text(encoding="utf-8").startswith("interrupted\n")
+        unfetched = folder / "repeats/tcp-01.void1" / unfetched_file(role)
+        assert unfetched.read_text(encoding="utf-8").startswith("interrupted\n")
     for _ in range(2):
         notes = [event.text for event in events if isinstance(event, Note)]
         assert sum("was not fetched stays" in note and remote in note for note in notes) == 2
@@ -279,13 +281,13 @@ def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> lis
     count, failed = 0, []
 
     def watched(name: str, call: Callable[..., object]) -> Callable[..., object]:
-        def counted(*words: object, **more: object) -> object:
+        def counted(*words: object, **options: object) -> object:
             nonlocal count
             count += 1
             if count >= moment:
                 failed.append(name)
                 raise error
-            return None if name == "fsync" else call(*words, **more)
+            return None if name == "fsync" else call(*words, **options)
 
         return counted
 
@@ -296,8 +298,8 @@ def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> lis
 
 @pytest.mark.parametrize("stride", mark_nightly([3, 1]))
 def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    full, moment, over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
-    while not over:
+    full, moment, is_over = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1 - stride, False
+    while not is_over:
         out = tmp_path / str(moment := moment + stride)
         with monkeypatch.context() as patched:
             failed = failing(patched, moment, full)
@@ -305,7 +307,7 @@ def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatc
                 run_trial(plan(), IdleTestbed(), out, lambda _: None)
             except ConfigurationError as error:
                 assert error.what  # noqa: PT017 (it may also end)
-            over = not failed
+            is_over = not failed
         if any(out.glob("*/trial.yaml")):
             folder = only(out)
             resume_trial(folder, IdleTestbed(), lambda _: None)
@@ -362,11 +364,11 @@ def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Eve
 def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun = of_two()
-    begun = begun.model_copy(update={"versions": {**begun.versions, "lab-steps": "1.0"}})
-    folder = store.create(tmp_path, begun)
+    trial = of_two()
+    trial = trial.model_copy(update={"versions": {**trial.versions, "lab-steps": "1.0"}})
+    folder = store.create(tmp_path, trial)
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
-    assert resumable(folder) == begun
+    assert resumable(folder) == trial
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
     with pytest.raises(ConfigurationError, match=r"started by other code \(lab-steps 1\.0\)"):
         resumable(folder)

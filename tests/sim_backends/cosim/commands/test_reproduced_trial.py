@@ -20,9 +20,9 @@ def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     folder = tmp_path_factory.mktemp("field")
     on_ns3 = ("--network", "ns3", "--policy", "sliding_window", "--window", "5ms")
     options = on_ns3 if request.param == "ns3" else ()
-    ran = run_here(folder, "cosim", "run", "field_30ft", *options, "--out", "simulated")
-    assert ran.code == 0, ran.err
-    return folder / "simulated", ran
+    result = run_here(folder, "cosim", "run", "field_30ft", *options, "--out", "simulated")
+    assert result.code == 0, result.err
+    return folder / "simulated", result
 
 
 def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Run]) -> None:
@@ -60,8 +60,8 @@ def test_rows_have_the_identity_and_the_columns_of_the_trial(run: tuple[Path, Ru
 
 
 def test_a_part_of_the_run_has_the_rows_of_what_was_sent(tmp_path: Path) -> None:
-    ran = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "short", "--duration", "600ms")
-    assert ran.code == 0, ran.err
+    result = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "short", "--duration", "600ms")
+    assert result.code == 0, result.err
     (row,) = rows(tmp_path / "short")
     assert (row["protocol"], row["status"], row["reason"]) == ("udp", "failed", "the run ended before the transfer")
     assert "rtt_loss" not in row
@@ -81,9 +81,9 @@ def test_a_part_of_the_run_has_the_rows_of_what_was_sent(tmp_path: Path) -> None
 )
 def test_a_contradiction_to_the_procedure_is_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
     options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
-    ran = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "run", "--duration", "10ms", *options)
-    assert ran.code == 2
-    assert message in ran.err
+    result = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "run", "--duration", "10ms", *options)
+    assert result.code == 2
+    assert message in result.err
     assert not (tmp_path / "run").exists()
 
 

@@ -14,7 +14,7 @@ from sim_backends.cosim.programs.wrappers import AgentClock, Clocked
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
-HERE = State((0.0, 0.0, 0.0))
+ORIGIN = State((0.0, 0.0, 0.0))
 MS = 1_000_000
 TIMES = st.integers(0, 10**11)
 CLOCKS = st.builds(
@@ -70,7 +70,7 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
     """Run a program alone, and return the datagrams that it sends, each with the true time."""
     datagrams = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
-        datagrams += [(wake_ns, datagram) for datagram in program.wake(wake_ns, HERE, ()).datagrams]
+        datagrams += [(wake_ns, datagram) for datagram in program.wake(wake_ns, ORIGIN, ()).datagrams]
     return datagrams
 
 
@@ -82,10 +82,10 @@ def test_a_program_with_a_fast_clock_sends_more_often_and_stamps_the_reading() -
     slow = AgentClock(offset_ns=-5 * MS)
     program = Clocked(listener, slow)
     for at_ns, datagram in packets[:2]:
-        program.wake(at_ns + 7 * MS, HERE, [Received("a", datagram.payload, at_ns, at_ns + 6 * MS)])
+        program.wake(at_ns + 7 * MS, ORIGIN, [Received("a", datagram.payload, at_ns, at_ns + 6 * MS)])
     assert listener.received == [
-        (2 * MS, Received("a", HERE, 0, 1 * MS)),
-        (12 * MS, Received("a", HERE, 11 * MS, 11 * MS)),
+        (2 * MS, Received("a", ORIGIN, 0, 1 * MS)),
+        (12 * MS, Received("a", ORIGIN, 11 * MS, 11 * MS)),
     ]
 
 

@@ -24,7 +24,7 @@ from sim_backends.network.packets import Datagram, Received
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State
 
-HERE = State((0.0, 0.0, 0.0))
+ORIGIN = State((0.0, 0.0, 0.0))
 MS = 1_000_000
 
 
@@ -32,7 +32,7 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
     """Run a program alone, and return the datagrams that it sends, each with its time."""
     datagrams = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= to_ns:
-        datagrams += [(wake_ns, datagram) for datagram in program.wake(wake_ns, HERE, ()).datagrams]
+        datagrams += [(wake_ns, datagram) for datagram in program.wake(wake_ns, ORIGIN, ()).datagrams]
     return datagrams
 
 
@@ -99,8 +99,8 @@ def test_a_ping_sends_its_requests_and_every_request_gets_an_equal_reply() -> No
     )
     assert [at_ns for at_ns, _ in requests] == [MS, 101 * MS, 201 * MS]
     arrived = [Received("a", request.payload, at_ns, at_ns + MS) for at_ns, request in requests]
-    other = Received("a", HERE, 0, MS)
-    replies = EchoResponder().wake(202 * MS, HERE, [*arrived, other]).datagrams
+    other = Received("a", ORIGIN, 0, MS)
+    replies = EchoResponder().wake(202 * MS, ORIGIN, [*arrived, other]).datagrams
     assert replies == [Datagram("a", 56, "p/b/reply", number, None, "tcp") for number in range(3)]
     assert all(isinstance(request.payload, PingRequest) for _, request in requests)
 
@@ -134,13 +134,13 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
     program = CombinedProgram([first, second])
     commands = []
     while (wake_ns := program.next_wake_ns()) is not None:
-        commands.append((wake_ns, program.wake(wake_ns, HERE, ()).command))
+        commands.append((wake_ns, program.wake(wake_ns, ORIGIN, ()).command))
     assert commands == [(3, "first"), (5, "second"), (7, "second")]
     received = [Received("a", None, 0, 9)]
-    assert program.wake(9, HERE, received) == Action()
+    assert program.wake(9, ORIGIN, received) == Action()
     assert first.received == second.received == received
     # With a fast clock a program may wake later than planned.
-    assert CombinedProgram([Steering("first", 3), Steering("second", 5)]).wake(4, HERE, ()).command == "first"
+    assert CombinedProgram([Steering("first", 3), Steering("second", 5)]).wake(4, ORIGIN, ()).command == "first"
 
 
 def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() -> None:
@@ -148,7 +148,7 @@ def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() 
     program = Outage(CombinedProgram([sends, steers]), 12, 31, "stop")
     actions = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= 50:
-        action = program.wake(wake_ns, HERE, ())
+        action = program.wake(wake_ns, ORIGIN, ())
         actions.append((wake_ns, [datagram.number for datagram in action.datagrams], action.command))
     assert actions == [
         (0, [0], None),
@@ -164,8 +164,8 @@ def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() 
     ]
     during, after = Received("a", 1, 0, 29), Received("a", 2, 0, 31)
     outage = Outage(steers, 12, 31)
-    assert outage.wake(29, HERE, [during]) == Action()
-    outage.wake(31, HERE, [after])
+    assert outage.wake(29, ORIGIN, [during]) == Action()
+    outage.wake(31, ORIGIN, [after])
     assert steers.received == [after]
 
 

@@ -283,19 +283,19 @@ def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded: Path
     table=st.sampled_from(packet_tables.TABLES),
     which=st.integers(0),
     at=st.integers(0),
-    how=st.sampled_from(["cut", "gone", "flip"]),
+    change=st.sampled_from(["cut", "gone", "flip"]),
 )
 def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
-    recorded: Path, table: str, which: int, at: int, how: str
+    recorded: Path, table: str, which: int, at: int, change: str
 ) -> None:
     parts = sorted((recorded / table).glob("*.parquet"))
     path = parts[which % len(parts)]
     content = path.read_bytes()
     at %= len(content)
     try:
-        if how == "gone":
+        if change == "gone":
             path.unlink()
-        elif how == "cut":
+        elif change == "cut":
             path.write_bytes(content[:at])
         else:
             path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])

@@ -49,7 +49,7 @@ def digest(scenario: CosimScenario, policy: str) -> str:
 
 @pytest.mark.parametrize("policy", sorted(BUILTIN))
 def test_the_built_in_federates_give_the_same_events_as_processes(policy: str, served: dict[str, str]) -> None:
-    external = load_scenario("convoy", {f"{role}.federate": where for role, where in served.items()} | DURATION)
+    external = load_scenario("convoy", {f"{role}.federate": address for role, address in served.items()} | DURATION)
     assert external.physics.federate
     assert digest(external, policy) == digest(without_federates(external), policy)
 
@@ -63,7 +63,7 @@ def test_pipes_give_the_same_events() -> None:
 
 
 def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, str]) -> None:
-    external = load_scenario("convoy", {f"{role}.federate": where for role, where in served.items()} | DURATION)
+    external = load_scenario("convoy", {f"{role}.federate": address for role, address in served.items()} | DURATION)
     digests = set()
     for scenario in (external, without_federates(external)):
         with build(scenario) as simulation:
@@ -75,7 +75,7 @@ def test_a_simulation_with_external_federates_can_be_copied(served: dict[str, st
 
 def test_a_federate_that_listens_serves_one_seed_after_another(served: dict[str, str], tmp_path: Path) -> None:
     options = ("--seeds", "2", "--duration", "200ms", "--format", "json")
-    federates = [word for role, where in served.items() for word in (f"--{role}", where)]
+    federates = [word for role, address in served.items() for word in (f"--{role}", address)]
     external, built_in = (cosim(tmp_path, "run", "convoy", *words, *options) for words in (federates, ()))
     assert (external.code, built_in.code) == (0, 0), external.err
     assert json.loads(external.out) == json.loads(built_in.out)

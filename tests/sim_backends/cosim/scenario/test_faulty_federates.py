@@ -41,9 +41,9 @@ def federates() -> Iterator[Federates]:
 @pytest.fixture(autouse=True)
 def short_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     def open_then_shorten(
-        role: int, where: str, hello: Hello, deadline_s: float | None
+        role: int, address: str, hello: Hello, deadline_s: float | None
     ) -> tuple[FederateSession, Hello, Welcome]:
-        session, sent_hello, welcome = open_session(role, where, hello, deadline_s)
+        session, sent_hello, welcome = open_session(role, address, hello, deadline_s)
         session._deadline_s = DEADLINE_S
         return session, sent_hello, welcome
 
@@ -54,12 +54,12 @@ def is_running(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists()
 
 
-def check_run(lab: Path, role: str, fault: str, where: str) -> None:
+def check_run(lab: Path, role: str, fault: str, address: str) -> None:
     """Run the scenario, whose federate has a fault, and check exit code, message and recording."""
     # DDS reports only after 10 s that a participant has exited without a message.
-    code, message = MESSAGES["suspended" if fault == "killed" and where.startswith("dds") else fault]
+    code, message = MESSAGES["suspended" if fault == "killed" and address.startswith("dds") else fault]
     started_s = time.monotonic()
-    run = cosim(lab, "run", "convoy", f"--{role}", where, *OPTIONS, "--out", "faulty")
+    run = cosim(lab, "run", "convoy", f"--{role}", address, *OPTIONS, "--out", "faulty")
     assert run.code == code, run.err
     assert f"error: {role} faulty (" in run.err
     assert message in run.err
@@ -84,9 +84,9 @@ def test_a_fault_over_a_pipe(fault: str, role: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_fault_over_a_transport(scheme: str, fault: str, role: str, federates: Federates, tmp_path: Path) -> None:
-    served_at, where = new_addresses(scheme)
+    served_at, address = new_addresses(scheme)
     pid = federates.start(role, fault, served_at)
-    check_run(tmp_path, role, fault, where)
+    check_run(tmp_path, role, fault, address)
     if fault == "suspended":
         os.kill(pid, 9)
     deadline_s = time.monotonic() + DELAY_S + 60

@@ -171,12 +171,12 @@ def test_an_agent_appears_at_its_start_and_moves_from_then_on(physics: str, path
 @pytest.mark.parametrize("physics", ["builtin", "mujoco"])
 def test_an_absent_agent_is_no_obstacle(physics: str, path: Path) -> None:
     """A robot drives through the place where another one has been, and collides with it while it is there."""
-    drives = {"kind": "velocity-profile", "legs": [{"duration": "5s", "speed": "1m/s"}]}
+    motion = {"kind": "velocity-profile", "legs": [{"duration": "5s", "speed": "1m/s"}]}
     changes = {
         "physics.federate": physics,
         "traffic": [],
         "duration": "4s",
-        "agents.a": {"robot": "husky", "at_m": [28.5, 10], "motion": drives, "radio": {}},
+        "agents.a": {"robot": "husky", "at_m": [28.5, 10], "motion": motion, "radio": {}},
         "agents.c.robot": "husky",
         "agents.c.motion": {"kind": "standing"},
         "agents.c.radio": {},
@@ -193,11 +193,11 @@ def test_an_absent_agent_is_no_obstacle(physics: str, path: Path) -> None:
 
 
 def test_a_run_with_lifetimes_can_be_recorded_and_replayed(path: Path) -> None:
-    ran = cosim(path.parent, "run", path.name, "--out", "run", "--format", "json")
-    assert ran.code == 0, ran.err
+    result = cosim(path.parent, "run", path.name, "--out", "run", "--format", "json")
+    assert result.code == 0, result.err
     replayed = cosim(path.parent, "replay", "run", "--format", "json")
     assert replayed.code == 0, replayed.err
-    assert json.loads(replayed.out) == json.loads(ran.out)
+    assert json.loads(replayed.out) == json.loads(result.out)
     assert {file.stem for file in (path.parent / "run" / "captures").iterdir()} == {"a", "b", "c"}
 
 

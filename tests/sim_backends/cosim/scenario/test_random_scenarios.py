@@ -18,7 +18,7 @@ NAMES = ("one", "two", "three", "four")
 UNTIL_NS = 30_000_000
 
 
-def some(**values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
+def optional_keys(**values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[str, Any]]:
     """Return a strategy for mappings that have any of these keys."""
     return st.fixed_dictionaries({}, optional=values)
 
@@ -38,7 +38,7 @@ SENDS = {"from": AGENT, "to": st.lists(AGENT, min_size=1, max_size=3) | AGENT}
 SENDING = {
     "protocol": st.sampled_from(("udp", "udp", "tcp", "topic", "ros1", "ros1-udp")),
     "start": TIMES,
-    "qos": some(reliability=st.sampled_from(("reliable", "best_effort")), depth=st.integers(1, 5)),
+    "qos": optional_keys(reliability=st.sampled_from(("reliable", "best_effort")), depth=st.integers(1, 5)),
 }
 LEGS = st.fixed_dictionaries(
     {"duration": written("ms", 3, 10)},
@@ -68,7 +68,7 @@ def agents(east_m: int) -> st.SearchStrategy[dict[str, Any]]:
     """Return a strategy for agents that start near an easting, so that few overlap."""
     places = st.tuples(st.integers(east_m, east_m + 10), st.integers(0, 40)).map(list)
     flying = {"robot": st.sampled_from(("iris", "duckiedrone")), "along": written("m", east_m, east_m + 5)}
-    radio = some(tx_power_dbm=st.integers(0, 20), standard=st.sampled_from(("802.11n", "802.11g")))
+    radio = optional_keys(tx_power_dbm=st.integers(0, 20), standard=st.sampled_from(("802.11n", "802.11g")))
     return st.fixed_dictionaries(
         {"robot": ROBOTS, "at_m": places}, optional={"radio": radio, "motion": MOTIONS}
     ) | st.fixed_dictionaries(
@@ -106,11 +106,13 @@ SCENARIOS = st.fixed_dictionaries(
     },
     optional={
         "line": st.sampled_from(("los", "nlos")),
-        "physics": some(step=written("ms", 0.5, 1)),
-        "policy": some(name=st.sampled_from([*BUILTIN]), window=written("ms", 1, 3.7), bound=written("cm", 0.1, 5)),
+        "physics": optional_keys(step=written("ms", 0.5, 1)),
+        "policy": optional_keys(
+            name=st.sampled_from([*BUILTIN]), window=written("ms", 1, 3.7), bound=written("cm", 0.1, 5)
+        ),
         "topology": st.sampled_from(("master", "masterless")),
         "relay": AGENT,
-        "radio": some(fading=st.booleans(), loss=st.just("10%"), queue_packets=st.integers(0, 3)),
+        "radio": optional_keys(fading=st.booleans(), loss=st.just("10%"), queue_packets=st.integers(0, 3)),
         "traffic": st.lists(TRAFFIC, max_size=4),
         "faults": st.lists(FAULTS, max_size=3),
     },
@@ -122,20 +124,20 @@ SCENARIOS = st.fixed_dictionaries(
 def test_any_scenario_runs_or_is_refused_with_its_place_and_a_remedy(tmp_path: Path, data: dict[str, Any]) -> None:
     path = tmp_path / "any.yaml"
     path.write_text(json.dumps(data, indent=1), encoding="utf-8")
-    refused: ConfigurationError | None = None
+    caught: ConfigurationError | None = None
     try:
         scenario = load_scenario(path)
         runs = [build(scenario).run(UNTIL_NS) for _ in range(2)]
     except ConfigurationError as error:
-        refused = error
-    if refused is None:
+        caught = error
+    if caught is None:
         event("runs")
         assert runs[0].windows_ns[-1] == UNTIL_NS
         assert runs[0].digest == runs[1].digest
-    elif isinstance(refused, PolicyError):
+    elif isinstance(caught, PolicyError):
         event("the rule as printed stops")
         assert scenario.policy.name == "velocity_aware_raw"
     else:
-        event(re.sub(r"[0-9.]+", "N", refused.what)[:70])
-        assert refused.where.startswith(f"{path}:")
-        assert refused.remedy
+        event(re.sub(r"[0-9.]+", "N", caught.what)[:70])
+        assert caught.where.startswith(f"{path}:")
+        assert caught.remedy

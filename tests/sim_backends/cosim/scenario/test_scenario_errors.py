@@ -115,7 +115,7 @@ def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(robot_limits.BODIES, "cart", HUSKY_A200)
 
 
-def refused(text: str, folder: Path) -> ConfigurationError:
+def error_of(text: str, folder: Path) -> ConfigurationError:
     with pytest.raises(ConfigurationError) as caught:
         load_scenario(_written(text, folder))
     return caught.value
@@ -124,7 +124,7 @@ def refused(text: str, folder: Path) -> ConfigurationError:
 @pytest.mark.parametrize(("right", "wrong", "line", "message"), WRONG, ids=lambda value: str(value).strip()[:40])
 def test_an_error_has_its_line_and_a_remedy(right: str, wrong: str, line: int, message: str, tmp_path: Path) -> None:
     assert SCENARIO.count(right) >= 1
-    error = refused(SCENARIO.replace(right, wrong, 1), tmp_path)
+    error = error_of(SCENARIO.replace(right, wrong, 1), tmp_path)
     assert re.search(message, str(error)), str(error)
     assert error.where == f"{tmp_path / 'meadow.yaml'}:{line}"
     assert error.remedy
@@ -138,7 +138,7 @@ def test_the_scenario_without_errors_runs(tmp_path: Path) -> None:
 
 def test_a_jammer_among_fixed_links_is_refused(tmp_path: Path) -> None:
     text = SCENARIO.replace("node-loss, agent: one", "jammer, power_dbm: 20, agent: one")
-    error = refused(text.replace("topology: masterless", "radio: {loss: 10%}"), tmp_path)
+    error = error_of(text.replace("topology: masterless", "radio: {loss: 10%}"), tmp_path)
     assert "fixed links ignore a jammer" in error.what
     assert error.where.endswith(":24")
 
@@ -149,7 +149,7 @@ def test_a_robot_that_drives_cannot_follow_several_leaders(tmp_path: Path) -> No
     )
     text = text.replace("to: [one]", "to: [one, three]")
     text = text.replace("faults:", "  - {kind: stream, from: three, to: two, rate: 10Hz}\nfaults:")
-    error = refused(text, tmp_path)
+    error = error_of(text, tmp_path)
     assert "does not fly, and only robots that fly follow several leaders" in error.what
     assert error.where.endswith(":14")
     assert error.remedy == "name one of one, three"
@@ -195,7 +195,7 @@ def test_a_motion_beyond_the_limits_is_refused_and_not_clipped(
     text = SCENARIO.replace(
         "robot: cart, at_m: [30, 10]", f"robot: {robot}, at_m: [30, 10],\n    motion: {{{motion}}}"
     )
-    error = refused(text, tmp_path)
+    error = error_of(text, tmp_path)
     assert re.search(f"three has .*{message}", error.what), error.what
     assert error.where.endswith(":17"), error.where
     assert error.remedy == f"choose a lower value, or a robot that is faster than {robot}"
@@ -240,7 +240,7 @@ def test_a_run_that_needs_too_much_memory_is_refused_with_both_sizes(
     # 10 Hz for 2 s and a bag of 100 packets are 120 packets of 1200 bytes; 2000 windows and 10 per packet have 40
     # bytes each; and there are three pairs of agents.
     assert checks.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
-    error = refused(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
+    error = error_of(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
     assert "2 s of 3 agents would need 3.4 MB of memory, and 1.0 MB are available" in error.what
     assert "choose a shorter duration, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
@@ -257,7 +257,7 @@ def test_too_many_agents_for_the_memory_are_refused_before_they_are_built(
     meminfo.write_text("MemAvailable:    70200 kB\n", encoding="ascii")
     monkeypatch.setattr(checks, "MEMINFO", meminfo)
     # 44,850 pairs need 72 MB. If the bodies were built, the error would be that all are in one place.
-    error = refused(f"{text}{agents}  one: {rest}", tmp_path)
+    error = error_of(f"{text}{agents}  one: {rest}", tmp_path)
     assert "2 s of 303 agents would need 73 MB of memory, and 72 MB are available" in error.what
     assert error.where.endswith(":7")
     assert error.remedy == "use fewer agents"

@@ -109,10 +109,10 @@ def test_a_subscriber_that_was_off_for_less_than_a_lease_gets_the_history_of_its
     assert {fate.reason for fate in lost} == {"pushed out of the writer's history before it was acknowledged"}
     assert within([fate.packet.sent_ns / MS for fate in lost], 990, 1910)
     # The writer keeps the last ten samples; each arrives within a heartbeat period after b is on.
-    kept = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
-    assert len(lost) + len(kept) == pytest.approx(100, abs=1)
-    assert 9 <= len(kept) <= 10
-    assert all(fate.arrived_ns is not None and 2000 < fate.arrived_ns / MS < 2120 for fate in kept)
+    delivered = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
+    assert len(lost) + len(delivered) == pytest.approx(100, abs=1)
+    assert 9 <= len(delivered) <= 10
+    assert all(fate.arrived_ns is not None and 2000 < fate.arrived_ns / MS < 2120 for fate in delivered)
     (recovery,) = (recovery for recovery in recoveries(scenario, run) if recovery.flow == "cb/b")
     assert recovery.lost == pytest.approx(len(lost), abs=1)
 

@@ -41,7 +41,7 @@ def half(window_s: float) -> float:
     return window_s / 2
 
 
-def held(window_s: float) -> float:
+def mean_wait_s(window_s: float) -> float:
     """Return the mean time that packets which arrive in a window wait for its end, over all affected packets."""
     return window_s**2 / 2 / (window_s + DELAY_S)
 
@@ -62,12 +62,12 @@ HELD_M = SPEED_M_S * STEP_NS / 1e9
 Law = Callable[[float], float]
 LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
     "time_stepped": (TimeStepped, {"delivery_s": held_twice, "position_m": path}),
-    "scheduled": (Scheduled, {"delivery_s": held, "position_m": path}),
-    "sliding_window": (SlidingWindow, {"late_s": held, "position_m": path}),
-    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": held, "position_m": path}),
-    "velocity_aware": (lambda window_s: VelocityAware(window_s, 1.0), {"late_s": held, "position_m": path}),
+    "scheduled": (Scheduled, {"delivery_s": mean_wait_s, "position_m": path}),
+    "sliding_window": (SlidingWindow, {"late_s": mean_wait_s, "position_m": path}),
+    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": mean_wait_s, "position_m": path}),
+    "velocity_aware": (lambda window_s: VelocityAware(window_s, 1.0), {"late_s": mean_wait_s, "position_m": path}),
     # Both keep their velocities, so the extrapolation is exact, and windows have their maximum length.
-    "error_bounded": (lambda window_s: ErrorBounded(1e-9, window_s), {"delivery_s": held}),
+    "error_bounded": (lambda window_s: ErrorBounded(1e-9, window_s), {"delivery_s": mean_wait_s}),
     "variable_stepped": (lambda _: VariableStepped(), {}),
     "event_driven": (lambda _: EventDriven(), {}),
 }

@@ -72,9 +72,11 @@ def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, 
     st.floats(0.5001, 100),
     st.booleans(),
 )
-def test_a_number_more_than_half_a_step_away_disagrees(number: Decimal, step: str, away: float, above: bool) -> None:
+def test_a_number_more_than_half_a_step_away_disagrees(
+    number: Decimal, step: str, deviation: float, above: bool
+) -> None:
     printed = Printed(str(number), step=step)
-    ours = printed.value + away * float(step) * (1 if above else -1)
+    ours = printed.value + deviation * float(step) * (1 if above else -1)
     expected = Agreement.ABOVE if above else Agreement.BELOW
     assert agreement(printed, IntervalEstimate(ours, NAN, NAN)) is expected
     ends = printed.value, ours

@@ -24,7 +24,7 @@ EXIT_S = 300.0
 TASKS = [Task(policy, seed) for policy in ("one", "other") for seed in (3, 1, 2)]
 
 
-def drawn(task: Task) -> tuple[str, int, float]:
+def random_result(task: Task) -> tuple[str, int, float]:
     """Return a result that depends only on the task; tasks that are submitted first take longest."""
     stream = RandomStream(task.seed, task.policy)
     for number in range(0, 3_000 // task.seed, 256):
@@ -49,16 +49,16 @@ def killed(task: Task) -> int:
 
 
 def test_results_are_in_the_order_of_the_tasks() -> None:
-    expected = [drawn(task) for task in TASKS]
+    expected = [random_result(task) for task in TASKS]
     counted: list[int] = []
-    assert run_many(drawn, TASKS, workers=Workers(2), progress=counted.append) == expected
+    assert run_many(random_result, TASKS, workers=Workers(2), progress=counted.append) == expected
     assert counted == [1, 2, 3, 4, 5, 6]
 
 
 @given(st.permutations(TASKS))
 def test_one_worker_and_any_order_give_the_same(tasks: list[Task]) -> None:
-    results = dict(zip(tasks, run_many(drawn, tasks, workers=Workers(1)), strict=True))
-    assert [results[task] for task in TASKS] == [drawn(task) for task in TASKS]
+    results = dict(zip(tasks, run_many(random_result, tasks, workers=Workers(1)), strict=True))
+    assert [results[task] for task in TASKS] == [random_result(task) for task in TASKS]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -88,8 +88,8 @@ def work(task):
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_the_end_of_the_parent_ends_its_workers(how: signal.Signals, tmp_path: Path) -> None:
+@pytest.mark.parametrize("stop_signal", [signal.SIGINT, signal.SIGKILL])
+def test_the_end_of_the_parent_ends_its_workers(stop_signal: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
     started = tmp_path / "started"
     started.mkdir()
@@ -103,8 +103,8 @@ def test_the_end_of_the_parent_ends_its_workers(how: signal.Signals, tmp_path: P
         stderr=subprocess.PIPE,
     ) as process:
         wait_until(lambda: len(list(started.iterdir())) == 2, Deadline.after(EXIT_S))
-        process.send_signal(how)
+        process.send_signal(stop_signal)
         _, stderr = process.communicate(timeout=EXIT_S)
-    assert process.returncode == -how
-    assert (b"KeyboardInterrupt" in stderr) == (how == signal.SIGINT)
+    assert process.returncode == -stop_signal
+    assert (b"KeyboardInterrupt" in stderr) == (stop_signal == signal.SIGINT)
     wait_until(lambda: not any(alive(int(path.name)) for path in started.iterdir()), Deadline.after(EXIT_S))

@@ -74,8 +74,8 @@ def test_take_off_fly_and_land(gcs: GroundStation) -> None:
     assert -gcs.last("LOCAL_POSITION_NED").z == pytest.approx(3.0, abs=0.15)
     send_set_point(gcs, POSITION_ONLY, (2.0, 1.0, -3.0))
     gcs.wait(20)  # much longer than GUID_TIMEOUT: it stays
-    here = gcs.last("LOCAL_POSITION_NED")
-    assert math.dist((here.x, here.y, -here.z), (2.0, 1.0, 3.0)) < 0.15
+    position = gcs.last("LOCAL_POSITION_NED")
+    assert math.dist((position.x, position.y, -position.z), (2.0, 1.0, 3.0)) < 0.15
     assert mode(gcs) == "GUIDED"
     assert change_mode(gcs, "LAND") == OK
     gcs.wait(14)

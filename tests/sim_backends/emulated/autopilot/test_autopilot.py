@@ -178,8 +178,8 @@ class TestFlight:
                 assert gcs.command(d.MAV_CMD_DO_SET_MODE, CUSTOM, 6, 0) == OK
             gcs.wait(0.1)
         gcs.wait(3)
-        here = gcs.last("LOCAL_POSITION_NED")
-        assert 9.0 < math.hypot(here.x, here.y) <= 10.1
+        position = gcs.last("LOCAL_POSITION_NED")
+        assert 9.0 < math.hypot(position.x, position.y) <= 10.1
 
     def test_return_to_launch(self, gcs: GroundStation) -> None:
         take_off(gcs)
@@ -290,8 +290,8 @@ class TestMission:
         nearest = dict.fromkeys(self.PLACES, math.inf)
         for _ in range(600):
             gcs.wait(0.1)
-            here = gcs.autopilot.vehicle.body.position_m
-            nearest = {place: min(distance_m, math.dist(place, here)) for place, distance_m in nearest.items()}
+            position = gcs.autopilot.vehicle.body.position_m
+            nearest = {place: min(distance_m, math.dist(place, position)) for place, distance_m in nearest.items()}
         assert max(nearest.values()) < 0.5
         assert not gcs.autopilot.vehicle.armed
         if not loss:

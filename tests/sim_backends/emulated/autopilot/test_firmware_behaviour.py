@@ -262,14 +262,14 @@ def test_home_is_where_it_was_armed_last(copter: Station) -> None:
     assert copter.change_mode("GUIDED") == OK
     assert copter.arm() == OK
     copter.wait(1)
-    home, here = copter.last("HOME_POSITION"), copter.last("LOCAL_POSITION_NED")
-    assert (home.x, home.y) == pytest.approx((here.x, here.y), abs=0.01)
-    assert (here.x, here.y) == pytest.approx((4.0, 3.0), abs=0.3)
+    home, position = copter.last("HOME_POSITION"), copter.last("LOCAL_POSITION_NED")
+    assert (home.x, home.y) == pytest.approx((position.x, position.y), abs=0.01)
+    assert (position.x, position.y) == pytest.approx((4.0, 3.0), abs=0.3)
     # If a person carries it back, the origin of its frame stays.
     copter.autopilot.vehicle.place((HOME_M[0], HOME_M[1] + 1.0, 0.0), 0.0, copter.now_ns)
     copter.wait(1)
-    here = copter.last("LOCAL_POSITION_NED")
-    assert (here.x, here.y) == pytest.approx((1.0, 0.0), abs=0.01)
+    position = copter.last("LOCAL_POSITION_NED")
+    assert (position.x, position.y) == pytest.approx((1.0, 0.0), abs=0.01)
 
 
 def test_a_battery_failsafe_lands_the_drone_and_lasts_until_a_reboot(copter: Station) -> None:

@@ -61,10 +61,10 @@ def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagra
     assert 90 <= seen["battery"] < 100.1
     # The lab recorded the same flight, down to the ground below its last corner.
 
-    flown_m = [one.position_m for one in up.oracle.track(0) if one.role is Role.RELAY and one.position_m]
+    flown_m = [point.position_m for point in up.oracle.track(0) if point.role is Role.RELAY and point.position_m]
     (east_m, north_m, up_m), last_m = flown_m[0], flown_m[-1]
-    assert max(one[2] for one in flown_m) - up_m == pytest.approx(1.0, abs=0.2)
-    assert min(math.dist(one[:2], (east_m + 2.0, north_m + 2.0)) for one in flown_m) < 0.5
+    assert max(point[2] for point in flown_m) - up_m == pytest.approx(1.0, abs=0.2)
+    assert min(math.dist(point[:2], (east_m + 2.0, north_m + 2.0)) for point in flown_m) < 0.5
     assert math.dist(last_m, (east_m, north_m + 2.0, up_m)) < 0.6
 
 

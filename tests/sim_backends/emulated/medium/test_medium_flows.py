@@ -12,11 +12,11 @@ from sim_backends.radio.links import PACKET, QUEUING_NS
 from tests.helpers.captures import RECEIVER, SENDER, datagram, ipv4
 
 UDP, TCP = 17, 6
-HERE, THERE = IPv4Address(SENDER), IPv4Address(RECEIVER)
+SENDER_ADDRESS, RECEIVER_ADDRESS = IPv4Address(SENDER), IPv4Address(RECEIVER)
 
 
 def count_of(flows: FlowDelays, port: int, protocol: int = UDP) -> int:
-    return flows.delay_parts(HERE, THERE, protocol, port).packets
+    return flows.delay_parts(SENDER_ADDRESS, RECEIVER_ADDRESS, protocol, port).packets
 
 
 @given(
@@ -38,7 +38,7 @@ def test_every_fragment_that_arrives_is_counted_for_its_flow(
         for packet in packets:
             number += 1
             if number not in lost:
-                flows.count(packet, PACKET, THERE.packed)
+                flows.count(packet, PACKET, RECEIVER_ADDRESS.packed)
                 truth[port] += 1
     assert count_of(flows, 1234) == truth[1234]
     assert count_of(flows, 1235) == 0, "it is counted from the first request"
@@ -64,8 +64,8 @@ def test_a_packet_that_is_forwarded_counts_once_with_the_time_of_all_its_hops() 
     (packet,) = datagram(1, 100, port=1234)
     # Another time to live on each hop, as forwarding has it.
     hops = [packet[:8] + bytes((64 - number,)) + packet[9:] for number in range(3)]
-    for hop, receiver in zip(hops, (b"\x0a\x2a\x00\x07", b"\x0a\x2a\x00\x08", THERE.packed), strict=True):
+    for hop, receiver in zip(hops, (b"\x0a\x2a\x00\x07", b"\x0a\x2a\x00\x08", RECEIVER_ADDRESS.packed), strict=True):
         flows.note_first_fragment(hop)
         flows.count(hop, PACKET + QUEUING_NS * 1000, receiver)
-    parts = flows.delay_parts(HERE, THERE, UDP, 1234)
+    parts = flows.delay_parts(SENDER_ADDRESS, RECEIVER_ADDRESS, UDP, 1234)
     assert (parts.packets, parts.queuing_ns) == (1, 3000)

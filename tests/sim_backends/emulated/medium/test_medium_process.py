@@ -86,7 +86,7 @@ def bench() -> Iterator[Bench]:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
+def routed_namespaces() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
     """Namespaces with default routes, for tests that depend on no counters."""
     with benches() as make:
         medium, spaces = make(PLAIN)
@@ -204,11 +204,11 @@ def test_flows_of_one_pair_are_distinguished_in_fragments_and_mixed(bench: Bench
     back = ("b", "a", socket.IPPROTO_UDP, 1234)
     for flow in (*flows.values(), back):
         assert medium.delays(*flow) == NO_PACKETS
-    sends = "import socket,sys; s=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n"
-    sends += "for n, size, port in ((2, 8192, 1234), (3, 972, 1235), (1, 9000, 99)):\n"
-    sends += "    for _ in range(n): s.sendto(bytes(size), (sys.argv[1], port))"
+    sender_program = "import socket,sys; s=socket.socket(socket.AF_INET,socket.SOCK_DGRAM)\n"
+    sender_program += "for n, size, port in ((2, 8192, 1234), (3, 972, 1235), (1, 9000, 99)):\n"
+    sender_program += "    for _ in range(n): s.sendto(bytes(size), (sys.argv[1], port))"
     ping(spaces["a"], ADDRESSES["b"], count=2)
-    spaces["a"].run(sys.executable, "-c", sends, ADDRESSES["b"])
+    spaces["a"].run(sys.executable, "-c", sender_program, ADDRESSES["b"])
     wait_until(lambda: medium.delays(*flows[1235]).packets == 3, Deadline.after(LONG_S))
     large, small = (medium.delays(*flow) for flow in flows.values())
     assert (large.packets, large.propagation_ns) == (12, 12 * 20_000_000)
@@ -287,9 +287,9 @@ def test_packets_that_waited_to_be_read_count_as_late(bench: Bench) -> None:
 @pytest.mark.parametrize("address", ["239.1.1.1", "10.9.0.255", "255.255.255.255"])
 @pytest.mark.parametrize("relay", [None, "r"])
 def test_multicast_and_broadcast_reach_everyone(
-    plain: tuple[MediumClient, dict[str, Namespace]], address: str, relay: str | None
+    routed_namespaces: tuple[MediumClient, dict[str, Namespace]], address: str, relay: str | None
 ) -> None:
-    medium, spaces = plain
+    medium, spaces = routed_namespaces
     medium.place(PLACES, relay=relay)
     listeners = {name: spaces[name].start(sys.executable, "-c", LISTEN, ADDRESSES[name]) for name in ("b", "r")}
     for listener in listeners.values():
@@ -352,8 +352,8 @@ def test_the_medium_continues_between_the_other_robots(bench: Bench) -> None:
     assert len(ping(spaces["a"], ADDRESSES["b"], count=5)) == 5
 
 
-def test_invalid_requests_are_rejected(plain: tuple[MediumClient, dict[str, Namespace]]) -> None:
-    medium, spaces = plain
+def test_invalid_requests_are_rejected(routed_namespaces: tuple[MediumClient, dict[str, Namespace]]) -> None:
+    medium, spaces = routed_namespaces
     fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
     with pytest.raises(RobotError, match="attached already"):
         medium.attach("a", "10.9.1.1/24", RADIO, fd)

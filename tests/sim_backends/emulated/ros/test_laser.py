@@ -167,16 +167,16 @@ def test_the_range_to_a_robot_is_its_distance_less_its_radius(writer: PlacesWrit
     bodies = [neighbour(1, load_profile("turtlebot3_burger"))]
     scanner = Sensor("/scan", LASER_SCAN, 5.0, "base_scan", 360)
     source = Source(scanner, (), lambda: neighbourhood.targets(bodies))
-    own = OwnMotion(place_m=(10.0, 20.0, 5.0 + ANTENNA_M), heading_rad=math.pi / 2)
+    own_motion = OwnMotion(place_m=(10.0, 20.0, 5.0 + ANTENNA_M), heading_rad=math.pi / 2)
 
     def scan(**places_m: Vector) -> np.ndarray:
         writer.write(places_m)
-        data = source.message(0, 0, own)
+        data = source.message(0, 0, own_motion)
         message: Any = shipped().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan")
         return np.asarray(message.ranges)
 
     for distance_m in (2.0, 3.0, 1.0):
-        ranges = scan(own=own.place_m, other=(10.0, 20.0 + distance_m, 5.0 + ANTENNA_M))
+        ranges = scan(own=own_motion.place_m, other=(10.0, 20.0 + distance_m, 5.0 + ANTENNA_M))
         assert ranges[0] == pytest.approx(distance_m - BURGER_RADIUS_M, abs=6 * LASER_NOISE_M)
         half = math.floor(math.degrees(math.asin(BURGER_RADIUS_M / distance_m)))
         assert np.isfinite(ranges).nonzero()[0].tolist() == [*range(half + 1), *range(360 - half, 360)]

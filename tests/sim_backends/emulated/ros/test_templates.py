@@ -48,8 +48,8 @@ def read_message(topic: PublishedTopic) -> Any:  # noqa: ANN401 (rosbags makes i
     return message
 
 
-def custom(definition: str, more: str) -> PublishedTopic:
-    return topic(f"type: my_msgs/Scan, {more}").model_copy(update={"definition": definition})
+def custom(definition: str, keys: str) -> PublishedTopic:
+    return topic(f"type: my_msgs/Scan, {keys}").model_copy(update={"definition": definition})
 
 
 def test_an_image_has_the_size_in_its_fields() -> None:

@@ -135,18 +135,18 @@ def exchange(near: FrameChannel, far: FrameChannel, bodies: list[bytes]) -> None
             far.send(encode(MessageKind.STATES, 1, 0, body), after_s(60))
         # The last answer is resent until it is acknowledged; the network may lose the end of the connection.
         with suppress(ClosedError):
-            while not ended.is_set():
+            while not closed.is_set():
                 with suppress(DeadlineError):
                     far.receive(after_s(0.1))
 
-    ended = threading.Event()
+    closed = threading.Event()
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
     for body in bodies:
         near.send(encode(MessageKind.PING, 1, 0, body), after_s(60))
         assert near.receive(after_s(60)).body == body
     near.close()
-    ended.set()
+    closed.set()
     thread.join(60)
     assert not thread.is_alive()
 

@@ -56,23 +56,23 @@ def test_an_invalid_address_is_an_error(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "where",
+    "address",
     ["tcp:192.0.2.1:7000", "udp:192.0.2.1:7000", "udp-listen:0.0.0.0:7000", "dds:carts:0:192.0.2.1", "ros1:carts"],
 )
-def test_a_token_is_needed_beyond_loopback(where: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_token_is_needed_beyond_loopback(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
     monkeypatch.setenv("ROS_MASTER_URI", "http://192.0.2.1:11311")
     with pytest.raises(ConfigurationError, match="there is no token"):
-        open_physics(where, HELLO, 1.0)
+        open_physics(address, HELLO, 1.0)
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_federate_serves_several_runs_with_large_frames(scheme: str, federates: Federates) -> None:
-    served_at, where = new_addresses(scheme)
+    served_at, address = new_addresses(scheme)
     federates.start("physics", "none", served_at, runs=3)
-    many = replace(HELLO, agents=MANY)  # 144 kB of states in each answer
-    for hello in (HELLO, many, HELLO):
-        with closing(open_physics(where, hello, 30.0)) as physics:
+    large_hello = replace(HELLO, agents=MANY)  # 144 kB of states in each answer
+    for hello in (HELLO, large_hello, HELLO):
+        with closing(open_physics(address, hello, 30.0)) as physics:
             for step in range(5):
                 states = physics.advance(step * MS, {})
             assert states.keys() == {agent.name for agent in hello.agents}
@@ -80,9 +80,9 @@ def test_a_federate_serves_several_runs_with_large_frames(scheme: str, federates
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_the_coordinator_may_be_first(scheme: str, federates: Federates) -> None:
-    served_at, where = new_addresses(scheme)
+    served_at, address = new_addresses(scheme)
     federates.start("physics", "none", served_at, delay_s=0.5)
-    with closing(open_physics(where, HELLO, 30.0)) as physics:
+    with closing(open_physics(address, HELLO, 30.0)) as physics:
         assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
 
 
@@ -95,11 +95,11 @@ def test_a_federate_may_connect_by_udp(federates: Federates) -> None:
 
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_federate_refuses_a_wrong_token(scheme: str, federates: Federates, monkeypatch: pytest.MonkeyPatch) -> None:
-    served_at, where = new_addresses(scheme)
+    served_at, address = new_addresses(scheme)
     federates.start("physics", "none", served_at)
     monkeypatch.setenv(TOKEN_VARIABLE, "wrong")
     with pytest.raises(FieldkitError, match="PermissionError: the token is wrong"):
-        open_physics(where, HELLO, 30.0)
+        open_physics(address, HELLO, 30.0)
 
 
 @pytest.mark.parametrize("scheme", ["dds", "ros1"])

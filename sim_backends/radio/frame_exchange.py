@@ -1,0 +1,324 @@
+"""Exchanges of frames and their acknowledgements: single frames with ACK, broadcasts, and A-MPDU with Block Ack."""
+
+from collections.abc import Callable
+from typing import Final, Generic
+
+from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate, BlockAckSession, remove_frames
+from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.contention import EventQueue
+from sim_backends.radio.driver_statistics import RadioMeter
+from sim_backends.radio.frames import (
+    HEADER_BYTES,
+    Frame,
+    Transmission,
+    TransmissionAttempt,
+    ack_record,
+    attempt_record,
+)
+from sim_backends.radio.links import RETRIES_EXHAUSTED, Payload
+from sim_backends.radio.modes import (
+    SHORT_RETRY_LIMIT,
+    SLOT_NS,
+    ack_ns,
+    basic_mode,
+    control_mode,
+    response_ns,
+)
+from sim_backends.radio.packet_delivery import PacketDelivery
+from sim_backends.radio.random_streams import PacketDraws
+from sim_backends.radio.reception import Reception
+from sim_backends.radio.stations import Peer, Station
+
+# 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
+_ACK_TIMEOUT_AFTER_SIFS_NS: Final = SLOT_NS + 20_000
+
+# Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.
+_JAMMED_RETRY_NS: Final = 1_000_000
+
+
+class FrameExchange(Generic[Payload]):
+    """The frame exchanges of stations that share one channel, each from the end of a backoff to the next.
+
+    Args:
+        channel: Received powers between the stations.
+        seed: Seed of all random draws.
+        queue_packets: Maximum number of queued packets per station.
+
+    Attributes:
+        stations: Stations by index.
+        events: Scheduled events.
+        delivery: Queues of the stations, and what they have received.
+        reception: The frames on the air.
+        log: Called with every transmission attempt that ends; None without a log.
+        meter: Counters of the radio drivers; None without counters.
+    """
+
+    def __init__(self, channel: RadioChannel, seed: int, queue_packets: int) -> None:
+        self._names = channel.names
+        band = channel.band
+        self._basic = basic_mode(band)
+        self._sifs_ns = band.sifs_ns
+        self._ack_timeout_ns = band.sifs_ns + _ACK_TIMEOUT_AFTER_SIFS_NS
+        self.stations: list[Station[Payload]] = [
+            Station(index, PacketDraws(seed, name, "backoff"), channel.ifs_ns(index))
+            for index, name in enumerate(channel.names)
+        ]
+        self.events = EventQueue(self._start)
+        self.delivery: PacketDelivery[Payload] = PacketDelivery(channel, self.stations, self.events, queue_packets)
+        self.reception = Reception(channel, seed, self.stations, self.events)
+        self.log: Callable[[TransmissionAttempt], None] | None = None
+        self.meter: RadioMeter | None = None
+
+    def abort(self, now_ns: int, station: Station[Payload]) -> None:
+        """End the exchange of a station whose radio is switched off, and cancel its next one."""
+        self.reception.abort(station.index, now_ns)
+        self.events.cancel_start(station.index)
+        station.exchange_id += station.exchange_id & 1
+        station.aggregate = None
+
+    def retry_when_idle(self, now_ns: int, station: Station[Payload]) -> None:
+        """Schedule the next exchange of a station that may have waited for the end of jammer noise."""
+        if not station.queue or station.exchange_id & 1 or station.index in self.events.starts:
+            return
+        if self.reception.is_jammed(station.index):
+            self.events.at(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
+        else:
+            station.contention.set_busy_until(now_ns)
+            self._contend(now_ns, station)
+
+    def _contend(self, now_ns: int, station: Station[Payload]) -> None:
+        self.events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
+
+    def _start(self, now_ns: int, index: int) -> None:
+        station = self.stations[index]
+        station.contention.earliest_start_ns(now_ns)
+        if self.reception.is_jammed(index):
+            self.events.at(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
+            return
+        station.exchange_id += 1
+        frame = station.queue[0]
+        peer = None if frame.receiver is None else self.delivery.peer(index, frame.receiver)
+        if peer is not None and peer.session is not None:
+            self._start_aggregate(now_ns, station, peer, peer.session)
+        else:
+            self._start_frame(now_ns, station, peer, frame)
+
+    def _start_frame(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None, frame: Frame[Payload]
+    ) -> None:
+        if not frame.attempts:
+            frame.first_attempt_ns = now_ns
+        frame.attempts += 1
+        packet, number = frame.packet, frame.attempts
+        if peer is None:
+            mode = self._basic
+        else:
+            mode = peer.mode = peer.rate.choose(now_ns, packet, number)
+        size_bytes = frame.size_bytes + HEADER_BYTES
+        end_ns = now_ns + mode.airtime_ns(size_bytes)
+        reserved_ns = end_ns if peer is None else end_ns + self._sifs_ns + ack_ns(mode)
+        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, packet, number)
+        self.reception.start(transmission, reserved_ns)
+        if self.meter is not None:
+            self.meter.on_start(transmission, frame.receiver)
+        self.events.at(end_ns, self._end_frame, station, peer, frame, transmission)
+
+    def _end_frame(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload] | None,
+        frame: Frame[Payload],
+        transmission: Transmission,
+    ) -> None:
+        addressed = sorted(transmission.receivers) if peer is None else [peer.receiver]
+        received = [index for index in addressed if self.reception.decodes(index, transmission, "data")]
+        self.reception.end(now_ns, transmission)
+        if self.log is not None:
+            self.log(attempt_record(self._names, transmission, frame, received, transmission.size_bytes))
+        if not station.queue or station.queue[0] is not frame:
+            return  # aborted: its radio was switched off
+        if peer is None:
+            self._end_broadcast(now_ns, station, frame, received)
+            return
+        if received:
+            self._receive(now_ns, station, peer, frame)
+        self._await_response(now_ns, station, peer, transmission, is_decoded=bool(received))
+
+    def _end_broadcast(
+        self, now_ns: int, station: Station[Payload], frame: Frame[Payload], received: list[int]
+    ) -> None:
+        for index in received:
+            self._receive(now_ns, station, self.delivery.peer(station.index, index), frame)
+        self.delivery.count_broadcast(now_ns, station.index, frame, received)
+        self._end_exchange(now_ns, station, done=True)
+
+    def _receive(self, now_ns: int, station: Station[Payload], peer: Peer[Payload], frame: Frame[Payload]) -> None:
+        if peer.last_frame is not frame:
+            peer.last_frame = frame
+            self.delivery.pass_up(now_ns, station.index, peer, (frame,))
+
+    def _start_aggregate(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], session: BlockAckSession[Payload]
+    ) -> None:
+        first = station.queue[0]
+        # Hardware repeats an aggregate in the next mode of the chain only if the Block Ack is missing.
+        mode = peer.mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
+        aggregate = station.aggregate = session.build_aggregate(station.queue, mode)
+        for frame in aggregate.frames:
+            if not frame.attempts:
+                frame.first_attempt_ns = now_ns
+            frame.attempts += 1
+        size_bytes, response_bytes = aggregate.size_bytes, aggregate.response_bytes
+        end_ns = now_ns + mode.airtime_ns(size_bytes)
+        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, first.packet, first.attempts)
+        transmission.response_bytes = response_bytes
+        self.reception.start(transmission, end_ns + self._sifs_ns + response_ns(mode, response_bytes))
+        if self.meter is not None:
+            self.meter.on_start(transmission, None)
+            self.meter.on_aggregate(transmission, peer.receiver, aggregate.frames)
+        self.events.at(end_ns, self._end_aggregate, station, peer, aggregate, transmission)
+
+    def _end_aggregate(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        aggregate: Aggregate[Payload],
+        transmission: Transmission,
+    ) -> None:
+        decoded = aggregate.decoded = self.reception.decoded_frames(peer.receiver, transmission, aggregate)
+        self.reception.end(now_ns, transmission)
+        if self.log is not None:
+            for frame in aggregate.frames:
+                received = [peer.receiver] if frame in decoded else []
+                size_bytes = frame.size_bytes + QOS_HEADER_BYTES
+                self.log(attempt_record(self._names, transmission, frame, received, size_bytes))
+        if station.aggregate is not aggregate:
+            return  # aborted: its radio was switched off
+        assert peer.session is not None
+        self.delivery.pass_up(now_ns, station.index, peer, peer.session.receive(decoded))
+        self._await_response(now_ns, station, peer, transmission, is_decoded=bool(decoded))
+
+    def _await_response(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        transmission: Transmission,
+        *,
+        is_decoded: bool,
+    ) -> None:
+        exchange_id = station.exchange_id
+        if is_decoded:
+            self.events.at(now_ns + self._sifs_ns, self._respond, station, peer, transmission, exchange_id)
+        self.events.at(now_ns + self._ack_timeout_ns, self._response_timeout, station, peer, exchange_id)
+
+    def _respond(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        transmission: Transmission,
+        exchange_id: int,
+    ) -> None:
+        """Start the ACK or Block Ack to a transmission of `station`."""
+        receiver = self.stations[peer.receiver]
+        if receiver.sending_until_ns > now_ns:
+            return
+        mode, size_bytes = transmission.mode, transmission.response_bytes
+        end_ns = now_ns + response_ns(mode, size_bytes)
+        packet, number = transmission.packet, transmission.attempt
+        ack = Transmission(receiver.index, now_ns, end_ns, control_mode(mode), size_bytes, packet, number)
+        self.reception.start(ack, end_ns)
+        if self.meter is not None:
+            self.meter.on_start(ack, None)
+        ack_exchange_id = 0
+        if station.receiving is ack and station.exchange_id == exchange_id:
+            ack_exchange_id = station.exchange_id = exchange_id + 2  # so that the timeout is ignored
+        self.events.at(end_ns, self._end_response, station, peer, ack, ack_exchange_id)
+
+    def _end_response(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        ack: Transmission,
+        exchange_id: int,
+    ) -> None:
+        decoded = station.receiving is ack and self.reception.decodes(station.index, ack, "ack")
+        self.reception.end(now_ns, ack)
+        if self.log is not None:
+            self.log(ack_record(self._names, ack, station.index, decoded=decoded))
+        if exchange_id == station.exchange_id:
+            self._finish_attempt(now_ns, station, peer, acknowledged=decoded)
+
+    def _response_timeout(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], exchange_id: int
+    ) -> None:
+        if exchange_id == station.exchange_id:
+            self._finish_attempt(now_ns, station, peer, acknowledged=False)
+
+    def _finish_attempt(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], *, acknowledged: bool
+    ) -> None:
+        if not acknowledged:
+            station.contention.set_busy_until(now_ns)
+        if peer.session is not None:
+            self._finish_aggregate(now_ns, station, peer, peer.session, acknowledged=acknowledged)
+            return
+        frame = station.queue[0]
+        peer.rate.report(peer.mode, acknowledged=acknowledged)
+        done = acknowledged or frame.attempts >= frame.max_attempts
+        if done:
+            is_received = peer.last_frame is frame
+            peer.count(delivered=is_received)
+            if self.meter is not None and not acknowledged:
+                self.meter.on_failures(station.index, peer.receiver, 1)
+            if not is_received:
+                self.delivery.lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
+        self._end_exchange(now_ns, station, done=done)
+
+    def _end_exchange(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
+        station.exchange_id += 1
+        if done:
+            station.contention.on_success()
+            station.queue.popleft()
+        else:
+            station.contention.on_failure()
+        if station.queue:
+            self._contend(now_ns, station)
+
+    def _finish_aggregate(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        session: BlockAckSession[Payload],
+        *,
+        acknowledged: bool,
+    ) -> None:
+        aggregate = station.aggregate
+        assert aggregate is not None
+        station.aggregate = None
+        frames, confirmed = aggregate.frames, set(aggregate.decoded if acknowledged else ())
+        peer.rate.report(peer.mode, acknowledged=len(confirmed), attempts=len(frames))
+        if acknowledged:
+            station.contention.on_success()
+            peer.failed_exchanges = 0
+        else:
+            station.contention.on_failure()
+            peer.failed_exchanges += 1
+        given_up = {frame for frame in frames if frame not in confirmed and frame.attempts >= frame.max_attempts}
+        lost = [frame for frame in frames if frame in given_up and not frame.is_received]
+        for frame in lost:
+            self.delivery.lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
+        peer.count_frames(delivered=len(confirmed) + len(given_up) - len(lost), lost=len(lost))
+        if self.meter is not None:
+            self.meter.on_failures(station.index, peer.receiver, len(given_up))
+        if lost:
+            self.delivery.pass_up(now_ns, station.index, peer, session.skip(lost))
+        remove_frames(station.queue, confirmed | given_up)
+        station.exchange_id += 1
+        if station.queue:
+            self._contend(now_ns, station)

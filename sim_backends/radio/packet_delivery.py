@@ -1,0 +1,129 @@
+"""Packets above the frame exchange: queues of the stations, relaying, delivery, and the log of losses."""
+
+from collections.abc import Iterable, Sequence
+from typing import Generic
+
+from sim_backends.radio.aggregation import BlockAckSession
+from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.contention import EventQueue
+from sim_backends.radio.frames import Frame
+from sim_backends.radio.links import (
+    NOT_DECODED,
+    OUT_OF_RANGE,
+    QUEUE_FULL,
+    RADIO_OFF,
+    Delay,
+    Delivery,
+    LossLog,
+    Payload,
+)
+from sim_backends.radio.stations import Peer, Station
+
+
+class PacketDelivery(Generic[Payload]):
+    """The packets of stations that share one channel.
+
+    Args:
+        channel: Received powers between the stations.
+        stations: Stations by index.
+        events: Scheduled events.
+        queue_packets: Maximum number of queued packets per station.
+
+    Attributes:
+        peers: State of each link that was used, by indices of transmitter and receiver.
+        arrived: Delivered packets, in order of arrival.
+        log_loss: Called for every loss; None without a log.
+    """
+
+    def __init__(
+        self,
+        channel: RadioChannel,
+        stations: Sequence[Station[Payload]],
+        events: EventQueue,
+        queue_packets: int,
+    ) -> None:
+        self._channel = channel
+        self._stations = stations
+        self._events = events
+        self._queue_packets = queue_packets
+        self.peers: dict[tuple[int, int], Peer[Payload]] = {}
+        self.arrived: list[Delivery[Payload]] = []
+        self.log_loss: LossLog | None = None
+
+    def enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
+        queue = station.queue
+        peer = None if frame.receiver is None else self.peer(station.index, frame.receiver)
+        if peer is not None and not self._channel.linked(station.index, peer.receiver):
+            peer.count(delivered=False)
+            self.lose(now_ns, station.index, frame, OUT_OF_RANGE)
+            return
+        if len(queue) > self._queue_packets:
+            if peer is not None:
+                peer.queue_dropped += 1
+            self.lose(now_ns, station.index, frame, QUEUE_FULL)
+            return
+        queue.append(frame)
+        if len(queue) == 1 and not station.exchange_id & 1:
+            self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
+
+    def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:
+        """Empty the queue of a station whose radio was switched off; frames that were not received are lost."""
+        while station.queue:
+            frame = station.queue.popleft()
+            peer = None if frame.receiver is None else self.peer(station.index, frame.receiver)
+            if peer is None or not peer.has_received(frame):
+                self.lose(now_ns, station.index, frame, RADIO_OFF)
+                if peer is not None and peer.session is not None:
+                    self.pass_up(now_ns, station.index, peer, peer.session.skip([frame]))
+
+    def pass_up(self, now_ns: int, transmitter: int, peer: Peer[Payload], frames: Iterable[Frame[Payload]]) -> None:
+        """Deliver frames at a receiver, or queue them for their second hop."""
+        receiver = peer.receiver
+        propagation_ns = self._channel.delay_ns(transmitter, receiver)
+        for frame in frames:
+            delay_so_far = frame.total_delay(now_ns, propagation_ns)
+            if frame.keep:
+                self._events.at(
+                    now_ns + propagation_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far
+                )
+            for onward in frame.onward:
+                self.enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, onward, delay_so_far))
+
+    def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, delay_so_far: Delay) -> None:
+        name = self._channel.names[receiver]
+        if name != source:  # an access point also repeats a broadcast to its sender
+            self.arrived.append((now_ns, name, payload, source, delay_so_far))
+
+    def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
+        """Count a broadcast on the link to each station, and log for which stations it was lost."""
+        for index, name in enumerate(self._channel.names):
+            linked, missed = self._channel.linked(transmitter, index), index not in received
+            if linked:
+                self.peer(transmitter, index).count(delivered=not missed)
+            if missed and index != transmitter and self.log_loss is not None and name != frame.source:
+                self.log_loss(now_ns, frame.payload, name, NOT_DECODED if linked else OUT_OF_RANGE)
+
+    def lose(self, now_ns: int, transmitter: int, frame: Frame[Payload], reason: str) -> None:
+        """Log that a frame was not delivered beyond `transmitter`, for each station that it would have reached."""
+        if self.log_loss is None:
+            return
+        for name in self._intended_receivers(transmitter, frame):
+            self.log_loss(now_ns, frame.payload, name, reason)
+
+    def _intended_receivers(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:
+        names = self._channel.names
+        ends = frame.onward or (frame.receiver,)
+        if ends == (None,):
+            return [name for name in names if name not in {frame.source, names[transmitter]}]
+        return [names[index] for index in ends if index is not None]
+
+    def peer(self, transmitter: int, receiver: int) -> Peer[Payload]:
+        """Return the state of a link, which is created when it is first used."""
+        pair = transmitter, receiver
+        peer = self.peers.get(pair)
+        if peer is None:
+            limits = self._channel.ampdu_limits(*pair)
+            session: BlockAckSession[Payload] | None = None if limits is None else BlockAckSession(limits)
+            peer = self.peers[pair] = Peer(receiver, self._channel.rate_control(*pair), session)
+        return peer
