@@ -32,6 +32,7 @@ _LONG: Final = (
     "test_docs",
     "test_drive",
     "test_smallest_emulated",
+    "test_virtual_machine",
     "test_step_conformance",
     "test_known_loss_tcp",
     "test_from_wheel",

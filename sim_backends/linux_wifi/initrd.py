@@ -20,6 +20,10 @@ MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p", "virtio_rng", "mac80211_hw
 _SUFFIX: Final = ".ko"
 _DEPENDS: Final = re.compile(rb"\0depends=([^\0]*)\0")
 
+_SIGNED: Final = b"~Module signature appended~\n"
+_SIGNATURE_HEADER_BYTES: Final = 12
+"""After the signature; its last four bytes are the size of the signature."""
+
 _START: Final = """\
 #!/bin/busybox sh
 export PATH=/bin
@@ -34,7 +38,7 @@ for name in $(cat /modules); do
 done
 mount -t 9p -o ro,trans=virtio,version=9p2000.L,msize=524288,cache=loose host /host || poweroff -f
 mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 lab /host/mnt || poweroff -f
-for place in tmp run; do mount -t tmpfs $place /host/$place; done
+mount -t tmpfs run /host/run
 for place in proc sys dev; do mount -o move /$place /host/$place; done
 mkdir -p /host/dev/pts /host/dev/shm /host/run/netns
 mount -t devpts devpts /host/dev/pts
@@ -62,7 +66,7 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
     order = module_order(modules, MODULES)
     files = {"init": (0o755, _START.format(radios=radios, job=job, output=output).encode())}
     files["modules"] = 0o644, "\n".join(path.name.removesuffix(_SUFFIX) for path in order).encode()
-    files |= {f"lib/{path.name}": (0o644, path.read_bytes()) for path in order}
+    files |= {f"lib/{path.name}": (0o644, without_signature(path.read_bytes())) for path in order}
     busybox = _program("busybox")
     files["bin/busybox"] = 0o755, busybox.read_bytes()
     files |= {str(path).lstrip("/"): (0o755, path.read_bytes()) for path in shared_libraries(busybox)}
@@ -102,6 +106,15 @@ def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
     for name in names:
         add(name.replace("-", "_"))
     return list(order.values())
+
+
+def without_signature(module: bytes) -> bytes:
+    """Return a module without the signature at its end (Linux, scripts/sign-file.c): its check needs seconds."""
+    if not module.endswith(_SIGNED):
+        return module
+    end = len(module) - len(_SIGNED)
+    size = int.from_bytes(module[end - 4 : end], "big")
+    return module[: max(0, end - _SIGNATURE_HEADER_BYTES - size)]
 
 
 def shared_libraries(program: Path) -> list[Path]:

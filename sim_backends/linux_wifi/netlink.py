@@ -34,6 +34,9 @@ _TYPE_MASK: Final = 0x3FFF
 _RECEIVE_BUFFER_BYTES: Final = 4 << 20
 _SO_RCVBUFFORCE: Final = 33
 _TIMEOUT_S: Final = 60.0
+_FIRST_PORT: Final = 1 << 30
+"""Above all process identifiers: the kernel gives the number of the process to other netlink sockets of the process,
+as `getaddrinfo` opens. hwsim ends the registration if a socket of any protocol with the same number is closed."""
 
 
 class NetlinkFormatError(ValueError):
@@ -175,7 +178,7 @@ class FamilySocket:
         self._socket = socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, _NETLINK_GENERIC, fileno=fd)
         try:
             if fd is None:
-                self._socket.bind((0, 0))
+                self._socket.bind((_FIRST_PORT + os.getpid(), 0))
             self._family = self._request_family(name)
             self._socket.setblocking(False)
             self._grow_buffer()

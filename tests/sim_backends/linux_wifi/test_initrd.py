@@ -1,12 +1,13 @@
 """The initial file system, read by busybox's cpio; the order of modules."""
 
+import struct
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.linux_wifi.initrd import cpio_archive, module_order
+from sim_backends.linux_wifi.initrd import cpio_archive, module_order, without_signature
 
 
 def write_module(folder: Path, name: str, depends: str | None) -> None:
@@ -26,6 +27,12 @@ def test_a_built_in_module_is_left_out_and_a_missing_one_is_an_error(tmp_path: P
         module_order(tmp_path, ("a",))
     (tmp_path / "modules.builtin").write_text("kernel/lib/built-in.ko\n")
     assert [path.stem for path in module_order(tmp_path, ("a",))] == ["a"]
+
+
+def test_the_signature_of_a_module_is_removed() -> None:
+    header = struct.pack(">5B3xI", 0, 0, 2, 0, 0, 300)
+    assert without_signature(b"\x7fELF" + bytes(300) + header + b"~Module signature appended~\n") == b"\x7fELF"
+    assert without_signature(b"\x7fELF unsigned") == b"\x7fELF unsigned"
 
 
 @pytest.mark.emulated
