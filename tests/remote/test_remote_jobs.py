@@ -45,6 +45,8 @@ def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell
     local_shell = LocalShell(home, userland_path(request.param, tmp_path / "bin"))
     jobs.install(local_shell, Deadline.after(30))
     evidence.begin(local_shell, FOLDER, "sender", "lo")
+    # Sampling of the link, if iw is installed, ends because this interface is not Wi-Fi.
+    wait_until(lambda: jobs.list_running(local_shell, Deadline.after(30)) == (), Deadline.after(60))
     yield local_shell
     evidence.end_jobs(local_shell, FOLDER)
     assert jobs.list_running(local_shell, Deadline.after(30)) == ()
