@@ -7,10 +7,11 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from typing_extensions import override
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Role
@@ -20,7 +21,7 @@ from fieldkit.measure.evidence.endings import Cause
 from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
-from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalShell, userland_path
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalSession, LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
 
@@ -35,6 +36,28 @@ def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell
     jobs.install(local_shell, Deadline.after(30))
     yield local_shell
     wait_until(lambda: jobs.list_running(local_shell, Deadline.after(30)) == (), Deadline.after(60))
+
+
+class ShellWithoutIw(LocalShell):
+    """A robot on which iw is not installed: in its mount namespace a file that is not executable covers iw."""
+
+    @override
+    def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
+        path = f"{os.environ['PATH']}:/usr/sbin:/sbin"
+        unshare, iw = shutil.which("unshare", path=path), shutil.which("iw", path=path)
+        assert unshare
+        if iw:
+            cover = (
+                unshare,
+                "--map-root-user",
+                "--mount",
+                "sh",
+                "-c",
+                'mount --bind /dev/null "$0" && exec "$@"',
+                iw,
+            )
+            argv = (*cover, *argv)
+        return super().begin(argv, deadline=deadline, until=until)
 
 
 def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
@@ -116,7 +139,7 @@ def test_sampler_stops_with_the_attempt(shell: LocalShell, tmp_path: Path, means
 
 
 def test_sampler_exits_without_wifi_and_does_not_start_without_iw(shell: LocalShell, tmp_path: Path) -> None:
-    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    evidence.begin(ShellWithoutIw(shell.home, shell.path), FOLDER, "sender", "wlan0")
     assert not (shell.home / FOLDER / ".jobs" / "link").exists()
     give_iw(tmp_path)
     (tmp_path / "bin" / "iw").write_text("#!/bin/sh\necho 'command failed: No such device (-19)' >&2\nexit 237\n")
