@@ -103,13 +103,17 @@ def uncompressed_kernel(image: bytes) -> bytes:
     return lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(payload)
 
 
-def require_machine(roots: Sequence[Path] = (Path("/"),)) -> Kernel:
+def require_machine(roots: Sequence[Path] = (Path("/"),), program_path: str = PATH) -> Kernel:
     """Return the kernel of the machine.
+
+    Args:
+        roots: Folders with `boot/` and `lib/modules/`.
+        program_path: Folders of programs, separated by colons.
 
     Raises:
         ConfigurationError: The kernel or a program is missing; the message names all that is.
     """
-    missing = {name: package for name, package in PACKAGE_OF.items() if shutil.which(name, path=PATH) is None}
+    missing = {name: package for name, package in PACKAGE_OF.items() if shutil.which(name, path=program_path) is None}
     kernel = find_kernel(roots)
     if kernel is None:
         missing["a kernel with mac80211_hwsim"] = "linux-image-amd64"

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import load_scenario
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.external import make_hello
@@ -225,6 +226,6 @@ def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize("lifetime", ["appears", "disappears"])
 def test_robots_that_appear_or_disappear_are_refused_before_the_run(lifetime: str, server: GazeboServer) -> None:
     changes = {f"agents.leader.{lifetime}": "3s"}
-    refusal = pytest.raises(FederateError, match="remove appears and disappears of leader")
+    refusal = pytest.raises(ConfigurationError, match=f"cannot appear or disappear in Gazebo; remove {lifetime}")
     with refusal, connected(server, {}, changes):
         pass

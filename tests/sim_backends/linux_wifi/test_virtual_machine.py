@@ -16,13 +16,15 @@ from sim_backends.linux_wifi.virtual_machine import Kernel, require_machine, run
 from tests.helpers.paths import ROOT
 
 ROOTS = (ROOT / ".linux", Path("/"))
+# .ci/install extracts iw, because with iw on the PATH fieldkit samples links of all robots of other tests.
+PROGRAMS = f"/usr/sbin:/usr/bin:/sbin:/bin:{ROOT / '.linux/sbin'}:{ROOT / '.linux/usr/sbin'}"
 # Without KVM a minute on an idle machine; the clock of the machine does not depend on it.
 BOOT_S = 1200.0
 
 
 @pytest.fixture(scope="module")
 def kernel() -> Kernel:
-    return require_machine(ROOTS)
+    return require_machine(ROOTS, PROGRAMS)
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +34,7 @@ def results(kernel: Kernel) -> dict[str, Any]:
     job = Path(__file__).with_name("machine_job.py")
     script = f"""\
 cd {shlex.quote(str(ROOT))}
-export PATH=/usr/sbin:/usr/bin:/sbin:/bin TMPDIR=/run
+export PATH={shlex.quote(PROGRAMS)} TMPDIR=/run
 export PYTHONPATH=. PYTHONDONTWRITEBYTECODE=1 OPENBLAS_NUM_THREADS=1
 exec {shlex.join((sys.executable, str(job)))}
 """
