@@ -8,7 +8,7 @@ from tests.helpers.smallest import CASES, run_minimally
 
 pytestmark = pytest.mark.emulated
 
-ON_NAMESPACES = ("layers", "medium", "moves", "swarm", "tcp_vs_kernel")
+ON_NAMESPACES = ("layers", "medium", "medium_cost", "moves", "swarm", "tcp_vs_kernel")
 ON_ROBOTS = (
     "emane",
     "stop",

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -23,7 +24,7 @@ from tests.helpers.sshd import wait_until
 pytestmark = pytest.mark.emulated
 
 EXAMPLE: Final = ROOT / "docs" / "examples" / "convoy"
-ROS2: Final = ROOT / ".ros2" / "bin" / "python"
+ROS2: Final = shlex.quote(str(ROOT / ".ros2" / "bin" / "python"))
 LEGS: Final = {"short": ("5:0.4", "6:1"), "all": ()}
 """Arguments of `lead.py`: the first two legs of the scenario, or all."""
 STANDSTILL_M: Final = 2.0

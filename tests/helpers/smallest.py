@@ -289,6 +289,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "layers": MinimalRun("--rounds 1 --packets 20", {"PINGS": 5, "STATIONS": (2,)}, shrink=_one_layer, emulated=True),
     "ledger": MinimalRun("--repeats 3"),
     "medium": MinimalRun("--rounds 1 --seconds 1 --probes 20", shrink=_slow_iperf, emulated=True),
+    "medium_cost": MinimalRun(". --rounds 1 --seconds 0.3", emulated=True),
     "studies.mesh": MinimalRun("--out FOLDER/lab --repeats 1", shrink=_short_row, emulated=True),
     "studies.mesh_losses": MinimalRun("--losses 1", shrink=_short_detour, emulated=True),
     "studies.middleware": MinimalRun(

@@ -1,5 +1,6 @@
 """The index of tables on a real file system that is full or read-only: a tmpfs in a mount namespace."""
 
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ pytestmark = pytest.mark.emulated
 def test_the_result_is_right_if_the_cache_is_full_or_read_only(tmp_path: Path, options: str) -> None:
     write_archive(tmp_path / "trials", indexed_tables.MIN_TABLES, 2)
     (tmp_path / "cache").mkdir()
-    command = f"{sys.executable} -m fieldkit aggregate trials --format csv"
+    command = f"{shlex.quote(sys.executable)} -m fieldkit aggregate trials --format csv"
     script = f"""sleep 2.1
     mount -t tmpfs -o {options} tmpfs cache
     {command} --no-index > direct.csv

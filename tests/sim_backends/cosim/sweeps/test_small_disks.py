@@ -19,10 +19,10 @@ LIMIT_S: Final = 600
 
 
 def in_mount_namespace(folder: Path, script: str) -> str:
-    """Return the output of a shell script; `$FIELDKIT` is the command, and mounts vanish with the script."""
+    """Return the output of a shell script; `$PYTHON` is the interpreter, and mounts vanish with the script."""
     namespace = ("unshare", "--mount", "--propagation", "private", "--", "sh", "-euc", script)
     environment = {"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "PYTHONPATH": str(ROOT), "HOME": str(folder)}
-    environment["FIELDKIT"] = f"{sys.executable} -m fieldkit"
+    environment["PYTHON"] = sys.executable
     done = subprocess.run(
         namespace, cwd=folder, env=environment, capture_output=True, text=True, timeout=LIMIT_S, check=False
     )
@@ -41,11 +41,11 @@ def test_a_sweep_on_a_full_disk_keeps_its_finished_runs_and_continues(tmp_path: 
     output = in_mount_namespace(
         tmp_path,
         f"""mount -t tmpfs -o size=24k tmpfs disk
-        $FIELDKIT {words} --jobs 2 -o disk/sweep 2>&1 || echo "exit code $?"
+        "$PYTHON" -m fieldkit {words} --jobs 2 -o disk/sweep 2>&1 || echo "exit code $?"
         echo "count: $(ls disk/sweep/runs | grep -c 'json$')"
-        for file in disk/sweep/runs/*.json; do {sys.executable} -m json.tool "$file" > /dev/null; done
+        for file in disk/sweep/runs/*.json; do "$PYTHON" -m json.tool "$file" > /dev/null; done
         mount -o remount,size=16m disk
-        $FIELDKIT {words} --jobs 2 -o disk/sweep 2>&1
+        "$PYTHON" -m fieldkit {words} --jobs 2 -o disk/sweep 2>&1
         cp -r disk/sweep copy""",
     )
     assert "No space left on device" in output
