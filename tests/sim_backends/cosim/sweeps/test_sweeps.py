@@ -221,6 +221,7 @@ def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
     )
     assert difference == pytest.approx(cells["scheduled"] - cells["sliding_window"], rel=1e-6)
     some = run_here(lab, "compare", "sweep", *between, "--where", "window_s == 0.013", "--format", "csv")
+    assert some.code == 0, some.err
     assert {row["window_s"] for row in csv.DictReader(some.out.splitlines())} == {"0.013"}
 
 
