@@ -64,9 +64,10 @@ def create(out: Path, plan: Plan) -> Path:
         ConfigurationError: `out` cannot be written, or the trial exists.
     """
     folder = out / plan.trial
+    content = schema.dump(plan).encode()
     try:
         (folder / REPEATS).mkdir(parents=True)
-        files.write(folder / PLAN_FILE, schema.dump(plan).encode())
+        files.write(folder / PLAN_FILE, content)
         files.sync_folder(out)
     except OSError as error:
         raise ConfigurationError(

@@ -19,6 +19,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Fault, FaultKind, Protocol, Role, Status
 from fieldkit.remote import jobs
 from fieldkit.trial import journal
+from fieldkit.trial.plan import PLAN_FILE
 from sim_backends.emulated.backend import DEFAULT_SITE
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import write_procedure
@@ -182,7 +183,7 @@ class Chaos:
 
     def _trial_exists(self) -> bool:
         """Return True if there is a trial to resume."""
-        return any((self._field_robots.folder / "trials").glob("*/trial.yaml"))
+        return any((self._field_robots.folder / "trials").glob(f"*/{PLAN_FILE}"))
 
     def _run_once(self, *words: str) -> Run:
         """Start fieldkit and inject faults until it ends."""

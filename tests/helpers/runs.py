@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fieldkit.cli import main
+from fieldkit.trial.plan import PLAN_FILE
 
 LIMIT_S = 600.0
 
@@ -108,9 +109,9 @@ def run_here(folder: Path, *arguments: str) -> Run:
 
 
 def only_trial(lab: Path) -> Path:
-    """The only trial folder of a lab."""
-    (folder,) = (lab / "trials").iterdir()
-    return folder
+    """The only trial of a lab; fieldkit killed while it created a folder leaves one without a plan."""
+    (plan,) = (lab / "trials").glob(f"*/{PLAN_FILE}")
+    return plan.parent
 
 
 def rows(trial: Path, name: str = "trial.csv") -> list[dict[str, str]]:
