@@ -111,8 +111,8 @@ def places_m(distance_m: float) -> dict[str, tuple[float, float, float]]:
 
 def loss_db(distance_m: float, *, wall: bool) -> float:
     """Return the path loss for ns-3, including the wall."""
-    near, far = (np.array([place]) for place in places_m(distance_m).values())
-    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(near, far, CHANNEL_6_HZ)[0])
+    start_m, end_m = (np.array([place]) for place in places_m(distance_m).values())
+    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)[0])
 
 
 class Link:

@@ -49,19 +49,19 @@ def processor_us(project: Path, options: RadioOptions, rate: int, seconds: float
     """
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(worker, "PROJECT", project))
-        near, far = stack.enter_context(Namespace()), stack.enter_context(Namespace())
+        client, server = stack.enter_context(Namespace()), stack.enter_context(Namespace())
         medium = stack.enter_context(MediumClient(options, seed=1))
-        for name, namespace, address in (("near", near, "10.9.0.1/24"), ("far", far, "10.9.0.2/24")):
+        for name, namespace, address in (("client", client, "10.9.0.1/24"), ("server", server, "10.9.0.2/24")):
             fd = namespace.tun("wlan0", address)
             medium.attach(name, address, RADIO, fd)
             os.close(fd)
-        medium.place({"near": (0.0, 0.0, 0.0), "far": (9.0, 0.0, 0.0)})
-        near.run("ping", "-c", "3", "10.9.0.2")
-        carried, spent_ns = packets_in(far), _processor_ns(medium.pid)
-        near.run(sys.executable, "-c", _SEND, str(round(rate * seconds)), str(1 / rate), timeout_s=seconds + 60)
+        medium.place({"client": (0.0, 0.0, 0.0), "server": (9.0, 0.0, 0.0)})
+        client.run("ping", "-c", "3", "10.9.0.2")
+        carried, spent_ns = packets_in(server), _processor_ns(medium.pid)
+        client.run(sys.executable, "-c", _SEND, str(round(rate * seconds)), str(1 / rate), timeout_s=seconds + 60)
         time.sleep(0.1)
         spent_ns = _processor_ns(medium.pid) - spent_ns
-        carried = packets_in(far) - carried
+        carried = packets_in(server) - carried
     if not carried:
         raise RuntimeError(f"the medium of {project} delivered no packet")
     return spent_ns / 1e3 / carried

@@ -127,8 +127,8 @@ def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.M
     with gazebo_server(tmp_path / "gazebo", world_sdf(load_world("lawn"), robots)) as server:
         monkeypatch.setenv("IGN_PARTITION", server.options["partition"])
         monkeypatch.setenv("IGN_IP", server.options["ip"])
-        up = fieldkit(tmp_path, "lab", "up")
-        assert up.code == 0, up.err
+        started = fieldkit(tmp_path, "lab", "up")
+        assert started.code == 0, started.err
         try:
             assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "10m", "18m").code == 0
             assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0

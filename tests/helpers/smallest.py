@@ -116,7 +116,7 @@ def _slow_iperf(module: ModuleType, folder: Path) -> None:
     """Limit the rate of iperf3, which would otherwise load all cores."""
     del folder
     at_full_rate = module.iperf
-    replace(module, "iperf", lambda near, seconds, *options: at_full_rate(near, seconds, *options, "-b", "5M"))
+    replace(module, "iperf", lambda client, seconds, *options: at_full_rate(client, seconds, *options, "-b", "5M"))
 
 
 def _small_swarm(module: ModuleType, folder: Path) -> None:

@@ -245,9 +245,9 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         except EvidenceError as error:
             yield f"{name}: {error.what}"
             return
-        silent = [topic for topic in self.topics if not content.messages_by_topic.get(topic)]
-        if silent:
-            yield f"{name}: no message of {', '.join(silent)}"
+        topics_without_messages = [topic for topic in self.topics if not content.messages_by_topic.get(topic)]
+        if topics_without_messages:
+            yield f"{name}: no message of {', '.join(topics_without_messages)}"
         if content.duration_s + SUBSCRIBE_S < MIN_RECORDED_SHARE * self.duration:
             yield f"{name}: spans only {content.duration_s:.1f} s of {self.duration:g} s"
 

@@ -152,9 +152,9 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         self, scene: Scene, testbed: Testbed, other_jobs: list[Planned], publish: Planned, announce: Announce
     ) -> None:
         announce("topics", self.expected_s(scene.protocol))
-        with ExitStack() as silent:
+        with ExitStack() as silence_contexts:
             for role in self.participants:
-                silent.enter_context(testbed.shells[role].silence(publish.job.limit_s))
+                silence_contexts.enter_context(testbed.shells[role].silence(publish.job.limit_s))
             code = jobs.run(testbed.shells[publish.role], publish.job)
         stopped = [
             (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))

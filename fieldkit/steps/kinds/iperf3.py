@@ -141,9 +141,9 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         server, client = self.jobs(scene)
         server_shell, client_shell = (testbed.shells[planned.role] for planned in (server, client))
         announce("iperf3", self.expected_s(scene.protocol))
-        with ExitStack() as silent:
+        with ExitStack() as silence_contexts:
             for shell in (server_shell, client_shell):
-                silent.enter_context(shell.silence(self.limit))
+                silence_contexts.enter_context(shell.silence(self.limit))
             code = jobs.run(client_shell, client.job)
         # With --json some versions exit with 0 after any error; `check` evaluates their output.
         server_code = jobs.begin_wait(server_shell, server.job, _SERVER_EXIT_S).end(_SERVER_EXIT_S + jobs.REPLY_S)

@@ -225,9 +225,9 @@ class TransferStep(
         before = None if oracle is None else oracle.delays(*flow)
         _, send = self._netcats(scene)
         announce("transfer", self.expected_s(scene.protocol))
-        with ExitStack() as silent:
+        with ExitStack() as silence_contexts:
             for role in (self.receiver, self.sender):
-                silent.enter_context(testbed.shells[role].silence(self.limit))
+                silence_contexts.enter_context(testbed.shells[role].silence(self.limit))
             sending = jobs.begin(testbed.shells[self.sender], send.job)
             waited_s = time.monotonic() - started_s
             if scene.protocol is Protocol.UDP and waited_s >= self.idle:

@@ -79,10 +79,10 @@ def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float |
     """
     step_s = scenario.physics.step
     steps = round(window_s / step_s)
-    near = sorted(
+    counts = sorted(
         range(max(steps // 2, 1), min(2 * steps, steps + _MAX_STEPS) + 1), key=lambda count: abs(count - steps)
     )
-    return next((count * step_s for count in near if not commensurate_events(scenario, [count * step_s])), None)
+    return next((count * step_s for count in counts if not commensurate_events(scenario, [count * step_s])), None)
 
 
 def _few_phases(event: PeriodicEvent, window_s: float) -> int | None:

@@ -46,8 +46,10 @@ def cast_with(*setup: str) -> Cast:
 @pytest.fixture(scope="module")
 def shell() -> Iterator[Shell]:
     options, world = EmulatedOptions(), load_world("lawn")
-    with testbed.bring_up(cast_with(*SETUP), options=options, world=world, ros=RosChoice.BUILTIN, seed=1) as up:
-        yield up.shells[Role.SENDER]
+    with testbed.bring_up(
+        cast_with(*SETUP), options=options, world=world, ros=RosChoice.BUILTIN, seed=1
+    ) as emulation:
+        yield emulation.shells[Role.SENDER]
 
 
 def output_of(shell: Shell, *argv: str) -> str:

@@ -249,20 +249,20 @@ def test_received_powers_follow_changes_of_the_channel() -> None:
     wifi: Wifi[str] = Wifi(channel, 1)
     wifi.send(0, "a", "near", 100, None)
     assert len(wifi.deliveries(10**9)) == 1
-    near, channel.rows[0] = channel.rows[0], [0.0, 0.0]
+    row_in_range, channel.rows[0] = channel.rows[0], [0.0, 0.0]
     wifi.send(10**9, "a", "far", 100, None)
     assert wifi.deliveries(2 * 10**9) == []
-    channel.rows[0] = near
+    channel.rows[0] = row_in_range
     wifi.send(2 * 10**9, "a", "near again", 100, None)
     assert [payload for _, _, payload, _, _ in wifi.deliveries(3 * 10**9)] == ["near again"]
 
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32), st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=6))
-def test_no_station_starts_while_it_detects_a_frame(seed: int, deaf: set[tuple[int, int]]) -> None:
+def test_no_station_starts_while_it_detects_a_frame(seed: int, pairs_without_link: set[tuple[int, int]]) -> None:
     """Of two overlapping frames of stations that are not hidden from each other, the second starts within 4 us."""
     names = "abcde"
-    pairs = [(names[first], names[second]) for first, second in deaf if first != second]
+    pairs = [(names[first], names[second]) for first, second in pairs_without_link if first != second]
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
     hidden = {*pairs, *((second, first) for first, second in pairs)}
