@@ -82,14 +82,14 @@ def main() -> None:
     print(f"{arguments.rounds} rounds, median (lowest to highest), processor time of the medium in us per packet")
     print(f"{'':14}{'this version':>26}{'the other':>26}{'ratio':>24}")
     for name, (options, rate) in RADIOS.items():
-        here: list[float] = []
-        there: list[float] = []
+        here_us: list[float] = []
+        other_us: list[float] = []
         for number in range(arguments.rounds):
-            turns = [(worker.PROJECT, here), (arguments.other.resolve(), there)]
+            turns = [(worker.PROJECT, here_us), (arguments.other.resolve(), other_us)]
             for project, spent_us in turns if number % 2 == 0 else reversed(turns):
                 spent_us.append(processor_us(project, options, rate, arguments.seconds))
-        ratios = [this / other for this, other in zip(here, there, strict=True)]
-        print(f"{name:14}{_spread(here, 1):>26}{_spread(there, 1):>26}{_spread(ratios, 3):>24}")
+        ratios = [this / other for this, other in zip(here_us, other_us, strict=True)]
+        print(f"{name:14}{_spread(here_us, 1):>26}{_spread(other_us, 1):>26}{_spread(ratios, 3):>24}")
 
 
 def _spread(values: list[float], digits: int) -> str:

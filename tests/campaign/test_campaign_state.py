@@ -119,11 +119,11 @@ def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
         started_plan = journal.folder / f"trial of {third}"
         started_plan.mkdir()
         (started_plan / "trial.yaml").touch()
-    for seen in (journal, CampaignJournal(journal.folder)):
-        assert list(seen.ended()) == [str(first)]
-        assert seen.interrupted(second) is None, "it has no folder"
-        assert seen.interrupted(third) == started_plan
-        assert seen.placing_s(99.0) == 30.0
+    for opened in (journal, CampaignJournal(journal.folder)):
+        assert list(opened.ended()) == [str(first)]
+        assert opened.interrupted(second) is None, "it has no folder"
+        assert opened.interrupted(third) == started_plan
+        assert opened.placing_s(99.0) == 30.0
     assert CampaignJournal(journal.folder / "none").placing_s(99.0) == 99.0
 
 

@@ -37,7 +37,7 @@ def messages() -> Iterator[tuple[str, str, bool]]:
 
 
 def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
-    top, seen = parser(), 0
+    top, n_subcommands = parser(), 0
     for path, text, to_type in messages():
         for match in COMMAND.finditer(text):
             inner = top
@@ -45,10 +45,10 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
                 inner = inner.command(word) or inner
                 inner.complete()
             assert inner is not top or not to_type, f"{path}: {text}"
-            seen += inner is not top
+            n_subcommands += inner is not top
             options = [] if inner is top else re.findall(r" (--[a-z-]+)", match["rest"])
             assert all(inner.accepts(option, "x") for option in options), f"{path}: {text}"
-    assert seen > 30
+    assert n_subcommands > 30
 
 
 @pytest.mark.parametrize(

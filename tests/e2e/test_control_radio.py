@@ -68,15 +68,15 @@ def test_ssh_crosses_the_medium_like_the_packets_of_any_station(emulation: Emula
     master = Role.RELAY in emulation.robots
     last_hop = "duckiedrone-1" if master else "turtlebot-1"
 
-    seen: list[MediumStats] = []
+    samples: list[MediumStats] = []
 
     def at_rest() -> bool:  # no packet is in flight on a hop or to the laptop
-        seen.append(stats := emulation.medium.stats())
+        samples.append(stats := emulation.medium.stats())
         hop = stats.links[last_hop, "laptop"]
         return hop.sent == hop.delivered == stats.ports["laptop"].written
 
     wait_until(at_rest, Deadline.after(30))
-    stats = seen[-1]  # a later one may be taken while a packet is in flight
+    stats = samples[-1]  # a later one may be taken while a packet is in flight
     assert stats.ports["laptop"].written > FETCHED_BYTES / 1500
     assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].written)
     assert stats.links["turtlebot-1", emulation.robots[Role.RECEIVER].name].sent == 0

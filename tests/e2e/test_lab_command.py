@@ -23,7 +23,7 @@ from fieldkit.lab import folder, requests
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.ros.interfaces.types import shipped
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import fieldkit, run_here, start
 
@@ -279,12 +279,12 @@ def test_an_invalid_request_gets_no_response(lab: Path, request_: str) -> None:
 
 
 def test_a_silent_client_does_not_block_others_for_long(lab: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as silent:
-        silent.connect(str(folder.of_directory(lab).socket))
+    with socket.socket(socket.AF_UNIX) as unanswered:
+        unanswered.connect(str(folder.of_directory(lab).socket))
         assert "air-1" in run_here(lab, "lab", "ps").out
 
 
-def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
+def test_down_leaves_nothing(tmp_path: Path, untouched: NamespaceComparison) -> None:
     (tmp_path / "fieldkit.yaml").write_text("emulated: {ros: builtin}\nrobots: {}\nroles: {}\n", encoding="utf-8")
     started = fieldkit(tmp_path, "lab", "up", "--robots", "2", "--profile", "duckiedrone")
     assert started.code == 0, started.err
@@ -300,7 +300,9 @@ def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
     assert not folder.of_directory(tmp_path).path.exists()
 
 
-def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     process = process_of(tmp_path)

@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.config import locations
 from fieldkit.core.deadline import Deadline
-from tests.helpers.host import Untouched
+from tests.helpers.host import NamespaceComparison
 from tests.helpers.labs import built_in_ros, write_procedure
 from tests.helpers.runs import Run, only_trial, rows, run_here
 from tests.helpers.texts import procedure
@@ -104,7 +104,9 @@ def run_procedure(lab: Path, text: str) -> Run:
     return run_here(lab, "trial", write_procedure(lab, text), "5m")
 
 
-def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
     run = run_here(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "ping recovery after link-down, median" in run.out
@@ -142,9 +144,9 @@ def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_resu
     assert recovery["is_lower_bound"] == "true", "only how long it was watched is known"
     assert (recovery["n"], recovery["n_censored"]) == ("1", "1")
     watched = (only_trial(tmp_path) / "repeats" / "tcp-01" / "fault-kill-watch.txt").read_text(encoding="ascii")
-    looks = [line.split() for line in watched.splitlines()[1:]]
-    last_up_s = max(float(look[0]) for look in looks if len(look) > 1)
-    assert float(recovery["value"]) == pytest.approx(float(looks[-1][0]) - last_up_s, abs=1e-6)
+    polls = [line.split() for line in watched.splitlines()[1:]]
+    last_up_s = max(float(poll[0]) for poll in polls if len(poll) > 1)
+    assert float(recovery["value"]) == pytest.approx(float(polls[-1][0]) - last_up_s, abs=1e-6)
     assert recovery["low"] == recovery["high"] == ""
     assert cells["reboot_recovery_s"]["is_lower_bound"] == "false"
 

@@ -14,7 +14,7 @@ from sim_backends.gazebo.sdf import SdfRobot, world_sdf
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
 from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import gazebo_server, missing_libraries
-from tests.helpers.host import Untouched, descendants
+from tests.helpers.host import NamespaceComparison, descendants
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
 from tests.helpers.sshd import wait_until
 
@@ -49,7 +49,7 @@ def trial_row(folder: Path, emulated: str) -> dict[str, str]:
     return row
 
 
-def test_a_trial_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_trial_on_the_built_in_network(tmp_path: Path, untouched: NamespaceComparison) -> None:
     sync = "{name: sliding_window, window: 4ms}"
     row = trial_row(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
     assert 0.0005 < float(row["delay_policy_s"]) < 0.0045, "half a window on average"

@@ -368,10 +368,10 @@ def test_los_and_nlos_keep_their_style_among_other_procedures(tmp_path: Path, pr
     cells = aggregate(table(tmp_path, rows))
     identities = Identities(cells)
     by_procedure = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
-    looks = {(identity.style.colour, identity.style.marker): name for name, identity in by_procedure.items()}
-    assert len(looks) == len(names)
-    assert looks.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
-    assert looks.get(("red", "s")) == ("nlos" if "nlos" in names else None)
+    names_by_style = {(identity.style.colour, identity.style.marker): name for name, identity in by_procedure.items()}
+    assert len(names_by_style) == len(names)
+    assert names_by_style.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
+    assert names_by_style.get(("red", "s")) == ("nlos" if "nlos" in names else None)
     several = scenarios.count("los") > 1
     assert {name: identity.label for name, identity in by_procedure.items()} == {
         name: name.upper() if name in {"los", "nlos"} else f"LOS, {name}" if several else "LOS" for name in names

@@ -111,15 +111,15 @@ def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> 
 @given(
     seed=st.integers(0, 2**32),
     sizes=st.lists(st.integers(1, 25_000), min_size=2, max_size=3),
-    apart=st.integers(-8, 8),
+    id_offset=st.integers(-8, 8),
     is_reverse=st.booleans(),
 )
 def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
-    loss: float, seed: int, sizes: list[int], interval: int, is_reverse: bool
+    loss: float, seed: int, sizes: list[int], id_offset: int, is_reverse: bool
 ) -> None:
     """Each socket counts IP ids from a random start (Linux, ip_select_ident_segs), so ids may be equal."""
     flows = [
-        Flow(f"flow{number}", 1234 + number, size, 100 + number * interval, is_reverse=is_reverse and number == 1)
+        Flow(f"flow{number}", 1234 + number, size, 100 + number * id_offset, is_reverse=is_reverse and number == 1)
         for number, size in enumerate(sizes)
     ]
     with tempfile.TemporaryDirectory() as place:

@@ -33,9 +33,9 @@ def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) ->
         sent_ns,
         np.array(at_ns, dtype=np.int64),
     )
-    begun: dict[str, int | None] = {"begun_ns": START - SECOND, "matched_ns": START - SECOND // 2}
+    times: dict[str, int | None] = {"begun_ns": START - SECOND, "matched_ns": START - SECOND // 2}
     counts = {"refused": 0, "skipped": 0, "foreign": 0}
-    return TopicLog(samples, is_complete=True, **{**begun, **counts, **changes})  # type: ignore[arg-type]
+    return TopicLog(samples, is_complete=True, **{**times, **counts, **changes})  # type: ignore[arg-type]
 
 
 def published(count: int) -> TopicLog:
@@ -182,13 +182,13 @@ def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int)
 
 def test_traffic_is_identified_by_its_ports() -> None:
     both = [datagram(1, 100, port=DATA), datagram(2, 100, port=DATA, sport=DISCOVERY), datagram(3, 3000, port=DATA)]
-    looks = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
+    discovery = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
     others = [datagram(6, 60), [ipv4(bytes(8), protocol=1, ip_id=7)], [ipv4(b"", protocol=1, size=99, offset=1480)]]
-    frames = [Frame(START, packet) for group in (*both, *looks, *others) for packet in group]
+    frames = [Frame(START, packet) for group in (*both, *discovery, *others) for packet in group]
     result = measured(published(2), arrived([0, 1]), packets(frames), packets(frames))
     # 3,008 bytes over UDP are three fragments.
     assert (result["topic_data_packets"], result["topic_discovery_packets"]) == (5, 2)
-    sizes = sum(len(packet) for group in looks for packet in group)
+    sizes = sum(len(packet) for group in discovery for packet in group)
     assert result["topic_discovery_bytes"] == sizes
 
 

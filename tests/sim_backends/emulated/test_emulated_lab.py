@@ -37,7 +37,7 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
@@ -122,7 +122,7 @@ def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
         assert b"Read-only file system" in result.stderr
 
 
-def test_a_lab_leaves_no_trace_on_the_host(untouched: Untouched) -> None:
+def test_a_lab_leaves_no_trace_on_the_host(untouched: NamespaceComparison) -> None:
     with testbed.bring_up(
         master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ):
@@ -253,7 +253,7 @@ def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
     return process, json.loads(process.stdout.readline())
 
 
-def test_sigkill_of_the_owner_leaves_no_processes(untouched: Untouched) -> None:
+def test_sigkill_of_the_owner_leaves_no_processes(untouched: NamespaceComparison) -> None:
     process, pids = owner(ROOT)
     lab_pids = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
     namespaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))

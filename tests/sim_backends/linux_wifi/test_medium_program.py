@@ -47,7 +47,7 @@ class PairedKernel:
         return list(decode_messages(datagram))
 
 
-class Owner:
+class MediumOwner:
     """The owner of a medium: sends requests, and messages as the kernel does."""
 
     def __init__(self, kernel: socket.socket, requests: int, replies: int) -> None:
@@ -70,16 +70,18 @@ class Owner:
 
 
 @contextmanager
-def running() -> Iterator[Owner]:
+def running() -> Iterator[MediumOwner]:
     """Run a medium in a thread; it must exit when its requests end."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.settimeout(DEADLINE_S)
-    theirs.setblocking(False)
+    socket_here, program_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    socket_here.settimeout(DEADLINE_S)
+    program_socket.setblocking(False)
     request_read, request_write = os.pipe()
     reply_read, reply_write = os.pipe()
-    thread = threading.Thread(target=serve, args=(PairedKernel(theirs), RequestLines(request_read), reply_write))
+    thread = threading.Thread(
+        target=serve, args=(PairedKernel(program_socket), RequestLines(request_read), reply_write)
+    )
     thread.start()
-    owner = Owner(ours, request_write, reply_read)
+    owner = MediumOwner(socket_here, request_write, reply_read)
     try:
         yield owner
     finally:
@@ -89,8 +91,8 @@ def running() -> Iterator[Owner]:
         owner.close()
         for fd in (request_read, reply_read, reply_write):
             os.close(fd)
-        ours.close()
-        theirs.close()
+        socket_here.close()
+        program_socket.close()
 
 
 def test_a_frame_passes_through_the_program() -> None:

@@ -294,11 +294,11 @@ def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) ->
 
 
 def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
-    class Unlinked(FixedPowers):
+    class UnlinkedPowers(FixedPowers):
         def linked(self, transmitter: int, receiver: int) -> bool:
             return False
 
-    wifi: Wifi[int] = Wifi(Unlinked("ab", G54), 1)
+    wifi: Wifi[int] = Wifi(UnlinkedPowers("ab", G54), 1)
     wifi.send(0, "a", 1, 100, "b")
     assert wifi.next_event_ns() is None
     assert wifi.counters()["a", "b"].lost == 1

@@ -389,6 +389,6 @@ def test_distinguishable_transfers_are_accepted(steps: str) -> None:
 
 
 def test_transfer_cannot_send_a_simultaneous_recording() -> None:
-    beside = "  - together: {during: [record: {robot: relay, topics: [/a], duration: 1s, name: a}, STEP]}"
+    recording = "  - together: {during: [record: {robot: relay, topics: [/a], duration: 1s, name: a}, STEP]}"
     with pytest.raises(ConfigurationError, match="no step before it records on relay"):
-        load(beside.replace("STEP", "transfer: {from: relay, to: sender}"))
+        load(recording.replace("STEP", "transfer: {from: relay, to: sender}"))

@@ -48,17 +48,17 @@ def fly(emulation: EmulatedTestbed, program: str) -> dict[str, Any]:
     assert emulation.medium.stats().ports[drone.name].read - carried > 100
     log = emulation.shells[Role.RELAY].run(("cat", "/run/robot/autopilot.log"), deadline=Deadline.after(10))
     assert log.stdout == b""
-    seen: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])
-    assert max(seen["nearest_m"]) < 0.5
-    return seen
+    report: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])
+    assert max(report["nearest_m"]) < 0.5
+    return report
 
 
 def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagram_is_lost(
     emulation: EmulatedTestbed,
 ) -> None:
-    seen = fly(emulation, "mavsdk_flight")
-    assert seen["items"] == 3
-    assert 90 <= seen["battery"] < 100.1
+    report = fly(emulation, "mavsdk_flight")
+    assert report["items"] == 3
+    assert 90 <= report["battery"] < 100.1
     # The lab recorded the same flight, down to the ground below its last corner.
 
     flown_m = [
@@ -71,7 +71,7 @@ def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagra
 
 
 def test_mavproxy_flies_a_mission_although_every_twentieth_datagram_is_lost(emulation: EmulatedTestbed) -> None:
-    seen = fly(emulation, "mavproxy_flight")
-    assert seen["height_m"] < 0.2
+    report = fly(emulation, "mavproxy_flight")
+    assert report["height_m"] < 0.2
     for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
-        assert words in seen["output"]
+        assert words in report["output"]
