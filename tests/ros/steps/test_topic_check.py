@@ -22,8 +22,8 @@ from tests.trial.check.test_check_judges import (
     RELAY,
     SENDER,
     WARN,
-    judge_all,
     installed,
+    judge_all,
     only,
     procedure_of,
 )
