@@ -1,4 +1,4 @@
-"""Processor time of the medium per packet, in turns with another version: `python -m benchmarks.medium_cost FOLDER`.
+"""Processor time of the medium per packet, compared with another version: `python -m benchmarks.medium_cost FOLDER`.
 
 FOLDER is a checkout of the other version, for example by `git worktree add`; the program needs root. Only the process
 of the medium is of that version: the senders are the same. Each round sends datagrams of 64 bytes at a fixed rate

@@ -152,7 +152,7 @@ class UsesSpace(Capability):
     """A step that leaves more than small text files on robots."""
 
     @abstractmethod
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         """Return the approximate size of its files on the robot in `role`, in bytes, without small text files."""
 
 

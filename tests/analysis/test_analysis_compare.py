@@ -181,7 +181,7 @@ def test_a_possible_difference_is_only_a_note(changes: dict[str, Any], message: 
 
 def test_attempts_in_both_runs_are_reported() -> None:
     (concern,) = compare(parsed(UDP), parsed(UDP[:7])).concerns
-    assert str(concern) == "attempts that the other run has too: A has 7, B has 7"
+    assert str(concern) == "attempts that are in both runs: A has 7, B has 7"
     assert not concern.refuses
 
 

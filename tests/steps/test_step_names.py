@@ -171,7 +171,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
         (
             "transfer: {name: bare",
             "transfer: {name: up",
-            "a transfer named up is defined twice; give one another name",
+            "a transfer named up is defined twice; rename one",
         ),
         ("name: imu}", "name: scan}", "a recording on sender is defined twice; give each a name:"),
         ("file: imu", "file: odom", "sends odom, but no recording of that name is made on sender before it"),

@@ -223,7 +223,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         return self.topics if role is self.robot else ()
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return sum(file.size_bytes for file in self.recorded(scene.cast) if file.role is role)
 
     @override

@@ -283,7 +283,7 @@ class TransferStep(
         yield Flow(self.sender, self.receiver, self.port, frame_count)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return self._size_bytes(scene) if role == self.receiver else 0.0
 
     def _size_bytes(self, scene: Scene) -> float:

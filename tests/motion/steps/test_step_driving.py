@@ -47,11 +47,11 @@ STEP = move("robot: receiver, path: [{away: 2m}, {right: 1m, towards: 1m}], spee
 
 def test_size_of_log_grows_with_drive_and_is_on_driving_robot_only() -> None:
     short, long = (move(f"robot: receiver, path: [{{away: {far}m}}], speed: 0.1m/s") for far in (10, 60))
-    assert [role for role in DRIVES if long.bytes_left(SCENE, role)] == [Role.RECEIVER]
+    assert [role for role in DRIVES if long.stored_bytes(SCENE, role)] == [Role.RECEIVER]
     # Each direction takes 500 s more, and the log has ten lines per second, each of 200 to 250 bytes.
-    grown_bytes = long.bytes_left(SCENE, Role.RECEIVER) - short.bytes_left(SCENE, Role.RECEIVER)
+    grown_bytes = long.stored_bytes(SCENE, Role.RECEIVER) - short.stored_bytes(SCENE, Role.RECEIVER)
     assert 200 * 10_000 < grown_bytes < 250 * 10_000
-    assert not long.bytes_left(replace(SCENE, cast=CAST), Role.RECEIVER), "a robot moved by a person has no log"
+    assert not long.stored_bytes(replace(SCENE, cast=CAST), Role.RECEIVER), "a robot moved by a person has no log"
 
 
 def test_argument_of_driver_has_legs_limits_and_topics() -> None:

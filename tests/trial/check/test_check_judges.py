@@ -382,7 +382,7 @@ def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
 @pytest.mark.parametrize(
     ("connection", "control", "status", "detail"),
     [
-        ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file says"),
+        ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file states"),
         ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it arrives at 192.168.1.5"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it arrives at 192.168.1.5"),
