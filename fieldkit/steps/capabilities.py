@@ -236,7 +236,7 @@ class Summarizes(Capability):
 
     @abstractmethod
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """Yield the most important figures for the line of a repeat: `IP loss 3.2 %`.
+        """Yield the most important figures for the line of a repeat: `IP packet loss 3.2 %`.
 
         Parts with the word `loss` come first in that line.
         """

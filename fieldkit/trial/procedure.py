@@ -213,7 +213,7 @@ class Procedure(catalog.Named, Sectioned):
             protocol: The transport protocol under test.
             cast: The robot in each role.
             folder: The attempt's folder on every robot.
-            variants: The tools of each robot, as found by preflight.
+            variants: The tools of each robot, as determined by the preflight checks.
         """
         recorded: dict[Role, tuple[RecordedFile, ...]] = {}
         for step in self._steps():

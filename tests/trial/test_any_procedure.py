@@ -226,7 +226,7 @@ def judge(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
     request = TrialRequest(procedure=procedure, distance=parse_distance("30ft"))
     plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, tzinfo=UTC))
     if plan.refusals({}):
-        OUTCOMES["refused by preflight"] += 1
+        OUTCOMES["refused by a preflight check"] += 1
         return
     with tempfile.TemporaryDirectory() as folder:
         repeat = RepeatId(protocol, 1)

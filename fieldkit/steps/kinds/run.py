@@ -260,7 +260,7 @@ class RunStep(Step, UsesSpace, Summarizes):
             output_limit_bytes=program_output.MAX_OUTPUT_BYTES,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
-        # Preflight searches for the program; a copied program does not exist on the robot yet.
+        # The preflight checks search for the program; a copied program does not exist on the robot yet.
         program = "sh" if self.words[0] == f"{{{arguments.PUT}}}" else argv[0]
         yield Planned(self.robot, job, program=program, remedy=remedy, put=put)
 

@@ -371,7 +371,7 @@ class TransferStep(
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
+        for name, layer in (("ip_loss", "IP packet"), ("datagram_loss", "datagram"), ("file_loss", "file")):
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
         if values.get("ip_packets_doubtful"):

@@ -221,7 +221,7 @@ def test_without_queues_the_skew_is_exact_and_the_error_is_half_a_round_trip() -
     world = World(-12.5, 40e-6)
     random = np.random.default_rng(4)
     sent_s = np.sort(random.uniform(0, 200, 3000))
-    # Every tenth packet has no queueing delay.
+    # Every tenth packet has no queuing delay.
     queue_s = np.where(random.random(3000) < 0.1, 0, random.exponential(0.05, 3000))
     clocks = estimate(world.forward(sent_s, 0.004 + queue_s), world.reverse(sent_s, 0.006 + queue_s[::-1]))
     assert clocks is not None

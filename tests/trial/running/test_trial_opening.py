@@ -38,7 +38,7 @@ class UnusedOperator:
 
 
 class Recorder:
-    """A backend that records the use of its testbed; it also replaces preflight, locks and runner.
+    """A backend that records the use of its testbed; it also replaces preflight checks, locks and runner.
 
     Args:
         failing: What raises, by name.
