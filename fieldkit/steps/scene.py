@@ -218,7 +218,7 @@ class Need:
 
 
 @dataclass(frozen=True)
-class Pinging:
+class PingSource:
     """Round-trip times that a step measures.
 
     Attributes:

@@ -188,7 +188,7 @@ class SimulatedTrial:
                 for role, content in simulated.captures.items():
                     (folder / str(capture_around(placed.within, role))).write_bytes(content)
             if isinstance(placed.step, PingStep):
-                (folder / placed.step.pinging().file).write_text(simulated.ping, encoding="ascii")
+                (folder / placed.step.ping_source().file).write_text(simulated.ping, encoding="ascii")
 
 
 def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]) -> str:

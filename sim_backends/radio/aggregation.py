@@ -86,7 +86,7 @@ class BlockAckSession(Generic[Payload]):
         self._skipped: set[int] = set()
 
     def build_aggregate(self, queue: deque[Frame[Payload]], mode: WifiMode) -> Aggregate[Payload]:
-        """Return the aggregate of the first frame of a queue and of later ones to its receiver, as many as fit."""
+        """Return the aggregate of a queue's first frame and later frames to its receiver, up to the size limits."""
         limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, _MAX_PPDU_NS))
         frames: list[Frame[Payload]] = []
         first, size_bytes, last_sequence = queue[0], 0, 0

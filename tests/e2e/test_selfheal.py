@@ -119,7 +119,7 @@ def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
     assert 2.0 <= float(row["reboot_outage_s"]) < LONG_S, "the boot time, and what its network takes"
     assert row["reboot_recovery_s"] == row["reboot_outage_s"]
     assert row["kill_recovered"] == row["kill_outage_s"] == "", "there was none"
-    assert 0.2 < float(row["rtt_loss"]) < 0.8, "the steps inside met the fault: 2 s of 6 s"
+    assert 0.2 < float(row["rtt_loss"]) < 0.8, "the fault lasts 2 s of the 6 s of pings"
     assert summary(trial)["reboot_recovered"]["value"] == "1"
     evidence = {path.name for path in (trial / "repeats" / "tcp-01").iterdir()}
     assert evidence >= {f"fault-{kind}{end}" for kind in ("link-down", "reboot") for end in (".txt", "-ping.txt")}
@@ -141,7 +141,7 @@ def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_resu
     cells = summary(only_trial(tmp_path))
     assert cells["kill_recovered"]["value"] == "0"
     recovery = cells["kill_recovery_s"]
-    assert recovery["is_lower_bound"] == "true", "only how long it was watched is known"
+    assert recovery["is_lower_bound"] == "true", "the robot did not recover while it was watched"
     assert (recovery["n"], recovery["n_censored"]) == ("1", "1")
     watched = (only_trial(tmp_path) / "repeats" / "tcp-01" / "fault-kill-watch.txt").read_text(encoding="ascii")
     polls = [line.split() for line in watched.splitlines()[1:]]
@@ -157,7 +157,7 @@ def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) ->
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
     assert row["status"] == "valid", row["reason"]
-    assert run.code == 1, "no stall above 300 ms was demanded"
+    assert run.code == 1, "the procedure demands stalls of at most 300 ms"
     assert row["out_of_range_recovered"] == "true"
     assert float(row["out_of_range_outage_s"]) >= CUT_S - 0.2
     noted = (trial / "repeats" / "tcp-01" / "fault-out-of-range-times.txt").read_text(encoding="ascii")

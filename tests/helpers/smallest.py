@@ -254,7 +254,7 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
     """Reduce `mesh_losses` to the loss of one of four robots."""
     del folder
     places = {"sender": (0, 0), "first": (60, -35), "left": (60, 35), "receiver": (120, 0)}
-    detour = module.Detour("two hops beside two", places, ("first", "left"), fading=False)
+    detour = module.Detour("paths of two and two hops", places, ("first", "left"), fading=False)
     replace(module, "DETOURS", (detour,))
     replace(module, "SETTLE_S", 2.0)
 

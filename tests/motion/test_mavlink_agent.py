@@ -364,7 +364,7 @@ def until_there(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("connection", "complaint"),
+    ("connection", "message"),
     [
         ("tcp:127.0.0.1:1", "Connection refused"),
         ("/dev/null:115200", "Inappropriate ioctl"),
@@ -374,14 +374,14 @@ def until_there(path: Path) -> None:
     ],
 )
 def test_connection_that_cannot_be_opened_is_reported(
-    connection: str, complaint: str, program: Path, tmp_path: Path
+    connection: str, message: str, program: Path, tmp_path: Path
 ) -> None:
     arguments = json.dumps({"connection": connection, "intervals_us": {}})
     argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
     done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 3
     assert f"error: MAVLink over {connection}: " in done.stderr
-    assert complaint in done.stderr
+    assert message in done.stderr
 
 
 @pytest.mark.parametrize("serial", [False, True], ids=["udp", "serial"])

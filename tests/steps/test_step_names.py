@@ -101,7 +101,7 @@ def test_plan_lists_transfers_pings_and_captures() -> None:
         ("up", "imu.bag", "up.recv.bag", ("sender.pcap", "receiver.pcap")),
         ("bare", "scan.bag", "bare.recv.bag", (None, None)),
     ]
-    pings = [(ping.name, ping.role, ping.file) for ping in planned_evidence.pingings(plan)]
+    pings = [(ping.name, ping.role, ping.file) for ping in planned_evidence.ping_sources(plan)]
     assert pings == [("up", Role.SENDER, "up.ping.txt"), ("", Role.RECEIVER, "ping.txt")]
     assert planned_evidence.captures(plan) == {
         "sender.pcap": Role.SENDER,

@@ -26,7 +26,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
 from fieldkit.steps.capabilities import HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
-from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, Refusal, Scene, fragments
+from fieldkit.steps.scene import Announce, Flow, Need, PingSource, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 from fieldkit.steps.view import View
 
@@ -168,8 +168,8 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         yield Flow(self.sender, self.receiver, frames=frame_count)
 
     @override
-    def pinging(self) -> Pinging:
-        return Pinging(self.sender, self._file, self.prefix)
+    def ping_source(self) -> PingSource:
+        return PingSource(self.sender, self._file, self.prefix)
 
     @override
     def check(self, view: View) -> Iterator[str]:

@@ -12,9 +12,9 @@ A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (
   acknowledges all data before this number. At most 64 are unacknowledged.
 - A side that waits sends an acknowledgement (4) of new data before it waits, and another every 2 s. Unacknowledged
   data are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
-- A side that ends sends close (5) once, when all its data are acknowledged or after 0.5 s. It ends the connection, if
-  `number` is the expected one. If the datagram is lost, an ICMP message that the
-  port is unreachable, or 3,600 s of silence, ends the connection.
+- A side that ends sends one close datagram (5), when all its data are acknowledged or after 0.5 s. The receiver ends
+  the connection if `number` is the expected one. If the datagram is lost, the connection ends with an ICMP message
+  that the port is unreachable, or after 3,600 s of silence.
 """
 
 import select

@@ -27,7 +27,7 @@ PLACE = {"do": "place", "positions": {"r1": [0, 0, 1], "r2": [3, 0, 1]}, "veloci
 
 
 class PairedKernel:
-    """The program's end of a socket pair, on which a test plays the kernel."""
+    """The program's end of a socket pair; a test writes to the other end as the kernel does."""
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
@@ -161,7 +161,7 @@ def read_all(lines: RequestLines) -> list[bytes]:
 
 
 @pytest.mark.skipif(Path("/sys/module/mac80211_hwsim").exists(), reason="this kernel has loaded hwsim")
-def test_without_hwsim_the_program_says_how_to_load_it() -> None:
+def test_without_hwsim_the_error_names_the_command_that_loads_it() -> None:
     argv = (sys.executable, "-m", "sim_backends.linux_wifi.medium_program")
     result = subprocess.run(argv, input="", capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert result.returncode == 2

@@ -193,14 +193,12 @@ def test_below_4_db_the_preamble_is_not_detected() -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(0, 20_000_000), st.integers(40, 1500)), max_size=40))
-def test_equal_seeds_give_equal_results_in_order_of_time(
-    seed: int, sending_probability: list[tuple[int, int]]
-) -> None:
+def test_equal_seeds_give_equal_results_in_order_of_time(seed: int, sent_frames: list[tuple[int, int]]) -> None:
     def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[("a", "b")]), seed)
         wifi.log_attempts(log.append)
-        for number, (at_ns, size) in enumerate(sorted(sending_probability)):
+        for number, (at_ns, size) in enumerate(sorted(sent_frames)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
         return wifi.deliveries(60 * 10**9), log
 
