@@ -14,8 +14,9 @@ from fieldkit.campaign.order import walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.campaign.runner import PLACING_S, CampaignRun
 from fieldkit.config.site import load_site
+from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.events import CampaignEnded, CampaignPlanned, Event
+from fieldkit.core.events import Event
 from fieldkit.core.prompts import Unattended
 from fieldkit.trial.running.stop import Stop
 from tests.helpers.paths import ROOT

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from fieldkit.cli import hints, main, parser
-from fieldkit.cli.display import event_words, show_error, show_findings, showing_events
+from fieldkit.cli.display import show_error, show_findings, showing_events
+from fieldkit.cli.event_words import event_words
 from fieldkit.core.errors import shell_command
 from fieldkit.core.events import Finding, TrialStopped
 from fieldkit.core.model import Verdict
