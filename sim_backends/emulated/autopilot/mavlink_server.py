@@ -121,12 +121,12 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
         obstacles=Ground(world, None).around,
         now_ns=power_on_ns,
         boot_s=drone.boot_s,
-        make_airframe=None if drone.physics is None else _simulated(drone.profile, drone.physics, reporter),
+        make_airframe=None if drone.physics is None else simulated_airframe(drone.profile, drone.physics, reporter),
     )
     return autopilot, DroneMotionReporter(autopilot, reporter, drone.antenna_m)
 
 
-def _simulated(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
+def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
     """Return the function that puts the drone of a physics at a place."""
     from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (as above)
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
