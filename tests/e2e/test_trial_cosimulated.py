@@ -1,4 +1,4 @@
-"""Trials and labs on the co-simulation: their numbers, real `cmd_vel` at a wall, and nothing that remains."""
+"""Campaigns, trials and labs on the co-simulation: their numbers, real `cmd_vel` at a wall, and nothing that remains."""
 
 import json
 import os
@@ -30,6 +30,16 @@ roles:
   masterless: {sender: robot-1, receiver: robot-2}
 emulated: EMULATED
 """
+CAMPAIGN = """\
+name: short
+procedures: [los]
+distances: [30ft]
+topologies: [masterless]
+protocols: [udp]
+repeats: 1
+record: 1s
+seed: 7
+"""
 TWIST = "'{linear: {x: 0.2}}'"
 DRIVE = f"timeout 60 rostopic pub -r 10 /cmd_vel geometry_msgs/Twist {TWIST}"
 
@@ -49,15 +59,20 @@ def trial_row(folder: Path, emulated: str) -> dict[str, str]:
     return row
 
 
-def test_a_trial_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_campaign_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -> None:
     sync = "{name: sliding_window, window: 4ms}"
-    row = trial_row(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
+    make_site(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
+    (tmp_path / "short.yaml").write_text(CAMPAIGN, encoding="utf-8")
+    run = run_here(tmp_path, "campaign", "short.yaml")
+    assert run.code == 0, run.err
+    (trial,) = (path.parent for path in (tmp_path / "trials").rglob("trial.yaml"))
+    (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     assert 0.0005 < float(row["delay_policy_s"]) < 0.0045, "half a window on average"
     assert float(row["delay_transmission_s"]) > 0
     assert float(row["cosim_late_max_s"]) < 0.1
     simulators = "physics kinematic, network builtin, sync sliding_window, window 0.004 s, step 0.001 s"
     assert row["backend"] == f"emulated ({simulators})"
-    plan = (only_trial(tmp_path) / "trial.yaml").read_text(encoding="utf-8")
+    plan = (trial / "trial.yaml").read_text(encoding="utf-8")
     assert "simulators:\n  physics: kinematic\n  network: builtin\n  sync: sliding_window, window 0.004 s\n" in plan
 
 
