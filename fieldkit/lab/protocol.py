@@ -80,6 +80,25 @@ class Overview:
     links: Sequence[LabLink]
 
 
+@dataclass(frozen=True)
+class LabLateness:
+    """Lateness of the co-simulation of a lab since the lab was up.
+
+    Attributes:
+        bound_s: Maximum lateness; if a packet or a window was later, results that were measured then are not valid.
+        packet_max_s: Maximum lateness of a packet; None if no packet arrived.
+        window_max_s: Maximum time by which the results of a window were later than its end; None if no window ended.
+        windows: Number of windows that ended.
+        late: Number of packets and windows that were later than the bound.
+    """
+
+    bound_s: float
+    packet_max_s: float | None
+    window_max_s: float | None
+    windows: int
+    late: int
+
+
 class Lab(Protocol):
     """The running robots of a lab."""
 
@@ -124,6 +143,14 @@ class Lab(Protocol):
 
     def overview(self) -> Overview:
         """Return the plan view with the current positions of the robots."""
+        ...
+
+    def lateness(self) -> LabLateness | None:
+        """Return the lateness of the co-simulation since the lab was up, or None without a co-simulation.
+
+        Raises:
+            LinkError: The radio does not answer.
+        """
         ...
 
 

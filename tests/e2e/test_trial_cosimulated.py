@@ -1,11 +1,15 @@
-"""Campaigns, trials and labs on the co-simulation: their numbers, real `cmd_vel` at a wall, and nothing that remains."""
+"""Campaigns, trials and labs on the co-simulation: their numbers, and real ROS at a wall; nothing remains."""
 
 import json
 import os
+import re
 import signal
+from base64 import b64decode
 from pathlib import Path
 
+import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.emulated_options import EmulatedOptions
@@ -91,29 +95,42 @@ def test_a_trial_on_ns3(tmp_path: Path) -> None:
 
 def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
     """The wall of the lawn begins at 3.9 m east, and the robot has a radius of 0.113 m."""
-    make_site(tmp_path, "{physics: kinematic, ros: debian}")
+    make_site(tmp_path, "{physics: kinematic, ros: debian, late_bound: 1us}")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     try:
-        assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "3.5m", "18m").code == 0
-        result = fieldkit(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
+        assert run_here(tmp_path, "lab", "move", "robot-1", "--to", "3.5m", "18m").code == 0
+        result = run_here(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
         assert "robot-2 would be within wall" in result.err
         assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
 
         def east_m() -> float:
-            listed = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)
+            listed = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
             return float(listed["robots"][0]["place_m"][0])
 
         wait_until(lambda: east_m() > 3.78, Deadline.after(90))
         assert east_m() == pytest.approx(3.787, abs=0.002)
-        lab_pid = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)["pid"]
+        record = "timeout -s INT 60 rosbag record -q -l 5 -O wall.bag /odom /scan >/dev/null 2>&1; base64 wall.bag"
+        (tmp_path / "wall.bag").write_bytes(b64decode(fieldkit(tmp_path, "lab", "shell", "robot-1", record).out))
+        with AnyReader([tmp_path / "wall.bag"]) as bag:
+            last = {each.topic: bag.deserialize(data, each.msgtype) for each, _, data in bag.messages()}
+        assert last["/odom"].pose.pose.position.x == pytest.approx(0.287, abs=0.003), "it began at 3.5 m"
+        assert last["/odom"].twist.twist.linear.x == 0.0
+        beams_rad = np.radians(np.arange(50, 70))
+        wall_m = np.median(last["/scan"].ranges[50:70] * np.cos(beams_rad))
+        assert wall_m == pytest.approx(3.9 - 3.787, abs=0.01)
+        listed = run_here(tmp_path, "lab", "ps")
+        late = re.search(r"late: .*windows at most [\d.]+ ms; \d{3,} windows", listed.out)
+        assert late is not None, listed.out
+        assert "windows later than 0.001 ms, so a trial would be void" in listed.err
+        lab_pid = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)["pid"]
         (cosim_pid,) = (pid for pid in descendants(lab_pid) if COSIM in Path(f"/proc/{pid}/cmdline").read_bytes())
         os.kill(cosim_pid, signal.SIGKILL)
-        wait_until(lambda: fieldkit(tmp_path, "lab", "ps").code != 0, Deadline.after(60))
-        failed = fieldkit(tmp_path, "lab", "ps")
+        wait_until(lambda: run_here(tmp_path, "lab", "ps").code != 0, Deadline.after(60))
+        failed = run_here(tmp_path, "lab", "ps")
         assert "does not answer: it was killed by SIGKILL" in failed.err
         assert "fieldkit lab down" in failed.err
     finally:
-        assert fieldkit(tmp_path, "lab", "down").code == 0
+        assert run_here(tmp_path, "lab", "down").code == 0
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from fieldkit.lab import folder
 from fieldkit.lab.folder import LabFolder
 
 if TYPE_CHECKING:
-    from fieldkit.lab.protocol import Lab, LabBackend, Overview
+    from fieldkit.lab.protocol import Lab, LabBackend, LabLateness, Overview
 
 
 def add(parser: Parser) -> None:
@@ -48,7 +48,8 @@ def add(parser: Parser) -> None:
         help="list the robots with positions and programs",
         description="List the robots: profile, roles, address on the radio, position, programs. --json prints one "
         "object: pid and up_s of the lab, and robots, each with name, profile, roles, address, place_m (metres east, "
-        "north, up) and programs, which is empty for a robot that has stopped.",
+        "north, up) and programs, which is empty for a robot that has stopped; and lateness of a co-simulation "
+        "(docs: lab-cosim).",
     )
     listing.add_argument("--json", action="store_true", help="print them as JSON")
     listing.set_defaults(run=list_robots)
@@ -162,7 +163,22 @@ def list_robots(arguments: argparse.Namespace) -> int:
     ]
     table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
     print_text(f"up for {format_duration(state.up_s)}, pid {state.pid}")
+    if state.lateness is not None:
+        _show_lateness(state.lateness)
     return 0
+
+
+def _show_lateness(lateness: "LabLateness") -> None:
+    """Print the lateness of a co-simulation, and a note if it was above its bound."""
+    parts = (("packets", lateness.packet_max_s), ("windows", lateness.window_max_s))
+    texts = [f"{name} at most {late_s * 1e3:.3g} ms" for name, late_s in parts if late_s is not None]
+    print_text(f"late: {', '.join(texts) or 'nothing'}; {format_count(lateness.windows, 'window')}")
+    if lateness.late:
+        show_note(
+            f"the co-simulation could not keep up: {format_count(lateness.late, 'packet or window')} later than "
+            f"{lateness.bound_s * 1e3:g} ms, so a trial would be void; reduce the load of this machine, or set a "
+            "longer window in emulated.sync"
+        )
 
 
 def move(arguments: argparse.Namespace) -> int:
