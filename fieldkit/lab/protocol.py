@@ -182,6 +182,22 @@ def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
     )
 
 
+@runtime_checkable
+class GazeboWorlds(Protocol):
+    """A backend whose robots a Gazebo of the user can move."""
+
+    def gazebo_world(self, version: str) -> str:
+        """Return the world of the robots as SDF.
+
+        Args:
+            version: Names of the plugins, `fortress`, or `garden` for it and later versions.
+
+        Raises:
+            ConfigurationError: A profile is missing or invalid.
+        """
+        ...
+
+
 def as_lab_backend(name: str, backend: Backend) -> LabBackend:
     """Return a backend as a `LabBackend`.
 

@@ -6,6 +6,7 @@ import re
 import signal
 from base64 import b64decode
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +15,6 @@ from rosbags.highlevel import AnyReader
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.simulator_choice import resolve
-from sim_backends.gazebo.sdf import SdfRobot, world_sdf
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
-from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import gazebo_server, missing_libraries
 from tests.helpers.host import Untouched, descendants
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
@@ -112,7 +110,9 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
         record = "timeout -s INT 60 rosbag record -q -l 5 -O wall.bag /odom /scan >/dev/null 2>&1; base64 wall.bag"
         (tmp_path / "wall.bag").write_bytes(b64decode(fieldkit(tmp_path, "lab", "shell", "robot-1", record).out))
         with AnyReader([tmp_path / "wall.bag"]) as bag:
-            last = {each.topic: bag.deserialize(data, each.msgtype) for each, _, data in bag.messages()}
+            last: dict[str, Any] = {
+                each.topic: bag.deserialize(data, each.msgtype) for each, _, data in bag.messages()
+            }
         assert last["/odom"].pose.pose.position.x == pytest.approx(0.287, abs=0.003), "it began at 3.5 m"
         assert last["/odom"].twist.twist.linear.x == 0.0
         beams_rad = np.radians(np.arange(50, 70))
@@ -152,11 +152,11 @@ def test_a_combination_that_cannot_work_is_refused(emulated: str, reason: str, t
 
 @pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())
 def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The world is that of the lab, with robots at other places."""
-    robots = {f"robot-{number}": SdfRobot(TURTLEBOT3_BURGER, (number, 2.0, 0.0), 0.0) for number in (1, 2)}
     make_site(tmp_path, "{physics: gazebo, ros: debian, world: lawn}")
     (tmp_path / "gazebo").mkdir()
-    with gazebo_server(tmp_path / "gazebo", world_sdf(load_world("lawn"), robots)) as server:
+    sdf = run_here(tmp_path, "lab", "sdf")
+    assert sdf.code == 0, sdf.err
+    with gazebo_server(tmp_path / "gazebo", sdf.out) as server:
         monkeypatch.setenv("IGN_PARTITION", server.options["partition"])
         monkeypatch.setenv("IGN_IP", server.options["ip"])
         up = fieldkit(tmp_path, "lab", "up")

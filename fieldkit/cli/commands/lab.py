@@ -63,6 +63,7 @@ def add(parser: Parser) -> None:
     action.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="command for its shell")
     action.set_defaults(run=shell)
     _add_move(actions)
+    _add_sdf(actions)
     config = actions.add_parser("ssh-config", help="print a configuration for ssh -F, scp -F, rsync and Ansible")
     config.set_defaults(run=print_ssh_config)
     actions.add_parser("down", help="stop the robots").set_defaults(run=down)
@@ -78,6 +79,24 @@ def add(parser: Parser) -> None:
         "-o", "--out", type=Path, default=Path("lab.svg"), metavar="FILE", help="SVG, PDF or PNG (default lab.svg)"
     )
     action.set_defaults(run=plot)
+
+
+def _add_sdf(actions: Commands) -> None:
+    parser: Parser = actions.add_parser(
+        "sdf",
+        help="print the world of the robots for Gazebo",
+        description="Print the world of the site file and its robots as SDF, for `physics: gazebo` of labs and "
+        "trials. Robots that Gazebo does not move are not in it.",
+        epilog="example: fieldkit lab sdf > lab.sdf",
+    )
+    parser.add_choice(
+        "--gazebo",
+        ("fortress", "garden"),
+        default="fortress",
+        help="names of the plugins: fortress (default), or garden for it and later versions",
+    )
+    shared.add_robots(parser)
+    parser.set_defaults(run=print_sdf)
 
 
 def _add_move(actions: Commands) -> None:
@@ -220,6 +239,19 @@ def print_ssh_config(_: argparse.Namespace) -> int:
     lab_folder = _lab_folder()
     requests.state(lab_folder)
     print_text(lab_folder.ssh_config.read_text(encoding="utf-8"), end="")
+    return 0
+
+
+def print_sdf(arguments: argparse.Namespace) -> int:
+    """Print the world for Gazebo."""
+    from fieldkit.lab.protocol import GazeboWorlds
+
+    backend = _backend(arguments)
+    if not isinstance(backend, GazeboWorlds):
+        raise ConfigurationError(
+            "Gazebo does not move the robots of this backend", remedy="fieldkit lab sdf --backend emulated"
+        )
+    print_text(backend.gazebo_world(arguments.gazebo), end="")
     return 0
 
 
