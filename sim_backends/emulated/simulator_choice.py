@@ -77,12 +77,19 @@ def _physics(options: EmulatedOptions) -> str:
 
 
 def _gazebo_options() -> dict[str, Any]:
-    """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks."""
+    """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks.
+
+    Velocities are means over a window: those of its last step need a second request per window.
+    """
     set_options = {
         option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
         for option, variable in (("partition", "PARTITION"), ("ip", "IP"))
     }
-    return default_options(GAZEBO, PHYSICS) | {option: value for option, value in set_options.items() if value}
+    return (
+        default_options(GAZEBO, PHYSICS)
+        | {"velocity": "window"}
+        | {option: value for option, value in set_options.items() if value}
+    )
 
 
 def _network(options: EmulatedOptions) -> str:

@@ -93,6 +93,7 @@ class LabPhysics:
         self._advanced_ns = 0
         self._now_ns = 0
         self._pending: dict[str, Command] = {}
+        self._followed: dict[str, Command] = {}
         self._assigned = dict.fromkeys(stations, State(OFF_AIR_M))
         self._hidden: frozenset[str] = frozenset()
         self._in_physics: dict[str, tuple[Vector, float]] = {}
@@ -158,6 +159,10 @@ class LabPhysics:
                 yield self._clock.simulated_ns(at_ns), name, command
 
     def _drive(self, name: str, at_ns: int, command: Command) -> None:
+        """Command a robot at a time; a command that the robot follows already needs no exchange with the physics."""
+        if self._followed.get(name) == command:
+            return
+        self._followed[name] = command
         self._advance(at_ns)
         self._pending[name] = command
 
@@ -200,6 +205,7 @@ class LabPhysics:
             was_driven = steering.is_driven
             if steering.poll_placement(self._clock.monotonic_ns(now_ns)) is not None:
                 self._changed = True
+                self._followed.pop(name, None)
                 if was_driven and state is not None:
                     self._assigned[name] = State(state.position_m)  # until the lab's request arrives
                     self._pending[name] = steering.idle
@@ -220,6 +226,7 @@ class LabPhysics:
         self._in_physics |= moved
         if isinstance(self._physics, Placing):
             for name, ((east_m, north_m, up_m), heading_rad) in moved.items():
+                self._followed.pop(name, None)
                 self._physics.put(name, (east_m, north_m, up_m - ANTENNA_M), heading_rad)
             self._check_overlaps(moved)
             self._physics_states = self._physics.advance(max(self._now_ns - self._started_ns, 0), {})
@@ -241,6 +248,7 @@ class LabPhysics:
         """Start the physics with all robots at their present places; those that move are at rest afterwards."""
         self.close()
         self._physics = None
+        self._followed.clear()
         states = {name: self._body_state(name) for name in self._bodies}
         self._in_physics = {name: (state.position_m, state.heading_rad or 0.0) for name, state in states.items()}
         self._started_ns = self._now_ns - self._now_ns % self.step_ns
