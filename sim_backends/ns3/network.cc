@@ -758,7 +758,8 @@ RunAlone(Network& network, const char* path)
     return stream == nullptr;
 }
 
-// Print the loss in dB of each link of a JSON text: seed, radio, world, names, and rows of time, two indices and positions.
+// Print losses in dB for a JSON text with seed, radio, world and names: of each row of `links`, which has a time, two
+// indices and positions, and then of each row of `places`, which has two positions.
 int
 PrintLosses()
 {
@@ -768,6 +769,10 @@ PrintLosses()
     for (const Json& row : request.at("links"))
     {
         losses_db.push_back(channel.LossDb(row[0], row[1], row[2], row[3], row[4]));
+    }
+    for (const Json& row : request.at("places"))
+    {
+        losses_db.push_back(channel.MeanLossDb(row[0].get<Point>(), row[1].get<Point>()));
     }
     std::cout << losses_db << "\n";
     return 0;
