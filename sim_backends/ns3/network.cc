@@ -46,6 +46,10 @@ class Network
 
     std::string Hello(const std::string& body)
     {
+        if (IsReady())
+        {
+            throw Refusal("hello was sent twice");
+        }
         protocol::Hello hello = protocol::ReadHello(body, protocol::kNetwork);
         g_heartbeat.SetInterval(hello.heartbeat_ms);
         try

@@ -1,4 +1,4 @@
-"""The channel of the ns-3 federate has the losses of the built-in radio: paths, obstacles, shadowing, fading, noise."""
+"""The channel of the ns-3 federate has the losses of the built-in radio, also from jammers."""
 
 import json
 import random
