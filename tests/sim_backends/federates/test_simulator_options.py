@@ -159,18 +159,6 @@ def test_options_of_ns3_without_an_effect_are_refused_with_their_line(
     assert caught.value.where == f"{path}:5"
 
 
-@pytest.mark.parametrize("key", ["appears", "disappears"])
-def test_gazebo_refuses_agents_that_appear_or_disappear_with_their_line(key: str, tmp_path: Path) -> None:
-    path = tmp_path / "pair.yaml"
-    text = (
-        SCENARIO.replace("PHYSICS", "gazebo").replace("    VALUE\n", "    reset: false\n").replace("NETWORK", "ns3")
-    )
-    path.write_text(text.replace("bob: {", f"bob: {{{key}: 500ms, "), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=f"cannot appear or disappear in Gazebo; remove {key}") as caught:
-        load_scenario(path)
-    assert caught.value.where == f"{path}:12"
-
-
 def test_reliable_topics_over_ns3_are_refused_with_their_line(tmp_path: Path) -> None:
     topics = {"kind": "stream", "from": "ann", "to": "bob", "rate": "10Hz", "protocol": "topic"}
     best_effort = topics | {"qos": {"reliability": "best_effort"}}
