@@ -73,10 +73,10 @@ class IpRadio:
         before: Delay = 0,  # noqa: ARG002 (see RadioModel)
     ) -> None:
         """Implement `RadioModel.send`."""
-        receivers, protocol = (destination,), UNICAST
-        identity = packet or payload.identity
-        if destination is None:
-            receivers, protocol = tuple(name for name in self._names if name != source), BROADCAST
+        if destination is not None:
+            receivers, protocol, identity = [destination], UNICAST, packet or payload.identity
+        else:
+            receivers, protocol = [name for name in self._names if name != source], BROADCAST
             identity = broadcast_flow(source), self._broadcasts
             self._broadcasts += 1
         for receiver in receivers:

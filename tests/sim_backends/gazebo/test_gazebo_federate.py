@@ -168,6 +168,7 @@ def test_parallel_runs_use_it_one_after_the_other_by_its_name(
     monkeypatch.chdir(tmp_path)
     options = ", ".join(f"{key}: {value}" for key, value in server.options.items())
     words = ["cosim", "run", "convoy", "--physics", "gazebo", "--set", f"physics.options={{{options}}}"]
+    words += ["--set", "agents.drone.disappears=300ms"]
     code = main([*words, "--duration", "500ms", "--window", "20ms", "--policy", "sliding_window", "--seeds", "2"])
     output = capsys.readouterr()
     assert code == 0, output.err

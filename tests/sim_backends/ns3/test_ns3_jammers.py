@@ -7,7 +7,9 @@ from typing import Any
 
 import pytest
 
-from tests.helpers.ns3_pair import arrived, reasons, run_pair, stream
+from sim_backends.cosim import build, load_scenario
+from sim_backends.cosim.packet_ledger import fixed_emitters_m, transmitters
+from tests.helpers.ns3_pair import SCENARIO, arrived, reasons, run_pair, stream
 
 MS = 1_000_000
 NETWORKS = ("builtin", "ns3")
@@ -83,3 +85,21 @@ def test_an_agent_carries_a_jammer_while_it_is_present(network: str, tmp_path: P
     assert not [at_ns for at_ns in times_ns if 102 * MS < at_ns < 200 * MS]
     assert len([at_ns for at_ns in times_ns if at_ns <= 102 * MS]) >= 9
     assert len([at_ns for at_ns in times_ns if at_ns >= 200 * MS]) >= 28
+
+
+def test_jammers_are_announced_to_policies_that_bound_errors(tmp_path: Path) -> None:
+    path = tmp_path / "line.yaml"
+    path.write_text(SCENARIO, encoding="utf-8")
+    jammer = {"kind": "jammer", "power_dbm": 0, "from": "0s"}
+    changes = {
+        "world": "baylands",
+        "agents.eve": {"robot": "husky", "at_m": [40, 10]},
+        "faults": [jammer | {"at_m": [78, 30], "height": "2m"}, jammer | {"agent": "eve"}],
+    }
+    announced = []
+    for network in NETWORKS:
+        with build(load_scenario(path, {"network.federate": network, **changes})) as simulation:
+            announced.append((transmitters(simulation.network), fixed_emitters_m(simulation.network)))
+    assert announced[0] == announced[1]
+    ((_, _, up_m),) = announced[0][1]
+    assert up_m > 2, "it is on raised ground"
