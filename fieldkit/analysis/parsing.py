@@ -164,7 +164,8 @@ def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
 def _texts(column: pa.ChunkedArray) -> Texts:
     encoded = column.unify_dictionaries().combine_chunks()
     distinct = np.array([*map(unescape_formula, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
-    return np.asarray(distinct[_buffer_values(encoded.indices, np.int32)], dtype=np.object_)
+    indices = encoded.indices.fill_null(len(distinct) - 1)
+    return np.asarray(distinct[_buffer_values(indices, np.int32)], dtype=np.object_)
 
 
 def _numbers(column: pa.ChunkedArray) -> Numbers:
