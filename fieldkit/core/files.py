@@ -22,8 +22,10 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """Open a file that atomically replaces `path` at the end of the body; a crash leaves the old or the new file.
 
     The mode of an existing file is kept, and the file is unchanged if the body raises. An existing symbolic link is
-    replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced. If several
-    processes replace a file at the same time, each of them replaces it by complete content, and the last one remains.
+    replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
+
+    If several processes replace a file at the same time, each of them writes complete content, and the last one
+    remains.
 
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.

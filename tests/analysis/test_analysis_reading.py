@@ -36,7 +36,9 @@ def test_rows_have_their_source(tmp_path: Path) -> None:
 
 def test_a_missing_text_of_a_dataset_is_empty(tmp_path: Path) -> None:
     identity = {"schema_version": 1, "trial": "t", "protocol": "udp", "attempt": 1, "status": "failed"}
-    rows = [identity | {"repeat": number, "reason": reason} for number, reason in enumerate(["late", None, "dead"], 1)]
+    rows = [
+        identity | {"repeat": number, "reason": reason} for number, reason in enumerate(["late", None, "dead"], 1)
+    ]
     pd.DataFrame(rows).to_parquet(tmp_path / "part-0.parquet", index=False)
     assert list(read([tmp_path], trial_columns()).texts["reason"]) == ["late", "", "dead"]
 
