@@ -225,6 +225,17 @@ def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
     assert {row["window_s"] for row in csv.DictReader(some.out.splitlines())} == {"0.013"}
 
 
+@pytest.mark.parametrize("between", ["window=7ms,13ms", "window_s=0.007,0.013"])
+def test_two_values_with_units_are_compared_in_both_forms(lab: Path, between: str) -> None:
+    done = run_here(lab, "compare", "sweep", "--between", between, "--format", "csv")
+    assert done.code == 0, done.err
+    rows = list(csv.DictReader(done.out.splitlines()))
+    assert {(row["flow"], row["policy"], row["n_a"], row["n_b"]) for row in rows} == {
+        ("pose/b", "scheduled", "2", "2"),
+        ("pose/b", "sliding_window", "2", "2"),
+    }
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
