@@ -164,7 +164,7 @@ class FrameExchange(Generic[Payload]):
         first = station.queue[0]
         # Hardware repeats an aggregate in the next mode of the chain only if the Block Ack is missing.
         mode = peer.mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
-        aggregate = station.aggregate = session.build_aggregate(station.queue, mode)
+        aggregate = station.aggregate = session.build_aggregate(station.queue, mode, is_single=peer.rate.is_probing)
         for frame in aggregate.frames:
             if not frame.attempts:
                 frame.first_attempt_ns = now_ns
