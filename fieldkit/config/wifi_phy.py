@@ -41,6 +41,8 @@ class WifiPhy(Strict):
             radios whose firmware selects them (brcmfmac, iwlwifi, ath10k), or `minstrel`, Linux's for 802.11g.
         firmware_margin_db: Rate control `firmware`: margin in dB below the measured signal, 0 to 20.
         firmware_interval: Rate control `firmware`: time between two selections of a rate, 1 ms to 10 s.
+        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
+            key it sends no RTS, as with `iw phy PHY set rts off`.
     """
 
     width_mhz: Int = 20
@@ -49,6 +51,7 @@ class WifiPhy(Strict):
     rate_control: WifiRateControl = "minstrel"
     firmware_margin_db: Annotated[Number | Int, Field(ge=0, le=20)] = 3.0
     firmware_interval: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
+    rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
 
     @schema.model_validator(mode="after")
     def _check(self) -> "WifiPhy":

@@ -77,6 +77,7 @@ class PhyCapability:
         rate_control: Its rate control.
         firmware_margin_db: Margin of `firmware` below the measured signal.
         firmware_interval_ns: Time between two selections of `firmware`.
+        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS; None for all.
     """
 
     amendment: WifiAmendment
@@ -87,6 +88,7 @@ class PhyCapability:
     rate_control: WifiRateControl = "minstrel"
     firmware_margin_db: float = 3.0
     firmware_interval_ns: int = 100_000_000
+    rts_threshold_bytes: int | None = None
 
     @property
     def band(self) -> Band:
@@ -119,6 +121,7 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
         phy.rate_control,
         float(phy.firmware_margin_db),
         round(phy.firmware_interval * 1e9),
+        phy.rts_threshold_bytes,
     )
 
 

@@ -353,6 +353,11 @@ class WorldChannel(RadioChannel):
         return self.band.difs_ns if self._antennas[station].phy is None else self.band.best_effort_aifs_ns
 
     @override
+    def rts_threshold_bytes(self, station: int) -> int | None:
+        phy = self._antennas[station].phy
+        return None if phy is None else phy.rts_threshold_bytes
+
+    @override
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:
         first, second = self._antennas[transmitter], self._antennas[receiver]
         if first.phy is None or second.phy is None or (self._fixed_mode is not None and not self._fixed_mode.ht):

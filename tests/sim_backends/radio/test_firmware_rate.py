@@ -117,9 +117,14 @@ def test_goodput_at_a_fixed_signal_follows_the_closed_form(
     assert least <= goodput / closed_form_bit_s(HT20[index], ratio_db) <= 1.02
 
 
-def test_rate_control_of_a_profile_reaches_the_model() -> None:
+def test_the_keys_of_a_profile_reach_the_model() -> None:
     fields = {"interface": "wlan0", "standard": "802.11n 2.4 GHz", "tx_power_dbm": 17, "sensitivity_dbm": -82}
-    phy = {"rate_control": "firmware", "firmware_margin_db": 6, "firmware_interval": "50ms"}
+    phy = {
+        "rate_control": "firmware",
+        "firmware_margin_db": 6,
+        "firmware_interval": "50ms",
+        "rts_threshold_bytes": 500,
+    }
     antenna = antenna_of(Radio.model_validate({**fields, "phy": phy}))
     assert antenna.phy is not None
     assert (antenna.phy.rate_control, antenna.phy.firmware_margin_db, antenna.phy.firmware_interval_ns) == (
@@ -127,4 +132,5 @@ def test_rate_control_of_a_profile_reaches_the_model() -> None:
         6.0,
         50_000_000,
     )
+    assert antenna.phy.rts_threshold_bytes == 500
     assert decode_antenna(asdict(antenna)) == antenna
