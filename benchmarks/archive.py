@@ -84,6 +84,8 @@ def run_round(archive: Path, work: Path) -> dict[str, Run]:
     outputs = {name: work / f"{name.replace(', ', '-').replace(' ', '-')}.json" for name in programs}
     for name, program in programs.items():
         runs[name] = program(outputs[name])
+        load = os.getloadavg()[0]
+        print(f"{name}: {runs[name].wall_s:.1f} s, load average {load:.1f}", file=sys.stderr, flush=True)
     first, *others = outputs.values()
     for output in others:
         check(first, output)

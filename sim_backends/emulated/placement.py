@@ -93,6 +93,12 @@ def antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
     return (*place_m, world.ground_m(place_m) + ANTENNA_M)
 
 
+def below_antenna_m(antenna_m: Vector) -> Vector:
+    """Return the lowest point of a robot with its antenna at a position."""
+    east_m, north_m, up_m = antenna_m
+    return east_m, north_m, up_m - ANTENNA_M
+
+
 def on_ground(state: State, world: World) -> State:
     """Return the state of a ground robot with its antenna at the right height above the ground of the world."""
     return state._replace(position_m=antenna_m(world, state.position_m[:2]))

@@ -85,8 +85,13 @@ class BlockAckSession(Generic[Payload]):
         self._frames_waiting: dict[int, Frame[Payload]] = {}
         self._skipped: set[int] = set()
 
-    def build_aggregate(self, queue: deque[Frame[Payload]], mode: WifiMode) -> Aggregate[Payload]:
-        """Return the aggregate of a queue's first frame and later frames to its receiver, up to the size limits."""
+    def build_aggregate(
+        self, queue: deque[Frame[Payload]], mode: WifiMode, *, is_single: bool = False
+    ) -> Aggregate[Payload]:
+        """Return the aggregate of a queue's first frame and later frames to its receiver, up to the size limits.
+
+        With `is_single` it contains the first frame only.
+        """
         limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, _MAX_PPDU_NS))
         frames: list[Frame[Payload]] = []
         first, size_bytes, last_sequence = queue[0], 0, 0
@@ -105,6 +110,8 @@ class BlockAckSession(Generic[Payload]):
                 self._next_sequence += 1
             frames.append(frame)
             size_bytes = new_bytes
+            if is_single:
+                break
         if len(frames) > 1:
             return Aggregate(frames, size_bytes, self._limits.block_ack_bytes)
         # Frames of VHT and HE always have a delimiter: 9.7.1.

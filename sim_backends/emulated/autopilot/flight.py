@@ -5,7 +5,7 @@ state is read.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -117,6 +117,10 @@ class Airframe:
             # At rest it neither slides nor tilts nor turns.
             self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
 
+    def rest(self, now_ns: int) -> None:
+        """Stay on the ground without power until this time, in whole steps."""
+        self.now_ns += (now_ns - self.now_ns) // STEP_NS * STEP_NS
+
     def _rests(self, obstacles: Sequence[Footprint]) -> bool:
         east, north, up = self._pose.place_m
         stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _REST_M), obstacles)
@@ -136,6 +140,10 @@ class Airframe:
         """Direction of flight over the ground; None while it is slow."""
         east, north, _ = self.velocity_m_s
         return math.atan2(north, east) if math.hypot(east, north) > _MIN_COURSE_M_S else None
+
+
+MakeAirframe = Callable[[Vector, float, int], Airframe]
+"""Puts a drone at a place: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:

@@ -193,6 +193,11 @@ class MotionReporter:
         self._odometer = Odometer(paths, now_ns, record)
         self._path_start_ns: int | None = None
 
+    @property
+    def path_start_ns(self) -> int:
+        """Start of the assigned path that put the robot at its place; 0 before the first one was read."""
+        return self._path_start_ns or 0
+
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
         """Return the place at which the lab has put the robot since the last call, or None if it has not.
 
@@ -225,5 +230,6 @@ class MotionReporter:
         Raises:
             OSError: There is no space for it.
         """
-        path_start_ns = self._path_start_ns or 0
-        self._record.write(Steered(now_ns, path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry))
+        self._record.write(
+            Steered(now_ns, self.path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+        )

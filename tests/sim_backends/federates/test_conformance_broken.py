@@ -89,6 +89,37 @@ class LosesAnAgent(WrappedPhysics):
         return {name: state for name, state in states.items() if name != "bob" or to_ns < 20 * MS}
 
 
+class LeavesOnTime(WrappedPhysics):
+    """Has no state of an agent outside of its lifetime, which may be shifted, or at another place."""
+
+    late_ns = 0
+    east_m = 0.0
+
+    def __init__(self, hello: Any) -> None:  # noqa: ANN401
+        super().__init__(hello)
+        self.lifetimes = hello.lifetimes
+
+    def broken(self, states: States, to_ns: int) -> States:
+        return {
+            name: shifted(state, self.east_m)
+            for name, state in states.items()
+            if name not in self.lifetimes or self.lifetimes[name].contains(to_ns - self.late_ns)
+        }
+
+
+class LeavesLate(LeavesOnTime):
+    late_ns = 1
+
+
+class LosesAnotherAgent(LeavesOnTime):
+    def broken(self, states: States, to_ns: int) -> States:
+        return {name: state for name, state in super().broken(states, to_ns).items() if name != "bob"}
+
+
+class AppearsElsewhere(LeavesOnTime):
+    east_m = 2.0
+
+
 class AddsAnAgent(WrappedPhysics):
     def broken(self, states: States, to_ns: int) -> States:
         return {**states, **({"dan": states["bob"]} if to_ns > 20 * MS else {})}
@@ -383,6 +414,15 @@ PHYSICS_CASES = [
         "unknown_command", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a command"
     ),
     BrokenFederate("determinism", physics(TremblingPhysics), "gave different answers"),
+    BrokenFederate(
+        "lifetimes", physics(LeavesLate, agents_disappear=True), "300000000 ns, has no state at 100000000 ns"
+    ),
+    BrokenFederate(
+        "lifetimes", physics(LosesAnotherAgent, agents_disappear=True), "bob, which is always present, has no"
+    ),
+    BrokenFederate(
+        "lifetimes", physics(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from the start"
+    ),
     BrokenFederate("fork", physics(IsShared), "the original"),
     BrokenFederate("drive_axes", physics(SwapsAxes), "0 rad, and moved by (0, 0.6, 0) m instead of 0.6 m east"),
     BrokenFederate("drive_axes", physics(ReportsDegrees), "the heading of ann is 90 rad at the start, not 1.57 rad"),
@@ -521,7 +561,8 @@ def test_the_federates_conform_before_they_are_broken(role: int) -> None:
     make = Carts if role == PHYSICS else LosesByKey
     for name in checks(is_physics=role == PHYSICS):
         settings: dict[str, Any] = {"transports": ("udp",)} if role == NETWORK else {}
-        pair = physics(make, agents_appear=True, agents_disappear=True, forks=name != "fork_absence", **settings)
+        used = LeavesOnTime if name == "lifetimes" else make
+        pair = physics(used, agents_appear=True, agents_disappear=True, forks=name != "fork_absence", **settings)
         result = run(role, BrokenFederate(name, pair, ""))
         assert (result.failure, result.skipped) == ("", ""), result
 
