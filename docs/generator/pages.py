@@ -2,9 +2,9 @@
 
 import inspect
 from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
 from docs.generator.commands import commands
 from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
@@ -305,11 +305,10 @@ def json_events() -> str:
             "`event`, `utc_ns` and the fields below. How a program answers requests: [automation](../automation.md)."
         ),
     ]
-    for name, record in vars(events).items():
-        if inspect.isclass(record) and is_dataclass(record) and record.__module__ == events.__name__:
-            meanings = attribute_meanings(record)
-            lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
-            blocks += [f"## {_snake(name)}", class_description(record), table(("field", "meaning"), lines)]
+    for record in get_args(events.Event):
+        meanings = attribute_meanings(record)
+        lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
+        blocks += [f"## {_snake(record.__name__)}", class_description(record), table(("field", "meaning"), lines)]
     return page("JSON events", *blocks)
 
 

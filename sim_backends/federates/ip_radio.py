@@ -150,6 +150,6 @@ class IpRadio:
         parts = self._parts.pop(arrival.packet_id, None)
         if parts is None:
             return PACKET
-        queueing_ns, transmission_ns, propagation_ns = parts
-        times = QUEUING_NS * queueing_ns + TRANSMISSION_NS * transmission_ns + PROPAGATION_NS * propagation_ns
+        queuing_ns, transmission_ns, propagation_ns = parts
+        times = QUEUING_NS * queuing_ns + TRANSMISSION_NS * transmission_ns + PROPAGATION_NS * propagation_ns
         return PACKET + times
