@@ -283,15 +283,24 @@ class LockStep
                 }
             }
             int64_t before_ns = m_nowNs;
+            int64_t target_ns = before_ns + steps * m_stepNs;
+            SetAwaited(target_ns);
             auto answer = m_connection.Send(m_options.ControlService(), Connection::ControlRequest(steps));
             WorldMonitor::Lock lock(m_monitor.mutex);
-            WaitForPoses(lock, before_ns + steps * m_stepNs, before_ns, answer);
+            WaitForPoses(lock, target_ns, before_ns, answer);
+            m_monitor.awaited_ns = -1;
             count -= steps;
         }
         for (size_t i = 0; i < m_agents.size(); i++)
         {
             m_agents[i].pose = m_monitor.poses[i];
         }
+    }
+
+    void SetAwaited(int64_t time_ns)
+    {
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        m_monitor.awaited_ns = time_ns;
     }
 
     // The clock of a step is published before the step is made, so only poses with its time stamp are valid.

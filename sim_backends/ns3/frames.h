@@ -334,7 +334,7 @@ class FrameTracker
         {
             m_links[{frame.from, frame.to}].delivered++;
             frame.is_received = true;
-            frame.parts.queueing_ns += frame.first_ns - frame.enqueued_ns;
+            frame.parts.queuing_ns += frame.first_ns - frame.enqueued_ns;
             frame.parts.propagation_ns += frame.propagation_ns;
             frame.parts.transmission_ns += NowNs() - frame.first_ns - frame.propagation_ns;
         }

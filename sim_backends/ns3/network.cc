@@ -650,20 +650,20 @@ class Network
     {
         parts.propagation_ns = std::min(parts.propagation_ns, delay_ns);
         parts.transmission_ns = std::min(parts.transmission_ns, delay_ns - parts.propagation_ns);
-        parts.queueing_ns = std::min(parts.queueing_ns, delay_ns - parts.propagation_ns - parts.transmission_ns);
+        parts.queuing_ns = std::min(parts.queuing_ns, delay_ns - parts.propagation_ns - parts.transmission_ns);
         return parts;
     }
 
     void WriteParts(const CoordinatorPacket& packet, int64_t delay_ns, const DelayParts& parts)
     {
-        int64_t processing_ns = delay_ns - parts.propagation_ns - parts.transmission_ns - parts.queueing_ns;
+        int64_t processing_ns = delay_ns - parts.propagation_ns - parts.transmission_ns - parts.queuing_ns;
         std::string flow = packet.flow;
         for (size_t place = 0; (place = flow.find('"', place)) != std::string::npos; place += 2)
         {
             flow.insert(place, 1, '"');
         }
         m_parts << '"' << flow << "\"," << packet.number << ',' << delay_ns << ',' << processing_ns << ','
-                << parts.queueing_ns << ',' << parts.transmission_ns << ',' << parts.propagation_ns << '\n';
+                << parts.queuing_ns << ',' << parts.transmission_ns << ',' << parts.propagation_ns << '\n';
     }
 
     void Drop(uint64_t id, const std::string& reason)

@@ -83,10 +83,10 @@ def test_udp_has_the_goodput_and_losses_of_the_built_in_network(standard: str, s
             "agents__bob__at_m": [distance_m, 0],
             "traffic": stream(rate="4kHz", size_bytes=1000),
         }
-        ours = goodput_mbit_s(simulated("builtin", **changes))
-        theirs = goodput_mbit_s(simulated(network__options__standard=standard, **changes))
-        assert theirs == pytest.approx(ours, rel=0.1), distance_m
-        assert (ours > 20) == (distance_m < 45)
+        builtin_mbit_s = goodput_mbit_s(simulated("builtin", **changes))
+        ns3_mbit_s = goodput_mbit_s(simulated(network__options__standard=standard, **changes))
+        assert ns3_mbit_s == pytest.approx(builtin_mbit_s, rel=0.1), distance_m
+        assert (builtin_mbit_s > 20) == (distance_m < 45)
 
 
 @pytest.mark.parametrize(
@@ -119,14 +119,14 @@ def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated
         # Only a message of TCP waits in its host: for the handshake, and for its window.
         assert min(parts_ns) >= 0
         assert identity[0] == "log/ann" or processing_ns < 25_000_000
-    assert any(int(row["queueing_ns"]) > 100_000 for row in rows.values())
+    assert any(int(row["queuing_ns"]) > 100_000 for row in rows.values())
 
 
 def test_losses_have_reasons(simulated: Simulated) -> None:
     sparse = stream(rate="10Hz", size_bytes=300)
-    far = simulated(agents__bob__at_m=[500, 0], traffic=sparse).run()
-    assert reasons(far).keys() - {""} == {"retries exhausted"}
-    assert not any(fate.arrived_ns for fate in far.fates.values())
+    distant_run = simulated(agents__bob__at_m=[500, 0], traffic=sparse).run()
+    assert reasons(distant_run).keys() - {""} == {"retries exhausted"}
+    assert not any(fate.arrived_ns for fate in distant_run.fates.values())
     full = simulated(radio__mode="g6", traffic=stream(rate="4kHz", size_bytes=1000)).run()
     assert reasons(full)["queue full"] > 1000
     off = [
