@@ -96,7 +96,7 @@ class Ros2Options(Strict):
 
 
 class SyncOptions(Strict):
-    """The [sync policy](method-cosim.md#synchronization-methods) of a lab on the co-simulation.
+    """The [sync policy](method-cosim.md#sync-policies) of a lab on the co-simulation.
 
     Attributes:
         name: Its name. `event_driven` adds no delay to a packet.

@@ -130,7 +130,7 @@ def _body(profile: RobotProfile) -> RobotBody:
 
 
 def summary(options: EmulatedOptions) -> Mapping[str, str]:
-    """Return the simulators and the policy of a lab, by what they are."""
+    """Return the physics, the network, the sync policy and the physics step of a lab as texts, by these words."""
     sync = sync_of(options)
     policy = make_policy(sync.name, **sync.parameters)
     defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}

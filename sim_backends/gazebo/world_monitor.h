@@ -87,11 +87,12 @@ class WorldMonitor
         std::lock_guard<std::mutex> guard(mutex);
         const auto& stamp = message.header().stamp();
         int64_t time_ns = stamp.sec() * 1000000000LL + stamp.nsec();
-        if (time_ns == pose_ns)
+        if (time_ns == pose_ns && message.pose_size() == m_poses)
         {
             return; // a paused world repeats its poses
         }
         pose_ns = time_ns;
+        m_poses = message.pose_size();
         present.clear();
         names.clear();
         for (const msgs::Pose& pose : message.pose())
@@ -194,6 +195,7 @@ class WorldMonitor
     protocol::Heartbeat& m_heartbeat;
     std::map<std::string, size_t> m_indices; // of agents, by model
     Clock::time_point m_clockAt;
+    int m_poses = 0; // number of poses in the last message
 };
 
 } // namespace fieldkit

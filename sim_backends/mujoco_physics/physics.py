@@ -256,8 +256,8 @@ class MujocoPhysics:
     def __deepcopy__(self, memo: dict[int, Any]) -> "MujocoPhysics":
         other = object.__new__(type(self))
         memo[id(self)] = other
-        own = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
-        vars(other).update(copy.deepcopy(own, memo), model=self.model)
+        members = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
+        vars(other).update(copy.deepcopy(members, memo), model=self.model)
         data = mujoco.MjData(self.model)
         mujoco.mj_copyData(data, self.model, self.data)
         other._use(data)

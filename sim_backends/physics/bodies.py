@@ -356,7 +356,7 @@ class Bodies:
         grid = CellGrid(2 * max((body.radius_m for body in self._present.values()), default=0.0))
         for number, name in enumerate(names):
             place_m = places_m[name]
-            others = [names[other] for other in grid.near(place_m)] if name in new else []
+            others = [names[other] for other in grid.nearby_indices(place_m)] if name in new else []
             footprints = [cylinder_footprint(other, places_m[other], self._bodies[other]) for other in others]
             self._check_free(name, place_m, footprints)
             grid.add(number, place_m)

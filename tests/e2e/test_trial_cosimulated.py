@@ -16,7 +16,7 @@ from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.simulator_choice import resolve
 from tests.helpers.gazebo_server import gazebo_server, missing_libraries
-from tests.helpers.host import Untouched, descendants
+from tests.helpers.host import NamespaceComparison, descendants
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
 from tests.helpers.sshd import wait_until
 
@@ -61,7 +61,7 @@ def trial_row(folder: Path, emulated: str) -> dict[str, str]:
     return row
 
 
-def test_a_campaign_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_campaign_on_the_built_in_network(tmp_path: Path, untouched: NamespaceComparison) -> None:
     sync = "{name: sliding_window, window: 4ms}"
     make_site(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
     (tmp_path / "short.yaml").write_text(CAMPAIGN, encoding="utf-8")
@@ -166,8 +166,8 @@ def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.M
     with gazebo_server(tmp_path / "gazebo", sdf.out) as server:
         monkeypatch.setenv("IGN_PARTITION", server.options["partition"])
         monkeypatch.setenv("IGN_IP", server.options["ip"])
-        up = fieldkit(tmp_path, "lab", "up")
-        assert up.code == 0, up.err
+        started = fieldkit(tmp_path, "lab", "up")
+        assert started.code == 0, started.err
         try:
             assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "10m", "18m").code == 0
             assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0

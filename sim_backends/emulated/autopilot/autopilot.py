@@ -98,7 +98,7 @@ class Autopilot:
             if message.get_type() == "HEARTBEAT":
                 self.vehicle.failsafes.heartbeat(message.get_srcSystem(), message.type, now_ns)
             elif self._is_addressed(message):
-                yield from self._port.frames(self._answers(message, now_ns))
+                yield from self._port.frames(self._replies(message, now_ns))
 
     def advance(self, now_ns: int) -> Iterator[Frame]:
         """Fly until this time and yield the frames that are due; the caller must consume all."""
@@ -150,7 +150,7 @@ class Autopilot:
             yield dialect.MAVLink_statustext_message(severity, text.encode("ascii", "replace")[:_TEXT_BYTES])
         self.vehicle.status_texts.clear()
 
-    def _answers(self, message: Message, now_ns: int) -> Iterator[Message]:
+    def _replies(self, message: Message, now_ns: int) -> Iterator[Message]:
         kind = message.get_type()
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
             yield from self._command(message, now_ns)

@@ -59,6 +59,19 @@ def test_a_retry_is_marked_and_long_frames_are_cut(tmp_path: Path) -> None:
     assert (first.wirelen, len(first)) == (1532, 160)
 
 
+def test_control_frames_have_their_type_and_addresses(tmp_path: Path) -> None:
+    paths = [tmp_path / air_log.PCAP, tmp_path / air_log.CSV]
+    log = AirLog([os.open(path, os.O_WRONLY | os.O_CREAT) for path in paths], ("a", "b"))
+    for control, size_bytes in (("RTS", 20), ("CTS", 14), ("ACK", 14)):
+        log.write(TransmissionAttempt(1000, 51_000, "a", "b", G_MODES[0], size_bytes, 0, ("b",), None, control))
+    log.close()
+    frames = rdpcap(str(paths[0]))
+    assert [(frame.type, frame.subtype, frame.addr1) for frame in frames] == [
+        (1, subtype, MAC["b"]) for subtype in (11, 12, 13)
+    ]
+    assert frames[0].addr2 == MAC["a"]
+
+
 @pytest.fixture
 def bench() -> Iterator[tuple[MediumClient, dict[str, Namespace]]]:
     with ExitStack() as stack:
