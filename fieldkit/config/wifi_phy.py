@@ -8,6 +8,7 @@ from fieldkit.config.schema import Duration, Field, Int, Number, Strict
 
 WifiAmendment = Literal["n", "ac", "ax"]
 WifiBand = Literal["2.4 GHz", "5 GHz", "6 GHz"]
+DscpMapping = Literal["linux", "rfc8325"]
 WifiRateControl = Literal["minstrel", "minstrel_ht", "firmware"]
 
 _STANDARD: Final = re.compile(r"802\.11(n|ac|ax) (2\.4 GHz|5 GHz|6 GHz)")
@@ -43,6 +44,8 @@ class WifiPhy(Strict):
         firmware_interval: Rate control `firmware`: time between two selections of a rate, 1 ms to 10 s.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
             key it sends no RTS, as with `iw phy PHY set rts off`.
+        access_categories: It has the four access categories of EDCA, into which packets come by their DSCP: `linux`
+            (its upper three bits, Linux up to 6.10) or `rfc8325`. Without this key all packets are best effort.
     """
 
     width_mhz: Int = 20
@@ -52,6 +55,7 @@ class WifiPhy(Strict):
     firmware_margin_db: Annotated[Number | Int, Field(ge=0, le=20)] = 3.0
     firmware_interval: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
     rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
+    access_categories: DscpMapping | None = None
 
     @schema.model_validator(mode="after")
     def _check(self) -> "WifiPhy":

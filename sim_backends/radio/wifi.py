@@ -1,8 +1,8 @@
 """802.11 stations on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
 
 An event-driven engine on integer nanoseconds that uses no clock and no socket; its interface is `model.RadioModel`.
-Frames between stations with `phy` are aggregated. It does not model RTS/CTS (drivers switch it off below 2347 bytes),
-other access categories than best effort, beacons of the access point, power save and fragmentation.
+Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories. It does not model
+beacons of the access point, power save and fragmentation.
 """
 
 from collections.abc import Callable, Mapping, Set
@@ -101,6 +101,7 @@ class Wifi(Generic[Payload]):
         packet: PacketIdentity | None = None,
         before: Delay = 0,
         max_attempts: int = SHORT_RETRY_LIMIT,
+        dscp: int = 0,
     ) -> None:
         """Implement `RadioModel.send`; after `max_attempts` on its first hop the packet is given up."""
         self.advance(now_ns)
@@ -115,6 +116,8 @@ class Wifi(Generic[Payload]):
             is_broadcast = receiver is None
             frame = Frame(payload, size_bytes, source, relay, (receiver,), is_broadcast, identity, now_ns, before)
         frame.max_attempts = max_attempts
+        if dscp:
+            frame.dscp = dscp
         self._delivery.enqueue(now_ns, station, frame)
 
     def next_event_ns(self) -> int | None:
