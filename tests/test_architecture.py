@@ -125,7 +125,8 @@ ONE_IMPORTER = {
     # Connections, and key formats.
     "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
     "keyring": "fieldkit/remote/passwords.py",
-    "rich": "fieldkit/cli/display.py",
+    # The width of texts on a terminal.
+    "rich": "fieldkit/cli/display.py fieldkit/cli/event_words.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # Messages of the drone, and, in a separate process, reading its log.
     "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",

@@ -209,12 +209,12 @@ class WorldChannel(RadioChannel):
                 given_db[index[transmitter], index[receiver]] = loss_db
         if before_db is None:
             before_db = np.full((count, count), np.nan)
-        same = (given_db == before_db) | (np.isnan(given_db) & np.isnan(before_db))
-        if same.all():
+        unchanged = (given_db == before_db) | (np.isnan(given_db) & np.isnan(before_db))
+        if unchanged.all():
             return
         self._given_db = given_db
         self._revision += 1
-        self._stale |= ~(same & same.T)[tuple(self._ends)]
+        self._stale |= ~(unchanged & unchanged.T)[tuple(self._ends)]
 
     def received_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
         """Return the mean received power at each station, by index, of another transmitter at a position."""
