@@ -4,7 +4,7 @@ import re
 from typing import Annotated, Final, Literal, cast
 
 from fieldkit.config import schema
-from fieldkit.config.schema import Duration, Field, Int, Number, Strict
+from fieldkit.config.schema import Bool, Duration, Field, Int, Number, Strict
 
 WifiAmendment = Literal["n", "ac", "ax"]
 WifiBand = Literal["2.4 GHz", "5 GHz", "6 GHz"]
@@ -46,6 +46,9 @@ class WifiPhy(Strict):
             key it sends no RTS, as with `iw phy PHY set rts off`.
         access_categories: It has the four access categories of EDCA, into which packets come by their DSCP: `linux`
             (its upper three bits, Linux up to 6.10) or `rfc8325`. Without this key all packets are best effort.
+        power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
+            default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
+        power_save_timeout: Time after its last frame after which it dozes, 1 ms to 10 s; 100 ms in mac80211.
     """
 
     width_mhz: Int = 20
@@ -56,6 +59,8 @@ class WifiPhy(Strict):
     firmware_interval: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
     rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
     access_categories: DscpMapping | None = None
+    power_save: Bool = False
+    power_save_timeout: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
 
     @schema.model_validator(mode="after")
     def _check(self) -> "WifiPhy":

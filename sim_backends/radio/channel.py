@@ -54,6 +54,10 @@ class RadioChannel(Protocol):
         """Return how a station maps packets to its access categories; None if it has only one queue."""
         return None
 
+    def power_save_timeout_ns(self, station: int) -> int | None:  # noqa: ARG002 (a default)
+        """Return the time after its last frame after which a station dozes; None if it never does."""
+        return None
+
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)
         """Return the limits of aggregates on a link; None if its frames are not aggregated."""
         return None

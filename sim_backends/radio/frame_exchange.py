@@ -14,6 +14,7 @@ from sim_backends.radio.aggregation import (
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
 from sim_backends.radio.driver_statistics import RadioMeter
+from sim_backends.radio.edca import AccessCategories
 from sim_backends.radio.frames import (
     HEADER_BYTES,
     Frame,
@@ -372,7 +373,10 @@ class FrameExchange(Generic[Payload]):
             station.queue.popleft()
         else:
             station.contention.on_failure()
-        self._start_next(now_ns, station, peer)
+        if station.categories is not None:
+            self._start_next(now_ns, station, station.categories, peer)
+        elif station.queue:
+            self._contend(now_ns, station)
 
     def _finish_aggregate(
         self,
@@ -407,15 +411,19 @@ class FrameExchange(Generic[Payload]):
             self.delivery.pass_up(now_ns, station.index, peer, session.skip(lost))
         remove_frames(station.queue, confirmed | given_up)
         station.exchange_id += 1
-        self._start_next(now_ns, station, peer)
+        if station.categories is not None:
+            self._start_next(now_ns, station, station.categories, peer)
+        elif station.queue:
+            self._contend(now_ns, station)
 
-    def _start_next(self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None) -> None:
+    def _start_next(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        categories: AccessCategories[Payload],
+        peer: Peer[Payload] | None,
+    ) -> None:
         """Schedule the next exchange of a station: in its transmission opportunity, or after contention."""
-        categories = station.categories
-        if categories is None:
-            if station.queue:
-                self._contend(now_ns, station)
-            return
         if peer is not None and station.queue and (frame := station.queue[0]).receiver == peer.receiver:
             data_ns = peer.mode.airtime_ns(frame.size_bytes + QOS_HEADER_BYTES)
             start_ns = categories.continue_ns(now_ns, data_ns + self._sifs_ns + ack_ns(peer.mode))

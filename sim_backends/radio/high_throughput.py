@@ -79,6 +79,7 @@ class PhyCapability:
         firmware_interval_ns: Time between two selections of `firmware`.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS; None for all.
         access_categories: How it maps packets to its access categories; None if it sends all as best effort.
+        power_save_timeout_ns: Time after its last frame after which it dozes; None if it never does.
     """
 
     amendment: WifiAmendment
@@ -91,6 +92,7 @@ class PhyCapability:
     firmware_interval_ns: int = 100_000_000
     rts_threshold_bytes: int | None = None
     access_categories: DscpMapping | None = None
+    power_save_timeout_ns: int | None = None
 
     @property
     def band(self) -> Band:
@@ -125,6 +127,7 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
         round(phy.firmware_interval * 1e9),
         phy.rts_threshold_bytes,
         phy.access_categories,
+        round(phy.power_save_timeout * 1e9) if phy.power_save else None,
     )
 
 

@@ -18,6 +18,7 @@ from sim_backends.radio.links import (
     LossLog,
     Payload,
 )
+from sim_backends.radio.power_save import PowerSave
 from sim_backends.radio.stations import CategoryPeer, Peer, Station
 
 
@@ -34,6 +35,7 @@ class PacketDelivery(Generic[Payload]):
         peers: State of each link that was used, by indices of transmitter and receiver.
         arrived: Delivered packets, in order of arrival.
         log_loss: Called for every loss; None without a log.
+        power_save: The dozing stations; None if no station uses power save.
     """
 
     def __init__(
@@ -51,9 +53,15 @@ class PacketDelivery(Generic[Payload]):
         self._category_peers: dict[tuple[int, int, int], CategoryPeer[Payload]] = {}
         self.arrived: list[Delivery[Payload]] = []
         self.log_loss: LossLog | None = None
+        self.power_save: PowerSave[Payload] | None = None
 
     def enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
         """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
+        if self.power_save is None or not self.power_save.buffer(now_ns, station, frame):
+            self.enqueue_now(now_ns, station, frame)
+
+    def enqueue_now(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        """Queue a frame whose receiver is awake."""
         queue = station.queue
         if station.categories is not None:
             frame.category = category_of(frame.dscp, station.categories.mapping)
@@ -70,14 +78,16 @@ class PacketDelivery(Generic[Payload]):
             return
         queue.append(frame)
         if len(queue) == 1:
-            in_exchange = bool(station.exchange_id & 1)
             if station.categories is not None:
-                station.categories.arrive(now_ns, frame, in_exchange=in_exchange)
-            if not in_exchange:
+                station.categories.arrive(now_ns, frame, in_exchange=bool(station.exchange_id & 1))
+            if not station.exchange_id & 1:
                 self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:
         """Empty the queue of a station whose radio was switched off; frames that were not received are lost."""
+        if self.power_save is not None:
+            for frame in self.power_save.discard(station):
+                self._discard(now_ns, station, frame)
         for queue in (station.queue,) if station.categories is None else station.categories.queues:
             while queue:
                 self._discard(now_ns, station, queue.popleft())
