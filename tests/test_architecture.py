@@ -390,6 +390,7 @@ FEDERATE_SEAMS = {
         "simulator_options",
         "transports",
     },
+    "sim_backends/cosim/scenario/build.py": {"ip_radio"},
     "sim_backends/cosim/scenario/federate_choice.py": {"frames", "named", "simulator_options"},
     "sim_backends/cosim/scenario/served.py": {"frames", "handshake", "serving"},
     "sim_backends/cosim/commands/conform.py": {"conformance", "frames", "handshake", "named", "protocols", "session"},

@@ -228,7 +228,7 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
 
 def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
     evidence = load_evidence(table(tmp_path, lawns.lawn(4)))
-    paragraph = summary.paragraph(aggregate(evidence.repeats), evidence).replace("\N{NO-BREAK SPACE}", " ")
+    paragraph = summary.paragraph(aggregate(evidence.repeats), evidence, {}).replace("\N{NO-BREAK SPACE}", " ")
     assert paragraph == (
         "24 trials of los and nlos on 2026-11-21 12:00 UTC: 10ft to 55ft; "
         "TCP and UDP; master and masterless; emulated and field robots. 192 attempts: 176 valid, 16 void. "
@@ -385,5 +385,6 @@ def test_edited_table_cannot_refer_to_other_folders(tmp_path: Path) -> None:
 
 def test_a_title_names_few_procedures(tmp_path: Path) -> None:
     rows = [tables.replace(tables.COMPARABLE, procedure=f"run {number}") for number in range(6)]
-    assert summary.title(aggregate(table(tmp_path, rows))) == "Loss and delay: run 0, run 1 and 4 others"
-    assert summary.title(aggregate(table(tmp_path / "three", rows[:3]))) == "Loss and delay: run 0, run 1 and run 2"
+    assert summary.title(aggregate(table(tmp_path, rows)), {}) == "Loss and delay: run 0, run 1 and 4 others"
+    three = aggregate(table(tmp_path / "three", rows[:3]))
+    assert summary.title(three, {}) == "Loss and delay: run 0, run 1 and run 2"

@@ -6,7 +6,7 @@ from typing_extensions import override
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe
-from sim_backends.emulated.ros.flight_records import Flight, FlightCommand, FlightCommandRecord, FlightRecord
+from sim_backends.emulated.ros.flight_records import FlightCommand, FlightCommandRecord, FlightMotion, FlightRecord
 from sim_backends.physics.body import Velocity
 from sim_backends.physics.quadrotor import FlightPose, Quadrotor, QuadrotorLimits
 
@@ -91,7 +91,7 @@ class SimulatedAirframe(Airframe):
             self._extrapolated_m(flight), flight.velocity_m_s, flight.roll_rad, flight.pitch_rad, flight.heading_rad
         )
 
-    def _extrapolated_m(self, flight: Flight) -> Vector:
+    def _extrapolated_m(self, flight: FlightMotion) -> Vector:
         if flight.is_supported:
             return flight.place_m
         elapsed_s = min(max(self.now_ns - flight.time_ns, 0), _LATEST_NS) / 1e9

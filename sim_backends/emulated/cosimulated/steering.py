@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS, odometry
 from sim_backends.emulated.robot.commanded import CommandedRecord
-from sim_backends.emulated.ros.flight_records import Flight, FlightCommandRecord, FlightRecord
+from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightMotion, FlightRecord
 from sim_backends.emulated.ros.own_motion import AT_REST, MotionReporter, OwnMotion
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarget
@@ -219,7 +219,7 @@ class FlightSteering(Steering):
             return
         place_m, roll_rad, pitch_rad, is_supported = flight
         self._flown.write(
-            Flight(
+            FlightMotion(
                 at_ns,
                 self._reporter.path_start_ns,
                 is_supported,

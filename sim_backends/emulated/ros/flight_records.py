@@ -95,7 +95,7 @@ class FlightCommandRecord:
         self._slots.close()
 
 
-class Flight(NamedTuple):
+class FlightMotion(NamedTuple):
     """Motion of a drone, as its sensors measure it.
 
     Attributes:
@@ -140,7 +140,7 @@ class FlightRecord:
         """
         return cls(open_record(path))
 
-    def write(self, flight: Flight) -> None:
+    def write(self, flight: FlightMotion) -> None:
         """Write the motion.
 
         Raises:
@@ -155,7 +155,7 @@ class FlightRecord:
             *flight[5:],
         )
 
-    def read(self) -> Flight | None:
+    def read(self) -> FlightMotion | None:
         """Return the last motion, or None if there is none.
 
         Raises:
@@ -165,7 +165,7 @@ class FlightRecord:
         if values is None:
             return None
         time_ns, path_start_ns, is_supported, e, n, u, v_e, v_n, v_u, *angles = values
-        return Flight(time_ns, path_start_ns, bool(is_supported), (e, n, u), (v_e, v_n, v_u), *angles)
+        return FlightMotion(time_ns, path_start_ns, bool(is_supported), (e, n, u), (v_e, v_n, v_u), *angles)
 
     def close(self) -> None:
         """Close the file."""

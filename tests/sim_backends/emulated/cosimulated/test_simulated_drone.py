@@ -20,7 +20,7 @@ from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.emulated.cosimulated.simulators import RobotBody
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.flight_records import Flight, FlightRecord
+from sim_backends.emulated.ros.flight_records import FlightMotion, FlightRecord
 from sim_backends.emulated.ros.own_motion import MotionReporter
 from sim_backends.physics.body import GRAVITY_M_S2
 from sim_backends.physics.ground import Ground
@@ -71,7 +71,7 @@ class Drone:
         self.vehicle.take_off(HEIGHT_M)
         self.fly(lambda: self.vehicle.mode is Mode.LOITER)
 
-    def flight(self) -> Flight:
+    def flight(self) -> FlightMotion:
         """Return the motion that the physics recorded last."""
         record = FlightRecord.open(self.bench.driven.folder / "flown")
         try:
@@ -81,7 +81,7 @@ class Drone:
         assert flight is not None
         return flight
 
-    def fall(self) -> list[Flight]:
+    def fall(self) -> list[FlightMotion]:
         """Return the recorded motion until it has landed, without the autopilot."""
         flights, deadline = [self.flight()], Deadline.after(30)
         while not (flights[-1].is_supported and flights[-1].velocity_m_s == (0.0, 0.0, 0.0)):
