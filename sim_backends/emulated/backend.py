@@ -1,11 +1,11 @@
 """The emulated backend: the robots of a site file, or the robots of the paper, in namespaces on this machine."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS, Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
@@ -90,16 +90,35 @@ class EmulatedBackend:
                 where=document.where(("robots", LAPTOP_NAME)) if document else "",
                 remedy="give the robot another name",
             )
+        if site.control is Control.RADIO and self._options.has_linux_wifi:
+            raise ConfigurationError(
+                "with `wifi: linux`, the operator's laptop has no radio",
+                where=document.where(("control",)) if document else "",
+                remedy="remove control: radio",
+            )
         self._addresses = dict(zip(site.robots, hosts, strict=False))
 
     @property
     def simulators(self) -> Mapping[str, str]:
         """Implement `Simulating.simulators`."""
+        if self._options.has_linux_wifi:
+            from sim_backends.linux_wifi import virtual_machine  # noqa: PLC0415 (other labs need none of it)
+
+            clock = {CLOCK: INSTRUCTIONS} if virtual_machine.clock_counts_instructions() else {}
+            return {"wifi": "linux", **clock}
         if not self._options.is_cosimulated:
             return {}
         from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
 
         return simulator_choice.summary(self._options)
+
+    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int | None:
+        """Implement `Relocating.run_elsewhere`: with the Wi-Fi of Linux, in a virtual machine if it is not here."""
+        if not self._options.has_linux_wifi:
+            return None
+        from sim_backends.linux_wifi import guest, radios  # noqa: PLC0415 (other labs need none of it)
+
+        return None if radios.runs_here() else guest.run_command(argv, results, radios=len(self._site.robots))
 
     @property
     def lab_bytes(self) -> int:
@@ -212,10 +231,12 @@ class EmulatedBackend:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""
         from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
 
-        variants = self._options.robots
+        has_linux_wifi, variants = self._options.has_linux_wifi, self._options.robots
         robot_variants = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for options in robot_variants for program in options.programs()} | mesh)
+        wifi = {"hostapd", "iw", "nft", "wpa_supplicant"} if has_linux_wifi else set()
+        programs = {program for options in robot_variants for program in options.programs()}
+        requirements.check(programs | mesh | wifi, needs_tun=not has_linux_wifi)
         return requirements.ros_in_use(self._options.ros)
 
 

@@ -1,6 +1,7 @@
 """The initial file system of the virtual machine: busybox, kernel modules and a start script, in a cpio archive.
 
-Everything else is the root file system of the host, which the machine mounts read-only over 9p. The archive has the
+Everything else is the root file system of the host, which the machine mounts read-only over 9p, below a layer in
+memory that has all changes. The archive has the
 format `newc` (Linux, Documentation/driver-api/early-userspace/buffer-format.rst). It is written here, because
 a program that creates it would have to be installed, and needs a copy of each file.
 """
@@ -14,8 +15,14 @@ from typing import Final
 
 from fieldkit.core.errors import ConfigurationError
 
-MODULES: Final = ("virtio_pci", "9pnet_virtio", "9p", "virtio_rng", "mac80211_hwsim", "ccm", "ctr", "cmac", "gcm")
-"""Modules that the machine loads, after their dependencies; ccm, cmac and gcm are the ciphers of WPA2 and WPA3."""
+MODULES: Final = (
+    *("virtio_pci", "9pnet_virtio", "9p", "overlay", "virtio_rng", "mac80211_hwsim", "crc32c_generic", "nf_tables"),
+    *("ccm", "ctr", "cmac", "gcm"),
+)
+"""Modules that the machine loads, after their dependencies.
+
+libcrc32c, on which nf_tables depends, needs crc32c_generic; ccm, cmac and gcm are the ciphers of WPA2 and WPA3.
+"""
 
 _SUFFIX: Final = ".ko"
 _DEPENDS: Final = re.compile(rb"\0depends=([^\0]*)\0")
@@ -36,15 +43,19 @@ for name in $(cat /modules); do
     [ $name != mac80211_hwsim ] || options=radios={radios}
     insmod /lib/$name.ko $options || poweroff -f
 done
+mkdir /memory
 mount -t 9p -o ro,trans=virtio,version=9p2000.L,msize=524288,cache=loose host /host || poweroff -f
-mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 lab /host/mnt || poweroff -f
-mount -t tmpfs run /host/run
-for place in proc sys dev; do mount -o move /$place /host/$place; done
-mkdir -p /host/dev/pts /host/dev/shm /host/run/netns
-mount -t devpts devpts /host/dev/pts
-mount -t tmpfs shm /host/dev/shm
-chroot /host /bin/sh /mnt/{job} </host/dev/null >/host/mnt/{output} 2>&1
-echo $? >/host/mnt/{output}.code
+mount -t tmpfs memory /memory
+mkdir /memory/upper /memory/work
+mount -t overlay -o lowerdir=/host,upperdir=/memory/upper,workdir=/memory/work root /changed || poweroff -f
+mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 lab /changed/mnt || poweroff -f
+mount -t tmpfs run /changed/run
+for place in proc sys dev; do mount -o move /$place /changed/$place; done
+mkdir -p /changed/dev/pts /changed/dev/shm /changed/run/netns
+mount -t devpts devpts /changed/dev/pts
+mount -t tmpfs shm /changed/dev/shm
+chroot /changed /bin/sh /mnt/{job} </changed/dev/null >/changed/mnt/{output} 2>&1
+echo $? >/changed/mnt/{output}.code
 poweroff -f
 """
 
@@ -70,7 +81,7 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
     busybox = _program("busybox")
     files["bin/busybox"] = 0o755, busybox.read_bytes()
     files |= {str(path).lstrip("/"): (0o755, path.read_bytes()) for path in shared_libraries(busybox)}
-    return cpio_archive(files, ("bin", "lib", "proc", "sys", "dev", "host"))
+    return cpio_archive(files, ("bin", "lib", "proc", "sys", "dev", "host", "changed"))
 
 
 def module_order(modules: Path, names: Iterable[str]) -> list[Path]:

@@ -1,12 +1,13 @@
-"""The medium as a process: `python -m sim_backends.linux_wifi.medium_program [--fd FD]`, as root.
+"""The medium as a process: `python -m sim_backends.linux_wifi.medium_program [CHANNEL] [--fd FD]`, as root.
 
-It becomes the medium of all radios of mac80211_hwsim in its network namespace. It reads requests from standard input,
-one JSON object per line, and answers each with one on standard output. The first one is `MediumSetup`; then
+It becomes the medium of all radios of mac80211_hwsim in its network namespace. It reads requests, one JSON object per
+line, and answers each with one: on the socket with the descriptor CHANNEL, or on standard input and output. The first
+one is `MediumSetup`; then
 
     {"do": "place", "positions": {"r1": [0, 0, 1]}, "velocities": {}}
     {"do": "totals"}
 
-It exits when standard input ends. When the last descriptor of the registered socket is closed, hwsim delivers all
+It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim delivers all
 frames again without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open,
 and passes its descriptor with `--fd`: if the medium is killed, no frame is delivered, and a new medium continues.
 """
@@ -218,8 +219,9 @@ def _vector(values: Any) -> tuple[float, float, float]:  # noqa: ANN401 (JSON)
 
 
 def main() -> int:
-    """Run the medium until standard input ends."""
+    """Run the medium until the requests end."""
     parser = argparse.ArgumentParser(description="The medium of all radios of mac80211_hwsim.")
+    parser.add_argument("channel", type=int, nargs="?", help="descriptor of a socket with requests")
     parser.add_argument("--fd", type=int, help="descriptor of a socket that is registered as the medium")
     options = parser.parse_args()
     try:
@@ -228,7 +230,9 @@ def main() -> int:
         sys.stderr.write(f"error: {error.what}\n  remedy: {error.remedy}\n")
         return 2
     try:
-        serve(kernel, RequestLines(sys.stdin.fileno()), sys.stdout.fileno())
+        channel = options.channel
+        requests, replies = (sys.stdin.fileno(), sys.stdout.fileno()) if channel is None else (channel, channel)
+        serve(kernel, RequestLines(requests), replies)
     finally:
         kernel.close()
     return 0

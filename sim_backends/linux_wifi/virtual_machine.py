@@ -1,7 +1,8 @@
 """A virtual machine with Linux's Wi-Fi, made of the distribution's kernel and the files of this host.
 
-It boots the kernel with mac80211_hwsim, mounts the root file system of the host read-only, runs one shell script as
-root, and switches off. It has no network. Its programs are those of the host: Python with fieldkit, iw, hostapd.
+It boots the kernel with mac80211_hwsim, mounts the root file system of the host read-only below a layer in memory,
+runs one shell script as root, and switches off. It has no network. Its programs are those of the host: Python with
+fieldkit, iw, hostapd.
 
 Without KVM, the clock of the machine counts its instructions, and time passes at the rate of the host only while the
 machine is idle. On a busy host a clock that runs at the rate of the host is too fast: the machine cannot process the
@@ -10,11 +11,12 @@ beacons of its radios before the next ones are due, and its queues overflow.
 
 import lzma
 import os
+import shlex
 import shutil
 import struct
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -29,10 +31,14 @@ PACKAGE_OF: Final = {
     "busybox": "busybox",
     "setpriv": "util-linux",
     "iw": "iw",
+    "nft": "nftables",
     "hostapd": "hostapd",
     "wpa_supplicant": "wpasupplicant",
 }
 """Debian package per program."""
+
+ROOT_VARIABLE: Final = "FIELDKIT_WIFI_ROOT"
+"""Environment variable with a folder in which packages were extracted instead of being installed."""
 
 _BOOT_SECTORS_OFFSET: Final = 0x1F1
 _BOOT_MAGIC_OFFSET: Final = 0x202
@@ -40,6 +46,10 @@ _BOOT_PAYLOAD_OFFSET: Final = 0x248
 _BOOT_HEADER_END: Final = 0x250
 
 _JOB, _OUTPUT = "job.sh", "output"
+INTERRUPT: Final = "/mnt/interrupt"
+"""A file that appears in the machine when the caller is interrupted."""
+_RESULTS: Final = "results"
+_POLL_S: Final = 0.2
 _MAX_OUTPUT_BYTES: Final = 16 << 20
 # An overloaded host misses the timer interrupts by which the kernel checks its IO-APIC, and the kernel would panic.
 # Mitigations of processor faults, self-tests of ciphers, read-only pages and the routing of interrupts by ACPI need
@@ -47,6 +57,8 @@ _MAX_OUTPUT_BYTES: Final = 16 << 20
 _KERNEL_OPTIONS: Final = (
     "console=ttyS0 rdinit=/init panic=-1 quiet no_timer_check mitigations=off cryptomgr.notests rodata=off acpi=noirq"
 )
+_INSTRUCTION_CLOCK: Final = "fieldkit.clock=instructions"
+"""Kernel option that marks a machine whose clock counts instructions."""
 _NS_PER_INSTRUCTION_EXPONENT: Final = 1
 """An emulated instruction needs 2^1 ns: 500 million instructions per second, as of a slow processor."""
 
@@ -77,6 +89,18 @@ class JobResult:
     output: str
 
 
+def kernel_roots() -> tuple[Path, ...]:
+    """Return the folders with `boot/`, `lib/modules/` and programs: that of `ROOT_VARIABLE`, and `/`."""
+    extracted = os.environ.get(ROOT_VARIABLE)
+    return (Path(extracted).absolute(), Path("/")) if extracted else (Path("/"),)
+
+
+def find_program(name: str, roots: Sequence[Path]) -> str | None:
+    """Return the path of a program in the program folders below one of `roots`, or None."""
+    folders = (str(root / folder.lstrip("/")) for root in roots for folder in PATH.split(":"))
+    return shutil.which(name, path=":".join(folders))
+
+
 def find_kernel(roots: Sequence[Path] = (Path("/"),)) -> Kernel | None:
     """Return the newest kernel with hwsim in `boot/` and `lib/modules/` of the first folder that has one, or None."""
     for root in roots:
@@ -103,17 +127,17 @@ def uncompressed_kernel(image: bytes) -> bytes:
     return lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(payload)
 
 
-def require_machine(roots: Sequence[Path] = (Path("/"),), program_path: str = PATH) -> Kernel:
+def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
     """Return the kernel of the machine.
 
     Args:
-        roots: Folders with `boot/` and `lib/modules/`.
-        program_path: Folders of programs, separated by colons.
+        roots: Folders with `boot/`, `lib/modules/` and programs; None for those of `kernel_roots`.
 
     Raises:
         ConfigurationError: The kernel or a program is missing; the message names all that is.
     """
-    missing = {name: package for name, package in PACKAGE_OF.items() if shutil.which(name, path=program_path) is None}
+    roots = kernel_roots() if roots is None else roots
+    missing = {name: package for name, package in PACKAGE_OF.items() if find_program(name, roots) is None}
     kernel = find_kernel(roots)
     if kernel is None:
         missing["a kernel with mac80211_hwsim"] = "linux-image-amd64"
@@ -127,12 +151,20 @@ def require_machine(roots: Sequence[Path] = (Path("/"),), program_path: str = PA
 
 
 def run_in_machine(
-    kernel: Kernel, script: str, deadline: Deadline, *, radios: int, memory_mib: int = 1024
+    kernel: Kernel,
+    script: str,
+    deadline: Deadline,
+    *,
+    radios: int,
+    memory_mib: int = 3072,
+    results: Path | None = None,
+    on_output: Callable[[bytes], None] = lambda _data: None,
 ) -> JobResult:
     """Run a shell script as root in a new machine, and return its result.
 
-    The machine ends with this process, even if this process is killed. The script may write to `/mnt` and `/run`
-    (also `TMPDIR`); other files are those of the host and cannot be changed.
+    The machine ends with this process, even if this process is killed. Changes of the machine to the host's files
+    are lost with the machine, except those below `results`. The first KeyboardInterrupt creates the file `INTERRUPT`
+    in the machine; the second one ends the machine.
 
     Args:
         kernel: Kernel of the machine.
@@ -140,6 +172,8 @@ def run_in_machine(
         deadline: Time by which the machine must have switched off; without KVM, boot takes 5 s and more.
         radios: Number of radios of hwsim.
         memory_mib: Memory of the machine.
+        results: An existing folder of the host in which the machine writes files; None for none.
+        on_output: Called with new output of the script.
 
     Raises:
         ConfigurationError: A file of the machine is missing.
@@ -149,12 +183,14 @@ def run_in_machine(
         folder = Path(name)
         shared = folder / "shared"
         shared.mkdir()
+        if results is not None:
+            script = _mount_command(results) + script
         (shared / _JOB).write_text(script, encoding="utf-8")
         (folder / "kernel").write_bytes(uncompressed_kernel(kernel.image.read_bytes()))
         (folder / "initrd").write_bytes(build_initrd(kernel.modules, radios=radios, job=_JOB, output=_OUTPUT))
         with (folder / "errors").open("wb") as errors:
             machine = subprocess.Popen(
-                _command_line(folder, memory_mib),
+                _command_line(folder, memory_mib, results),
                 cwd=folder,
                 stdin=subprocess.DEVNULL,
                 stdout=errors,
@@ -163,7 +199,7 @@ def run_in_machine(
                 env={"PATH": PATH},
             )
         try:
-            machine.wait(deadline.remaining_s)
+            _wait(machine, shared, deadline, on_output)
         except subprocess.TimeoutExpired:
             raise _lost("did not switch off in time", folder) from None
         finally:
@@ -175,15 +211,62 @@ def run_in_machine(
         return JobResult(int(code.read_text(encoding="ascii")), _read_text(shared / _OUTPUT))
 
 
-def _command_line(folder: Path, memory_mib: int) -> list[str]:
-    argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *_accelerators(), "-cpu", "max"]
+def _wait(
+    machine: subprocess.Popen[bytes], shared: Path, deadline: Deadline, on_output: Callable[[bytes], None]
+) -> None:
+    """Wait until the machine has switched off, and report the output of its script.
+
+    Raises:
+        subprocess.TimeoutExpired: It did not switch off before the deadline.
+        KeyboardInterrupt: Raised for the second time.
+    """
+    reported_bytes, is_running, is_interrupted = 0, True, False
+    while is_running:
+        try:
+            machine.wait(min(_POLL_S, deadline.remaining_s))
+            is_running = False
+        except subprocess.TimeoutExpired:
+            if deadline.expired:
+                raise
+        except KeyboardInterrupt:
+            if is_interrupted:
+                raise
+            is_interrupted = True
+            (shared / Path(INTERRUPT).name).touch()
+        output = shared / _OUTPUT
+        if output.exists():
+            with output.open("rb") as file:
+                file.seek(reported_bytes)
+                data = file.read()
+            reported_bytes += len(data)
+            if data:
+                on_output(data)
+
+
+def _mount_command(results: Path) -> str:
+    place = shlex.quote(str(results))
+    return f"mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 {_RESULTS} {place} || exit\n"
+
+
+def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[str]:
+    accelerators = _accelerators()
+    options = _KERNEL_OPTIONS if "kvm" in accelerators else f"{_KERNEL_OPTIONS} {_INSTRUCTION_CLOCK}"
+    argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *accelerators, "-cpu", "max"]
     argv += ["-m", str(memory_mib), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
-    argv += ["-kernel", "kernel", "-initrd", "initrd", "-append", _KERNEL_OPTIONS]
+    argv += ["-kernel", "kernel", "-initrd", "initrd", "-append", options]
     argv += ["-serial", "file:console", "-device", "virtio-rng-pci"]
-    for tag, path, access in (("host", "/", ",readonly=on"), ("lab", str(folder / "shared"), "")):
-        argv += ["-fsdev", f"local,id={tag},path={path},security_model=none,multidevs=remap{access}"]
+    shares = [("host", "/", ",readonly=on"), ("lab", str(folder / "shared"), "")]
+    shares += [] if results is None else [(_RESULTS, str(results), "")]
+    for tag, path, access in shares:
+        escaped = path.replace(",", ",,")  # a single comma separates options
+        argv += ["-fsdev", f"local,id={tag},path={escaped},security_model=none,multidevs=remap{access}"]
         argv += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
     return argv
+
+
+def clock_counts_instructions() -> bool:
+    """Return True if this process runs in a machine without KVM: times on its clock are no durations."""
+    return _INSTRUCTION_CLOCK in Path("/proc/cmdline").read_text(encoding="ascii", errors="replace").split()
 
 
 def _accelerators() -> Sequence[str]:

@@ -42,7 +42,9 @@ class CosimulatedClient(MediumClient):
         self._policy = policy
 
     @override
-    def attach(self, name: str, address: str, radio: Radio, fd: int, *, physics_fds: Sequence[int] = ()) -> None:
+    def attach(
+        self, name: str, address: str, radio: Radio, fd: int | None, *, physics_fds: Sequence[int] = ()
+    ) -> None:
         super().attach(name, address, radio, fd)
         if (body := self._bodies.get(name)) is not None:
             request = {"do": "body", "name": name, "profile": body.profile, "limits": asdict(body.limits)}

@@ -1,0 +1,86 @@
+"""Commands of fieldkit in the virtual machine: the same command line, with its results in a folder of the host."""
+
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.process import worker
+from sim_backends.linux_wifi.virtual_machine import (
+    INTERRUPT,
+    PACKAGE_OF,
+    find_program,
+    kernel_roots,
+    require_machine,
+    run_in_machine,
+)
+
+_LONGEST_S: Final = 7 * 24 * 3600.0
+_COMMAND: Final = """\
+mkdir -p /usr/local/sbin
+{links}
+cd {folder} || exit
+export {variables}
+( while sleep 1; do if [ -e {interrupt} ]; then rm {interrupt}; kill -INT $$; fi; done ) &
+exec {command}
+"""
+
+
+def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
+    """Run a command of fieldkit in a new virtual machine; its output is that of this process.
+
+    Args:
+        argv: The words after `fieldkit`.
+        results: Folder of the host that the command may change; it is created. Other changes are lost.
+        radios: Number of radios.
+
+    Returns:
+        Exit code of the command.
+
+    Raises:
+        ConfigurationError: A program, or the kernel of the machine, is not installed.
+        TestbedLostError: The machine ended before the command.
+    """
+    kernel = require_machine()
+    results.mkdir(parents=True, exist_ok=True)
+    ended = run_in_machine(
+        kernel,
+        _script(argv, Path.cwd()),
+        Deadline.after(_LONGEST_S),
+        radios=radios,
+        results=results.resolve(),
+        on_output=_write,
+    )
+    return ended.code
+
+
+def _script(argv: Sequence[str], folder: Path) -> str:
+    """Return the shell script that runs a command of fieldkit in a folder."""
+    # Programs of a folder of extracted packages are not on the PATH of the robots.
+    links = [
+        shlex.join(("ln", "-sf", found, f"/usr/local/sbin/{name}"))
+        for name in PACKAGE_OF
+        if shutil.which(name, path=worker.PATH) is None and (found := find_program(name, kernel_roots())) is not None
+    ]
+    variables = {
+        "PATH": worker.PATH,
+        "HOME": os.environ.get("HOME", "/"),
+        "LANG": "C.UTF-8",
+        "PYTHONPATH": str(worker.PROJECT),
+    }
+    return _COMMAND.format(
+        links="\n".join(links),
+        folder=shlex.quote(str(folder)),
+        variables=" ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items()),
+        interrupt=INTERRUPT,
+        command=shlex.join((*worker.command("fieldkit"), *argv)),
+    )
+
+
+def _write(data: bytes) -> None:
+    sys.stdout.write(data.decode(errors="replace"))
+    sys.stdout.flush()
