@@ -148,6 +148,19 @@ class LabBackend(Protocol):
         ...
 
 
+@runtime_checkable
+class ChoosesWifi(Protocol):
+    """Optional capability of a `LabBackend` with several kinds of Wi-Fi."""
+
+    def use_wifi(self, kind: str) -> None:
+        """Use a kind of Wi-Fi, `model` or `linux`.
+
+        Raises:
+            ConfigurationError: The site file excludes it.
+        """
+        ...
+
+
 def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
     """Return the error for a robot that is not in the lab, with the nearest name as a hint."""
     return ConfigurationError(

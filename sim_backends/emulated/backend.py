@@ -114,11 +114,29 @@ class EmulatedBackend:
 
     def run_elsewhere(self, argv: Sequence[str], results: Path) -> int | None:
         """Implement `Relocating.run_elsewhere`: with the Wi-Fi of Linux, in a virtual machine if it is not here."""
-        if not self._options.has_linux_wifi:
+        if not self._options.has_linux_wifi or self._has_radios():
             return None
-        from sim_backends.linux_wifi import guest, radios  # noqa: PLC0415 (other labs need none of it)
+        from sim_backends.linux_wifi import guest  # noqa: PLC0415 (other labs need none of it)
 
-        return None if radios.runs_here() else guest.run_command(argv, results, radios=len(self._site.robots))
+        return guest.run_command(argv, results, radios=len(self._site.robots))
+
+    def use_wifi(self, kind: str) -> None:
+        """Implement `ChoosesWifi.use_wifi`."""
+        self._options = self._options.with_wifi(kind)
+
+    @staticmethod
+    def _has_radios() -> bool:
+        from sim_backends.linux_wifi import radios  # noqa: PLC0415 (as above)
+
+        return radios.runs_here()
+
+    def _site_of_guest(self) -> dict[str, object]:
+        """Return the content of a site file for this lab."""
+        content = dict(self._document.data) if self._document is not None else {}
+        emulated = content.get("emulated") or {}
+        assert isinstance(emulated, dict)
+        site = self._site.model_dump(mode="json", exclude_defaults=True)
+        return site | {"backend": "emulated", "emulated": emulated | {"wifi": self._options.wifi}}
 
     @property
     def lab_bytes(self) -> int:
@@ -195,6 +213,13 @@ class EmulatedBackend:
         if self._site.control is Control.RADIO:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
+        if self._options.has_linux_wifi and not self._has_radios():
+            from sim_backends.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
+
+            sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
+            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed) as lab:
+                yield lab
+            return
         ros = self._checked_ros(members)
         _check_bridges(members, ros)
         self._note_simulators(sink)
@@ -224,8 +249,9 @@ class EmulatedBackend:
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:
+            purposes = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
             texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
-            sink(Note(f"the robots run on the co-simulation: {', '.join(texts)}"))
+            sink(Note(f"{purposes} {', '.join(texts)}"))
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""

@@ -6,6 +6,7 @@ from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import RadioOptions
 
@@ -197,6 +198,18 @@ class EmulatedOptions(Strict):
                 "`sync` needs a co-simulation; write for example `physics: kinematic`", "sync"
             )
         return self
+
+    def with_wifi(self, kind: str) -> "EmulatedOptions":
+        """Return a copy with another `wifi`.
+
+        Raises:
+            ConfigurationError: It cannot be combined with other options.
+        """
+        try:
+            return EmulatedOptions.model_validate(self.model_dump(mode="json") | {"wifi": kind})
+        except schema.ValidationError as error:
+            cause = error.errors()[0]["msg"]
+            raise ConfigurationError(cause, remedy="change emulated: in the site file") from error
 
     @schema.model_validator(mode="after")
     def _check_wifi(self) -> "EmulatedOptions":

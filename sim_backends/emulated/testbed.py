@@ -175,7 +175,7 @@ class LinuxWifiTestbed(EmulatedTestbed):
 
     @property
     @override
-    def oracle(self) -> None:  # type: ignore[override] (the protocol permits None, and only this testbed has none)
+    def oracle(self) -> None:  # type: ignore[override]  # the protocol permits None
         return None
 
 

@@ -20,14 +20,15 @@ from sim_backends.linux_wifi.virtual_machine import (
 )
 
 _LONGEST_S: Final = 7 * 24 * 3600.0
-_COMMAND: Final = """\
+_PROLOGUE: Final = """\
 mkdir -p /usr/local/sbin
 {links}
 cd {folder} || exit
 export {variables}
-( while sleep 1; do if [ -e {interrupt} ]; then rm {interrupt}; kill -INT $$; fi; done ) &
-exec {command}
 """
+_COMMAND: Final = f"""\
+( while sleep 1; do if [ -e {INTERRUPT} ]; then rm {INTERRUPT}; kill -INT $$; fi; done ) &
+exec """
 
 
 def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
@@ -49,7 +50,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     results.mkdir(parents=True, exist_ok=True)
     ended = run_in_machine(
         kernel,
-        _script(argv, Path.cwd()),
+        prologue(Path.cwd()) + _COMMAND + shlex.join((*worker.command("fieldkit"), *argv)),
         Deadline.after(_LONGEST_S),
         radios=radios,
         results=results.resolve(),
@@ -58,8 +59,8 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     return ended.code
 
 
-def _script(argv: Sequence[str], folder: Path) -> str:
-    """Return the shell script that runs a command of fieldkit in a folder."""
+def prologue(folder: Path) -> str:
+    """Return the part of a shell script that prepares the machine for programs of fieldkit in a folder."""
     # Programs of a folder of extracted packages are not on the PATH of the robots.
     links = [
         shlex.join(("ln", "-sf", found, f"/usr/local/sbin/{name}"))
@@ -72,12 +73,10 @@ def _script(argv: Sequence[str], folder: Path) -> str:
         "LANG": "C.UTF-8",
         "PYTHONPATH": str(worker.PROJECT),
     }
-    return _COMMAND.format(
+    return _PROLOGUE.format(
         links="\n".join(links),
         folder=shlex.quote(str(folder)),
         variables=" ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items()),
-        interrupt=INTERRUPT,
-        command=shlex.join((*worker.command("fieldkit"), *argv)),
     )
 
 

@@ -16,7 +16,17 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 
 MODULES: Final = (
-    *("virtio_pci", "9pnet_virtio", "9p", "overlay", "virtio_rng", "mac80211_hwsim", "crc32c_generic", "nf_tables"),
+    *(
+        "virtio_pci",
+        "9pnet_virtio",
+        "9p",
+        "overlay",
+        "virtio_rng",
+        "virtio_console",
+        "mac80211_hwsim",
+        "crc32c_generic",
+        "nf_tables",
+    ),
     *("ccm", "ctr", "cmac", "gcm"),
 )
 """Modules that the machine loads, after their dependencies.

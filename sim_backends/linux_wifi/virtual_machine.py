@@ -13,10 +13,12 @@ import lzma
 import os
 import shlex
 import shutil
+import socket
 import struct
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -48,6 +50,8 @@ _BOOT_HEADER_END: Final = 0x250
 _JOB, _OUTPUT = "job.sh", "output"
 INTERRUPT: Final = "/mnt/interrupt"
 """A file that appears in the machine when the caller is interrupted."""
+CHANNEL: Final = "/dev/vport0p1"
+"""Device in the machine that is connected to a socket of the host. Devices have the numbers of their PCI slots."""
 _RESULTS: Final = "results"
 _POLL_S: Final = 0.2
 _MAX_OUTPUT_BYTES: Final = 16 << 20
@@ -150,6 +154,137 @@ def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
     return kernel
 
 
+class Machine:
+    """A machine that runs its script, or has switched off; `started_machine` creates it.
+
+    Args:
+        process: The process of QEMU.
+        folder: Folder with the files of the machine.
+    """
+
+    def __init__(self, process: subprocess.Popen[bytes], folder: Path) -> None:
+        self._process = process
+        self._folder = folder
+        self._reported_bytes = 0
+
+    def wait(self, deadline: Deadline, on_output: Callable[[bytes], None] = lambda _data: None) -> JobResult:
+        """Wait until the machine has switched off, and return the result of its script.
+
+        The first KeyboardInterrupt creates the file `INTERRUPT` in the machine.
+
+        Args:
+            deadline: Time by which the machine must have switched off.
+            on_output: Called with new output of the script.
+
+        Raises:
+            TestbedLostError: The machine did not run the script to its end before the deadline.
+            KeyboardInterrupt: Raised for the second time.
+        """
+        is_interrupted = False
+        while not self._has_ended(min(_POLL_S, deadline.remaining_s), is_interrupted=is_interrupted):
+            on_output(self.new_output())
+            if deadline.expired:
+                raise self.lost("did not switch off in time")
+            is_interrupted = is_interrupted or (self._folder / "shared" / Path(INTERRUPT).name).exists()
+        on_output(self.new_output())
+        code = self._folder / "shared" / f"{_OUTPUT}.code"
+        if not code.exists():
+            raise self.lost("ended before its script")
+        return JobResult(int(code.read_text(encoding="ascii")), _read_text(self._folder / "shared" / _OUTPUT))
+
+    def check_alive(self) -> None:
+        """Raise TestbedLostError if the machine has ended."""
+        if self._process.poll() is not None:
+            raise self.lost("ended")
+
+    def new_output(self) -> bytes:
+        """Return the output of the script since the last call."""
+        output = self._folder / "shared" / _OUTPUT
+        if not output.exists():
+            return b""
+        with output.open("rb") as file:
+            file.seek(self._reported_bytes)
+            data = file.read()
+        self._reported_bytes += len(data)
+        return data
+
+    def lost(self, cause: str) -> TestbedLostError:
+        """Return the error for a machine that cannot be used, with the last line of its output."""
+        texts = [_read_text(self._folder / name).strip() for name in (f"shared/{_OUTPUT}", "console", "errors")]
+        last_line = next((text.rsplit("\n", 1)[-1] for text in texts if text), "")
+        return TestbedLostError(
+            f"{cause}; its last output: {last_line}" if last_line else cause,
+            where="the virtual machine with Linux's Wi-Fi",
+            remedy="run it on a machine that is less busy, or that has KVM",
+        )
+
+    def _has_ended(self, timeout_s: float, *, is_interrupted: bool) -> bool:
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            return False
+        except KeyboardInterrupt:
+            if is_interrupted:
+                raise
+            (self._folder / "shared" / Path(INTERRUPT).name).touch()
+            return False
+        return True
+
+
+@contextmanager
+def started_machine(
+    kernel: Kernel,
+    script: str,
+    *,
+    radios: int,
+    memory_mib: int = 3072,
+    results: Path | None = None,
+    channel: socket.socket | None = None,
+) -> Iterator[Machine]:
+    """Yield a new machine that runs a shell script as root; leaving the context ends it.
+
+    The machine also ends with this process, even if this process is killed. Its changes to files of the host are
+    lost, except those below `results`.
+
+    Args:
+        kernel: Kernel of the machine.
+        script: The script.
+        radios: Number of radios of hwsim.
+        memory_mib: Memory of the machine.
+        results: An existing folder of the host in which the machine writes files; None for none.
+        channel: A stream socket that is the device `CHANNEL` in the machine; None for none.
+
+    Raises:
+        ConfigurationError: A file of the machine is missing.
+    """
+    with tempfile.TemporaryDirectory(prefix="fieldkit-wifi-") as name:
+        folder = Path(name)
+        shared = folder / "shared"
+        shared.mkdir()
+        if results is not None:
+            script = _mount_command(results) + script
+        (shared / _JOB).write_text(script, encoding="utf-8")
+        (folder / "kernel").write_bytes(uncompressed_kernel(kernel.image.read_bytes()))
+        (folder / "initrd").write_bytes(build_initrd(kernel.modules, radios=radios, job=_JOB, output=_OUTPUT))
+        descriptors = () if channel is None else (channel.fileno(),)
+        with (folder / "errors").open("wb") as errors:
+            process = subprocess.Popen(
+                [*_command_line(folder, memory_mib, results), *_channel_options(descriptors)],
+                cwd=folder,
+                pass_fds=descriptors,
+                stdin=subprocess.DEVNULL,
+                stdout=errors,
+                stderr=errors,
+                start_new_session=True,
+                env={"PATH": PATH},
+            )
+        try:
+            yield Machine(process, folder)
+        finally:
+            process.kill()
+            process.wait()
+
+
 def run_in_machine(
     kernel: Kernel,
     script: str,
@@ -162,85 +297,10 @@ def run_in_machine(
 ) -> JobResult:
     """Run a shell script as root in a new machine, and return its result.
 
-    The machine ends with this process, even if this process is killed. Changes of the machine to the host's files
-    are lost with the machine, except those below `results`. The first KeyboardInterrupt creates the file `INTERRUPT`
-    in the machine; the second one ends the machine.
-
-    Args:
-        kernel: Kernel of the machine.
-        script: The script.
-        deadline: Time by which the machine must have switched off; without KVM, boot takes 5 s and more.
-        radios: Number of radios of hwsim.
-        memory_mib: Memory of the machine.
-        results: An existing folder of the host in which the machine writes files; None for none.
-        on_output: Called with new output of the script.
-
-    Raises:
-        ConfigurationError: A file of the machine is missing.
-        TestbedLostError: The machine did not run the script to its end before the deadline.
+    Args and errors as `started_machine` and `Machine.wait`.
     """
-    with tempfile.TemporaryDirectory(prefix="fieldkit-wifi-") as name:
-        folder = Path(name)
-        shared = folder / "shared"
-        shared.mkdir()
-        if results is not None:
-            script = _mount_command(results) + script
-        (shared / _JOB).write_text(script, encoding="utf-8")
-        (folder / "kernel").write_bytes(uncompressed_kernel(kernel.image.read_bytes()))
-        (folder / "initrd").write_bytes(build_initrd(kernel.modules, radios=radios, job=_JOB, output=_OUTPUT))
-        with (folder / "errors").open("wb") as errors:
-            machine = subprocess.Popen(
-                _command_line(folder, memory_mib, results),
-                cwd=folder,
-                stdin=subprocess.DEVNULL,
-                stdout=errors,
-                stderr=errors,
-                start_new_session=True,
-                env={"PATH": PATH},
-            )
-        try:
-            _wait(machine, shared, deadline, on_output)
-        except subprocess.TimeoutExpired:
-            raise _lost("did not switch off in time", folder) from None
-        finally:
-            machine.kill()
-            machine.wait()
-        code = shared / f"{_OUTPUT}.code"
-        if not code.exists():
-            raise _lost("ended before its script", folder)
-        return JobResult(int(code.read_text(encoding="ascii")), _read_text(shared / _OUTPUT))
-
-
-def _wait(
-    machine: subprocess.Popen[bytes], shared: Path, deadline: Deadline, on_output: Callable[[bytes], None]
-) -> None:
-    """Wait until the machine has switched off, and report the output of its script.
-
-    Raises:
-        subprocess.TimeoutExpired: It did not switch off before the deadline.
-        KeyboardInterrupt: Raised for the second time.
-    """
-    reported_bytes, is_running, is_interrupted = 0, True, False
-    while is_running:
-        try:
-            machine.wait(min(_POLL_S, deadline.remaining_s))
-            is_running = False
-        except subprocess.TimeoutExpired:
-            if deadline.expired:
-                raise
-        except KeyboardInterrupt:
-            if is_interrupted:
-                raise
-            is_interrupted = True
-            (shared / Path(INTERRUPT).name).touch()
-        output = shared / _OUTPUT
-        if output.exists():
-            with output.open("rb") as file:
-                file.seek(reported_bytes)
-                data = file.read()
-            reported_bytes += len(data)
-            if data:
-                on_output(data)
+    with started_machine(kernel, script, radios=radios, memory_mib=memory_mib, results=results) as machine:
+        return machine.wait(deadline, on_output)
 
 
 def _mount_command(results: Path) -> str:
@@ -264,6 +324,12 @@ def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[s
     return argv
 
 
+def _channel_options(descriptors: Sequence[int]) -> Iterator[str]:
+    for descriptor in descriptors:
+        yield from ("-device", "virtio-serial-pci", "-chardev", f"socket,id=channel,fd={descriptor}")
+        yield from ("-device", "virtserialport,chardev=channel")
+
+
 def clock_counts_instructions() -> bool:
     """Return True if this process runs in a machine without KVM: times on its clock are no durations."""
     return _INSTRUCTION_CLOCK in Path("/proc/cmdline").read_text(encoding="ascii", errors="replace").split()
@@ -285,16 +351,6 @@ def _version(image: Path) -> list[tuple[int, str]]:
     """Return a sort key by which 6.1.0-50 is newer than 6.1.0-9."""
     words = image.name.removeprefix("vmlinuz-").replace("-", ".").split(".")
     return [(int(word), "") if word.isdecimal() else (-1, word) for word in words]
-
-
-def _lost(cause: str, folder: Path) -> TestbedLostError:
-    texts = [_read_text(folder / name).strip() for name in ("shared/output", "console", "errors")]
-    last_line = next((text.rsplit("\n", 1)[-1] for text in texts if text), "")
-    return TestbedLostError(
-        f"{cause}; its last output: {last_line}" if last_line else cause,
-        where="the virtual machine with Linux's Wi-Fi",
-        remedy="run it on a machine that is less busy, or that has KVM",
-    )
 
 
 def _read_text(path: Path) -> str:
