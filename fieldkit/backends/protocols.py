@@ -332,7 +332,12 @@ class Simulating(Protocol):
 class Relocating(Protocol):
     """Optional capability of a `Backend` that may have to run commands of fieldkit in a virtual machine."""
 
-    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int | None:
+    @property
+    def must_relocate(self) -> bool:
+        """True if commands that use robots cannot run in this process."""
+        ...
+
+    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
         """Run a command line of fieldkit elsewhere.
 
         Args:
@@ -340,7 +345,7 @@ class Relocating(Protocol):
             results: Folder that the command may change; it is created. Other changes may be lost.
 
         Returns:
-            Its exit code; None if the command can run in this process.
+            Its exit code.
 
         Raises:
             FieldkitError: It cannot run.

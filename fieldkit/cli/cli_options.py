@@ -79,8 +79,20 @@ def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path)
         chosen: The backend.
         arguments: The arguments of the command.
         results: Folder of the results.
+
+    Raises:
+        ConfigurationError: The command would write a file outside of that folder.
     """
-    return chosen.run_elsewhere(arguments.words, results) if isinstance(chosen, Relocating) else None
+    if not isinstance(chosen, Relocating) or not chosen.must_relocate:
+        return None
+    junit: Path | None = getattr(arguments, "junit", None)
+    if junit is not None and not junit.resolve().is_relative_to(results.resolve()):
+        raise ConfigurationError(
+            f"with these robots, only files below {results} can be written",
+            where="--junit",
+            remedy=f"write for example --junit {results / junit.name}",
+        )
+    return chosen.run_elsewhere(arguments.words, results)
 
 
 def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:

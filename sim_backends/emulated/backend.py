@@ -112,23 +112,24 @@ class EmulatedBackend:
 
         return simulator_choice.summary(self._options)
 
-    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int | None:
-        """Implement `Relocating.run_elsewhere`: with the Wi-Fi of Linux, in a virtual machine if it is not here."""
-        if not self._options.has_linux_wifi or self._has_radios():
-            return None
-        from sim_backends.linux_wifi import guest  # noqa: PLC0415 (other labs need none of it)
+    @property
+    def must_relocate(self) -> bool:
+        """Implement `Relocating.must_relocate`: the Wi-Fi of Linux needs radios of hwsim in this kernel."""
+        if not self._options.has_linux_wifi:
+            return False
+        from sim_backends.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
+
+        return not radios.runs_here()
+
+    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
+        """Implement `Relocating.run_elsewhere` by a virtual machine."""
+        from sim_backends.linux_wifi import guest  # noqa: PLC0415 (as above)
 
         return guest.run_command(argv, results, radios=len(self._site.robots))
 
     def use_wifi(self, kind: str) -> None:
         """Implement `ChoosesWifi.use_wifi`."""
         self._options = self._options.with_wifi(kind)
-
-    @staticmethod
-    def _has_radios() -> bool:
-        from sim_backends.linux_wifi import radios  # noqa: PLC0415 (as above)
-
-        return radios.runs_here()
 
     def _site_of_guest(self) -> dict[str, object]:
         """Return the content of a site file for this lab."""
@@ -213,7 +214,7 @@ class EmulatedBackend:
         if self._site.control is Control.RADIO:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
-        if self._options.has_linux_wifi and not self._has_radios():
+        if self.must_relocate:
             from sim_backends.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))

@@ -152,7 +152,7 @@ def bring_up(members: Mapping[str, LabRobot], site: Mapping[str, object], *, see
     with ours, of_machine:
         script = _script(site, Path.cwd(), seed)
         with started_machine(kernel, script, radios=len(members), channel=of_machine) as machine:
-            streams = Streams(ours.fileno(), ours.fileno())
+            streams = Streams(ours.fileno())
             reader = threading.Thread(target=streams.run, name="machine", daemon=True)
             reader.start()
             try:

@@ -45,8 +45,12 @@ def main(channel: str, directory: str) -> None:
     """Serve the channel until it ends."""
     lab = folder.of_directory(Path(directory))
     _wait_for_login(lab)
-    descriptor = os.open(channel, os.O_RDWR)
-    Streams(descriptor, descriptor, lambda stream: serve(stream, lab)).run()
+    relay(os.open(channel, os.O_RDWR), lab)
+
+
+def relay(descriptor: int, lab: LabFolder) -> None:
+    """Serve the channel of a descriptor until it ends."""
+    Streams(descriptor, lambda stream: serve(stream, lab)).run()
 
 
 def serve(stream: socket.socket, lab: LabFolder) -> None:

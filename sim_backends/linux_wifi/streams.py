@@ -36,14 +36,12 @@ class Streams:
     """The streams of one side. Its threads end when the channel ends, or with the process.
 
     Args:
-        read_fd: Descriptor from which the channel is read.
-        write_fd: Descriptor to which it is written.
+        descriptor: Descriptor of the channel.
         accept: Called in a new thread with the socket of each stream that the other side opens; None to accept none.
     """
 
-    def __init__(self, read_fd: int, write_fd: int, accept: Callable[[socket.socket], None] | None = None) -> None:
-        self._read_fd = read_fd
-        self._write_fd = write_fd
+    def __init__(self, descriptor: int, accept: Callable[[socket.socket], None] | None = None) -> None:
+        self._descriptor = descriptor
         self._accept = accept
         self._streams: dict[int, _Stream] = {}
         self._next_number = 0
@@ -140,14 +138,14 @@ class Streams:
         frame = _HEADER.pack(number, kind, len(data)) + data
         with self._write_lock, contextlib.suppress(OSError):
             while frame:
-                frame = frame[os.write(self._write_fd, frame) :]
+                frame = frame[os.write(self._descriptor, frame) :]
 
     def _read(self, size: int) -> bytes | None:
         """Return this number of bytes, or None if the channel ended before."""
         data = b""
         while len(data) < size:
             try:
-                part = os.read(self._read_fd, size - len(data))
+                part = os.read(self._descriptor, size - len(data))
             except OSError:
                 part = b""
             if not part:

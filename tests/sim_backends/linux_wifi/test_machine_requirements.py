@@ -13,7 +13,7 @@ from sim_backends.linux_wifi.virtual_machine import find_kernel, require_machine
 
 def test_all_that_is_missing_is_listed_with_its_packages(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError) as caught:
-        require_machine((tmp_path,), str(tmp_path))
+        require_machine((tmp_path,))
     assert "qemu-system-x86_64" in caught.value.what
     for package in ("qemu-system-x86", "linux-image-amd64", "iw", "hostapd", "wpasupplicant", "busybox"):
         assert f" {package}" in caught.value.remedy
