@@ -3,6 +3,7 @@
 import os
 import shlex
 import shutil
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -48,14 +49,19 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     """
     kernel = require_machine()
     results.mkdir(parents=True, exist_ok=True)
-    ended = run_in_machine(
-        kernel,
-        prologue(Path.cwd()) + _COMMAND + shlex.join((*worker.command("fieldkit"), *argv)),
-        Deadline.after(_LONGEST_S),
-        radios=radios,
-        results=results.resolve(),
-        on_output=_write,
-    )
+    # Ctrl-C is for the command in the machine, which finishes its repeat. A second one ends the machine.
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        ended = run_in_machine(
+            kernel,
+            prologue(Path.cwd()) + _COMMAND + shlex.join((*worker.command("fieldkit"), *argv)),
+            Deadline.after(_LONGEST_S),
+            radios=radios,
+            results=results.resolve(),
+            on_output=_write,
+        )
+    finally:
+        signal.signal(signal.SIGINT, previous)
     return ended.code
 
 

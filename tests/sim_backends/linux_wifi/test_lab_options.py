@@ -113,7 +113,7 @@ def test_check_and_campaign_run_in_the_machine_too(folder: Path, monkeypatch: py
     write_site("{wifi: linux}")
     assert main(["check", "los"]) == 4
     assert calls["results"] == folder / "trials"
-    Path("lab.yaml").write_text("name: lab\nprocedures: [los]\ntopologies: [master]\ndistances: [30ft]\n")
+    Path("lab.yaml").write_text("name: lab\nprocedures: [los]\ntopologies: [master]\ndistances: [30ft]\nseed: 1\n")
     assert main(["campaign", "lab.yaml", "--out", "other"]) == 4
     assert calls["results"] == folder / "other"
 
