@@ -1,10 +1,11 @@
-"""In the virtual machine: connections of the host to the lab of a folder, `python -m ... CHANNEL FOLDER`.
+"""In the virtual machine: connections of the host to the lab of a folder, `python -m ... PATTERN FOLDER`.
 
 Each stream of the channel is one connection to the lab's socket: a request and its answer. The request `login` is
 answered from the lab's files. After `connect ROBOT` the stream is a connection to the SSH server of the robot.
 """
 
 import contextlib
+import glob
 import json
 import os
 import socket
@@ -41,11 +42,11 @@ class GuestLogin:
     host_keys: dict[str, str]
 
 
-def main(channel: str, directory: str) -> None:
-    """Serve the channel until it ends."""
+def main(pattern: str, directory: str) -> None:
+    """Serve the channel, the first device that matches a pattern, until it ends."""
     lab = folder.of_directory(Path(directory))
     _wait_for_login(lab)
-    relay(os.open(channel, os.O_RDWR), lab)
+    relay(os.open(glob.glob(pattern)[0], os.O_RDWR), lab)  # noqa: PTH207 (an absolute pattern)
 
 
 def relay(descriptor: int, lab: LabFolder) -> None:

@@ -50,8 +50,8 @@ _BOOT_HEADER_END: Final = 0x250
 _JOB, _OUTPUT = "job.sh", "output"
 INTERRUPT: Final = "/mnt/interrupt"
 """A file that appears in the machine when the caller is interrupted."""
-CHANNEL: Final = "/dev/vport0p1"
-"""Device in the machine that is connected to a socket of the host. Devices have the numbers of their PCI slots."""
+CHANNEL: Final = "/dev/vport*p1"
+"""Pattern of the device in the machine that is connected to a socket of the host."""
 _RESULTS: Final = "results"
 _POLL_S: Final = 0.2
 _MAX_OUTPUT_BYTES: Final = 16 << 20
