@@ -123,7 +123,11 @@ class Lab(Protocol):
         ...
 
     def overview(self) -> Overview:
-        """Return the plan view with the current positions of the robots."""
+        """Return the plan view with the current positions of the robots.
+
+        Raises:
+            FieldkitError: The positions are unknown, because a process of the lab has failed.
+        """
         ...
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -218,7 +219,8 @@ class EmulatedBackend:
             from sim_backends.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
-            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed) as lab:
+            draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
+            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, draw=draw) as lab:
                 yield lab
             return
         ros = self._checked_ros(members)

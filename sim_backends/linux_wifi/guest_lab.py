@@ -44,6 +44,7 @@ class GuestLab:
         streams: Streams to `lab_relay` in the machine.
         members: The robots by name.
         check_alive: Raises an error if the machine has ended.
+        draw: Returns the plan view for the positions of the robots.
         deadline: Time by which the lab must answer for the first time.
 
     Raises:
@@ -56,9 +57,11 @@ class GuestLab:
         streams: Streams,
         members: Mapping[str, LabRobot],
         check_alive: Callable[[], None],
+        draw: Callable[[Mapping[str, Vector]], Overview],
         deadline: Deadline,
     ) -> None:
         self._streams = streams
+        self._draw = draw
         self._check_alive = check_alive
         self.members = members
         login = self._request("login", _read_login, deadline)
@@ -88,8 +91,8 @@ class GuestLab:
         return self._request(f"move {name} {requests.pack_destination(to)}", requests.unpack_place_m)
 
     def overview(self) -> Overview:
-        """Implement `Lab.overview`."""
-        return self._request("overview", requests.unpack_overview)
+        """Implement `Lab.overview`; it is computed here, because the machine is slow."""
+        return self._draw({name: self.place_m(name) for name in self.members})
 
     def _state(self, name: str) -> requests.RobotState:
         state = self._request("state", requests.unpack_state)
@@ -135,13 +138,20 @@ def _require_connection(stream: socket.socket) -> None:
 
 
 @contextmanager
-def bring_up(members: Mapping[str, LabRobot], site: Mapping[str, object], *, seed: int) -> Iterator[GuestLab]:
+def bring_up(
+    members: Mapping[str, LabRobot],
+    site: Mapping[str, object],
+    *,
+    seed: int,
+    draw: Callable[[Mapping[str, Vector]], Overview],
+) -> Iterator[GuestLab]:
     """Yield the lab in a new virtual machine.
 
     Args:
         members: The robots by name.
         site: Content of its site file.
         seed: Seed of all random numbers of the lab.
+        draw: As for `GuestLab`.
 
     Raises:
         ConfigurationError: A program, or the kernel of the machine, is not installed.
@@ -156,7 +166,7 @@ def bring_up(members: Mapping[str, LabRobot], site: Mapping[str, object], *, see
             reader = threading.Thread(target=streams.run, name="machine", daemon=True)
             reader.start()
             try:
-                yield GuestLab(streams, members, lambda: _check(machine), Deadline.after(_START_S))
+                yield GuestLab(streams, members, lambda: _check(machine), draw, Deadline.after(_START_S))
             finally:
                 ours.shutdown(socket.SHUT_RDWR)
                 reader.join()

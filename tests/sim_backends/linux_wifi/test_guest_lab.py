@@ -3,7 +3,7 @@
 import socket
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -11,11 +11,16 @@ import pytest
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, LinkError, TestbedLostError
+from fieldkit.core.model import Vector
 from fieldkit.lab import folder
+from fieldkit.lab.protocol import Overview
 from fieldkit.lab.robots import Destination, LabRobot
+from sim_backends.emulated import interactive_lab
+from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.linux_wifi import lab_relay
 from sim_backends.linux_wifi.guest_lab import GuestLab
 from sim_backends.linux_wifi.streams import Streams
+from sim_backends.world.world import load_world
 from tests.helpers.runs import fieldkit
 
 pytestmark = pytest.mark.emulated
@@ -25,6 +30,10 @@ MEMBERS = {
     name: LabRobot(name, load_profile("turtlebot3_burger"), f"10.42.0.{number}")
     for number, name in enumerate(("robot-1", "robot-2"), start=1)
 }
+
+
+def draw(places_m: Mapping[str, Vector]) -> Overview:
+    return interactive_lab.overview(MEMBERS, places_m, EmulatedOptions.defaults(), load_world("open"))
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +55,7 @@ def lab(directory: Path) -> Iterator[GuestLab]:
         reader = threading.Thread(target=streams.run)
         for thread in (served, reader):
             thread.start()
-        yield GuestLab(streams, MEMBERS, lambda: None, Deadline.after(WITHIN_S))
+        yield GuestLab(streams, MEMBERS, lambda: None, draw, Deadline.after(WITHIN_S))
         host.shutdown(socket.SHUT_RDWR)
         for thread in (served, reader):
             thread.join(WITHIN_S)
@@ -57,7 +66,7 @@ def test_state_and_moves_are_those_of_the_lab(lab: GuestLab, directory: Path) ->
     assert lab.programs("robot-1")[:2] == ("sshd", "sensors")
     assert lab.move("robot-1", Destination(20.0, 10.0, None, relative=False)) == pytest.approx((20, 10, 0.2))
     assert lab.place_m("robot-1") == pytest.approx((20, 10, 0.2))
-    assert set(lab.overview().robots) == {"robot-1", "robot-2"}
+    assert lab.overview().robots["robot-1"] == pytest.approx((20, 10))
     with pytest.raises(ConfigurationError, match="robot-3"):
         lab.move("robot-3", Destination(0, 0, None, relative=True))
 
@@ -97,7 +106,7 @@ def test_a_machine_that_has_ended_is_reported() -> None:
         raise TestbedLostError("ended")
 
     with socket.socketpair()[0] as host, pytest.raises(TestbedLostError, match="ended"):
-        GuestLab(Streams(host.fileno()), MEMBERS, check_alive, Deadline.after(WITHIN_S))
+        GuestLab(Streams(host.fileno()), MEMBERS, check_alive, draw, Deadline.after(WITHIN_S))
 
 
 def test_a_machine_that_answers_nonsense_is_reported() -> None:
@@ -113,6 +122,6 @@ def test_a_machine_that_answers_nonsense_is_reported() -> None:
 
         threading.Thread(target=answer).start()
         with pytest.raises(LinkError, match="no valid answer"):
-            GuestLab(streams, MEMBERS, lambda: None, Deadline.after(WITHIN_S))
+            GuestLab(streams, MEMBERS, lambda: None, draw, Deadline.after(WITHIN_S))
         host.shutdown(socket.SHUT_RDWR)
         reader.join(WITHIN_S)
