@@ -3,16 +3,22 @@
 import os
 import shutil
 import subprocess
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
 from sim_backends.emulated.process.worker import PATH
 
 _FOLDER: Final = Path("/sys/class/ieee80211")
 _CLASS: Final = "mac80211_hwsim"
+_MODULE: Final = Path("/sys/module/mac80211_hwsim")
 _RADIO_BIT: Final = 0x40
+_RETURN_S: Final = 5.0
+"""The kernel returns the radios of a network namespace some time after its last process has exited."""
+_POLL_S: Final = 0.05
 _TIMEOUT_S: Final = 60.0
 
 
@@ -60,17 +66,23 @@ def find_radios(folder: Path = _FOLDER) -> list[Radio]:
 
 
 def runs_here() -> bool:
-    """Return True if this process can use radios of hwsim: it is root, and the kernel has such radios."""
-    return os.geteuid() == 0 and bool(find_radios())
+    """Return True if this process can use radios of hwsim: it is root, and the kernel has the module."""
+    return os.geteuid() == 0 and _MODULE.exists()
 
 
-def require_radios(count: int) -> list[Radio]:
+def require_radios(count: int, wait_s: float = _RETURN_S) -> list[Radio]:
     """Return this number of radios.
+
+    Args:
+        count: The number.
+        wait_s: Maximum time to wait for radios of a lab that has just ended.
 
     Raises:
         ConfigurationError: There are fewer.
     """
-    radios = find_radios()
+    deadline = Deadline.after(wait_s)
+    while len(radios := find_radios()) < count and not deadline.expired:
+        time.sleep(_POLL_S)
     if len(radios) < count:
         raise ConfigurationError(
             f"the lab has {count} robots, but mac80211_hwsim has {len(radios)} radios here",

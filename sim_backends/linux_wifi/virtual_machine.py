@@ -63,6 +63,8 @@ _KERNEL_OPTIONS: Final = (
 )
 _INSTRUCTION_CLOCK: Final = "fieldkit.clock=instructions"
 """Kernel option that marks a machine whose clock counts instructions."""
+_EMULATED_PROCESSOR: Final = "Nehalem"
+"""The first processor with all instructions that numpy needs. Later ones, for example with AVX2, are slower."""
 _NS_PER_INSTRUCTION_EXPONENT: Final = 1
 """An emulated instruction needs 2^1 ns: 500 million instructions per second, as of a slow processor."""
 
@@ -311,7 +313,8 @@ def _mount_command(results: Path) -> str:
 def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[str]:
     accelerators = _accelerators()
     options = _KERNEL_OPTIONS if "kvm" in accelerators else f"{_KERNEL_OPTIONS} {_INSTRUCTION_CLOCK}"
-    argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *accelerators, "-cpu", "max"]
+    argv = ["setpriv", "--pdeathsig", "KILL", "--", "qemu-system-x86_64", *accelerators]
+    argv += ["-cpu", "max" if "kvm" in accelerators else _EMULATED_PROCESSOR]
     argv += ["-m", str(memory_mib), "-nodefaults", "-nic", "none", "-display", "none", "-no-reboot"]
     argv += ["-kernel", "kernel", "-initrd", "initrd", "-append", options]
     argv += ["-serial", "file:console", "-device", "virtio-rng-pci"]

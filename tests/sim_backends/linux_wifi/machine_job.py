@@ -20,6 +20,7 @@ from fieldkit.core.model import Role
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.linux_wifi import medium_program
+from sim_backends.linux_wifi.radios import require_radios
 from sim_backends.linux_wifi.wifi_client import WifiClient
 from sim_backends.world.world import load_world
 
@@ -138,7 +139,7 @@ def main() -> None:
             note("error", str(error))
         start_medium(lab.medium)
         note("restarted", lab.wait_for_link())
-    note("radios_left", run("iw", "dev"))
+    note("radios", [radio.interface for radio in require_radios(3)])
     sys.stdout.write(f"RESULTS {json.dumps(results)}\n")
 
 

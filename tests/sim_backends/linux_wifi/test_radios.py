@@ -38,7 +38,7 @@ def test_too_few_radios_are_an_error_with_the_command_that_adds_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(radios, "find_radios", lambda: [Radio("phy0", "wlan0", "42:00:00:00:00:00")])
-    assert len(radios.require_radios(1)) == 1
+    assert len(radios.require_radios(1, wait_s=0.0)) == 1
     with pytest.raises(ConfigurationError) as caught:
-        radios.require_radios(3)
+        radios.require_radios(3, wait_s=0.0)
     assert "radios=3" in caught.value.remedy
