@@ -254,7 +254,7 @@ class Attended(Protocol):
 CLOCK: Final = "clock"
 """Purpose of the simulator of time, in `Simulating.simulators`."""
 INSTRUCTIONS: Final = "instructions"
-"""A clock that counts the instructions of an emulated processor: times are no durations."""
+"""A clock that counts the instructions of a processor in software: times are no durations."""
 
 
 class Backend(Protocol):

@@ -20,7 +20,7 @@ from fieldkit.trial.procedure import PlacedStep
 from fieldkit.trial.step_errors import StepErrors
 
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
-_NO_TIMES: Final = "its clock counts the instructions of an emulated processor"
+_NO_TIMES: Final = "its clock counts the instructions of a processor in software"
 
 
 @dataclass(frozen=True)

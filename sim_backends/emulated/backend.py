@@ -103,7 +103,7 @@ class EmulatedBackend:
     def simulators(self) -> Mapping[str, str]:
         """Implement `Simulating.simulators`."""
         if self._options.has_linux_wifi:
-            from sim_backends.linux_wifi import virtual_machine  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import virtual_machine  # noqa: PLC0415 (other labs need none of it)
 
             clock = {CLOCK: INSTRUCTIONS} if virtual_machine.clock_counts_instructions() else {}
             return {"wifi": "linux", **clock}
@@ -118,13 +118,13 @@ class EmulatedBackend:
         """Implement `Relocating.must_relocate`: the Wi-Fi of Linux needs radios of hwsim in this kernel."""
         if not self._options.has_linux_wifi:
             return False
-        from sim_backends.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
+        from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
 
         return not radios.runs_here()
 
     def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
         """Implement `Relocating.run_elsewhere` by a virtual machine."""
-        from sim_backends.linux_wifi import guest  # noqa: PLC0415 (as above)
+        from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
         return guest.run_command(argv, results, radios=len(self._site.robots))
 
@@ -216,7 +216,7 @@ class EmulatedBackend:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
         if self.must_relocate:
-            from sim_backends.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)

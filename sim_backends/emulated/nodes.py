@@ -32,7 +32,7 @@ from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
-    from sim_backends.linux_wifi.radios import Radio as HwsimRadio
+    from sim_backends.emulated.linux_wifi.radios import HwsimRadio
 
 # Equal to the robots' own radios, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
@@ -297,11 +297,11 @@ def running_robots(
         wifi: Mapping[RobotKey, WifiSpec] = {}
         radios: Mapping[str, HwsimRadio] = {}
         if options.has_linux_wifi:
-            from sim_backends.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
+            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
 
             wifi = lab.parts(robots)
             radios = lab.radios_of(robots.values())
-            medium: MediumClient = stack.enter_context(lab.medium(options, world, seed, radios))
+            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios))
         elif options.is_cosimulated:
             medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
         else:
