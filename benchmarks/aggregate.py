@@ -148,7 +148,7 @@ def run_pandas(folder: Path, out: Path) -> Run:
     return run([sys.executable, "-m", "benchmarks.pandas_peer", str(folder)], out)
 
 
-def check(ours: Path, theirs: Path) -> None:
+def check(fieldkit_output: Path, peer_output: Path) -> None:
     """Compare counts, means, medians and percentiles.
 
     Raises:
@@ -158,11 +158,11 @@ def check(ours: Path, theirs: Path) -> None:
         (tuple(map(str, cell["key"].values())), name): tuple(
             estimate[part] for part in ("n", "mean", "median", "p95")
         )
-        for cell in json.loads(ours.read_bytes())["cells"]
+        for cell in json.loads(fieldkit_output.read_bytes())["cells"]
         for name, estimate in cell["estimates"].items()
     }
     peer_figures: Figures = {
-        (tuple(key), name): tuple(rest[:4]) for key, name, *rest in json.loads(theirs.read_bytes())
+        (tuple(key), name): tuple(rest[:4]) for key, name, *rest in json.loads(peer_output.read_bytes())
     }
     close = our_figures.keys() == peer_figures.keys() and all(
         math.isclose(our_value, peer_value, rel_tol=1e-6)

@@ -50,20 +50,20 @@ def figures(output: Path) -> dict[tuple[str, ...], tuple[float, ...]]:
     }
 
 
-def check(ours: Path, theirs: Path) -> None:
+def check(fieldkit_output: Path, peer_output: Path) -> None:
     """Compare the figures of two outputs.
 
     Raises:
         RuntimeError: They differ.
     """
-    our_figures, peer_figures = figures(ours), figures(theirs)
-    same = our_figures.keys() == peer_figures.keys() and all(
+    our_figures, peer_figures = figures(fieldkit_output), figures(peer_output)
+    is_equal = our_figures.keys() == peer_figures.keys() and all(
         math.isclose(a, b, rel_tol=1e-6)
         for key in our_figures
         for a, b in zip(our_figures[key], peer_figures[key], strict=True)
     )
-    if not same or not our_figures:
-        raise RuntimeError(f"{ours.name} and {theirs.name} differ: {our_figures} {peer_figures}")
+    if not is_equal or not our_figures:
+        raise RuntimeError(f"{fieldkit_output.name} and {peer_output.name} differ: {our_figures} {peer_figures}")
 
 
 def run_round(archive: Path, work: Path) -> dict[str, Run]:
@@ -84,6 +84,8 @@ def run_round(archive: Path, work: Path) -> dict[str, Run]:
     outputs = {name: work / f"{name.replace(', ', '-').replace(' ', '-')}.json" for name in programs}
     for name, program in programs.items():
         runs[name] = program(outputs[name])
+        load = os.getloadavg()[0]
+        print(f"{name}: {runs[name].wall_s:.1f} s, load average {load:.1f}", file=sys.stderr, flush=True)
     first, *others = outputs.values()
     for output in others:
         check(first, output)

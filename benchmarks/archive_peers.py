@@ -24,17 +24,23 @@ def by_pandas(folder: Path) -> list[list[Any]]:
     return [[*key, *map(float, figures)] for key, figures in zip(cells.index, cells.to_numpy(), strict=True)]
 
 
-def by_duckdb(source: str) -> list[list[Any]]:
-    """Return conditions with number, mean and median of a table that DuckDB reads."""
+def _query(folder: Path, text: str) -> Any:  # noqa: ANN401 (a relation of DuckDB)
+    """Return the result of a query; what does not fit into memory is written next to the archive."""
     import duckdb  # noqa: PLC0415 (as above)
 
+    duckdb.execute(f"SET temp_directory = '{folder.parent / 'duckdb'}'")
+    return duckdb.sql(text)
+
+
+def by_duckdb(folder: Path, source: str) -> list[list[Any]]:
+    """Return conditions with number, mean and median of a table that DuckDB reads."""
     keys = ", ".join(BY)
     query = (
         f"SELECT {keys}, count({QUANTITY}), avg({QUANTITY}), median({QUANTITY}) FROM {source} "
         "WHERE CAST(distance_m AS DOUBLE) < 20 AND topology = 'master' AND status = 'valid' "
         f"AND {QUANTITY} IS NOT NULL GROUP BY {keys}"
     )
-    rows: Any = duckdb.sql(query)
+    rows = _query(folder, query)
     return [
         [str(float(value)) if name == "distance_m" else value for name, value in zip(BY, row, strict=False)]
         + list(row[len(BY) :])
@@ -48,13 +54,11 @@ def main() -> None:
     tables = f"read_csv('{folder}/**/trial.csv', union_by_name=true, sample_size=-1)"
     parquet = folder.parent / PARQUET
     if name == "write":
-        import duckdb  # noqa: PLC0415 (as above)
-
-        duckdb.sql(f"COPY (SELECT * FROM {tables}) TO '{parquet}' (FORMAT parquet)")
+        _query(folder, f"COPY (SELECT * FROM {tables}) TO '{parquet}' (FORMAT parquet)")
     elif name == "pandas":
         print(json.dumps(by_pandas(folder)))
     else:
-        print(json.dumps(by_duckdb(tables if name == "duckdb" else f"'{parquet}'")))
+        print(json.dumps(by_duckdb(folder, tables if name == "duckdb" else f"'{parquet}'")))
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ Exchange = Callable[[int], object]
 """Makes an exchange; its argument is the simulated time in nanoseconds."""
 
 
-class Still:
+class StationaryPhysics:
     """A physics whose robots do not move.
 
     Args:
@@ -72,7 +72,7 @@ class Still:
         return self._states
 
 
-class Silent:
+class IdleNetwork:
     """A network without packets."""
 
     def __init__(self, hello: Hello) -> None:
@@ -98,17 +98,17 @@ def echo(request_bytes: int, answer_bytes: int, port: int) -> None:
     with socket.create_connection(("127.0.0.1", port)) as connection:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while True:
-            left = request_bytes
-            while left:
-                received = len(connection.recv(left))
+            remaining = request_bytes
+            while remaining:
+                received = len(connection.recv(remaining))
                 if not received:
                     return
-                left -= received
+                remaining -= received
             connection.sendall(answer)
 
 
 @dataclass(frozen=True)
-class Party:
+class ExchangePeer:
     """An exchange, and the process of its other side.
 
     Attributes:
@@ -121,7 +121,7 @@ class Party:
 
 
 @contextmanager
-def floor(request_bytes: int, answer_bytes: int) -> Iterator[Party]:
+def floor(request_bytes: int, answer_bytes: int) -> Iterator[ExchangePeer]:
     """Yield an exchange over a plain socket."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         sizes = (str(request_bytes), str(answer_bytes), str(server.getsockname()[1]))
@@ -132,28 +132,28 @@ def floor(request_bytes: int, answer_bytes: int) -> Iterator[Party]:
 
     def exchange(_: int) -> None:
         connection.sendall(request)
-        left = answer_bytes
-        while left:
-            left -= len(connection.recv(left))
+        remaining = answer_bytes
+        while remaining:
+            remaining -= len(connection.recv(remaining))
 
     try:
-        yield Party(exchange, [process.pid])
+        yield ExchangePeer(exchange, [process.pid])
     finally:
         connection.close()
         process.wait()
 
 
 @contextmanager
-def opened(role: str, where: str, count: int, pids: Sequence[int] = ()) -> Iterator[Party]:
+def opened(role: str, where: str, count: int, pids: Sequence[int] = ()) -> Iterator[ExchangePeer]:
     """Yield an exchange with an external federate: `physics` or `network`."""
     before = child_pids()
     if role == "physics":
         with closing(open_physics(where, make_hello(PHYSICS, count), 60.0)) as physics:
-            yield Party(lambda to_ns: physics.advance(to_ns, {}), pids or sorted(child_pids() - before))
+            yield ExchangePeer(lambda to_ns: physics.advance(to_ns, {}), pids or sorted(child_pids() - before))
         return
     states = {agent.name: agent.start for agent in make_hello(NETWORK, count).agents}
     with closing(open_network(where, make_hello(NETWORK, count), 60.0)) as network:
-        yield Party(lambda to_ns: network.advance(to_ns, (), states), pids or sorted(child_pids() - before))
+        yield ExchangePeer(lambda to_ns: network.advance(to_ns, (), states), pids or sorted(child_pids() - before))
 
 
 def served(role: str, address: str = "") -> str:
@@ -164,7 +164,7 @@ def served(role: str, address: str = "") -> str:
 
 
 @contextmanager
-def listening(role: str, scheme: str, count: int) -> Iterator[Party]:
+def listening(role: str, scheme: str, count: int) -> Iterator[ExchangePeer]:
     """Yield an exchange with a federate that listens."""
     served_at = where = f"{scheme}:benchmark_{os.getpid()}"
     if scheme in {"tcp", "udp"}:
@@ -180,7 +180,7 @@ def listening(role: str, scheme: str, count: int) -> Iterator[Party]:
 
 
 @contextmanager
-def connected_to(program: Path, count: int) -> Iterator[Party]:
+def connected_to(program: Path, count: int) -> Iterator[ExchangePeer]:
     """Yield an exchange over TCP with a program that has the connection as its standard input and output."""
     with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
 
@@ -192,7 +192,7 @@ def connected_to(program: Path, count: int) -> Iterator[Party]:
 
         started = pool.submit(start)
         with opened("physics", f"tcp:127.0.0.1:{server.getsockname()[1]}", count) as party:
-            yield Party(party.exchange, [started.result().pid])
+            yield ExchangePeer(party.exchange, [started.result().pid])
         started.result().wait()
 
 
@@ -241,7 +241,7 @@ class Times:
         return Times(statistics.median(walls), min(walls), statistics.median(cpus))
 
 
-def measure(parties: Mapping[str, Party]) -> dict[str, Times]:
+def measure(parties: Mapping[str, ExchangePeer]) -> dict[str, Times]:
     """Return the times of each exchange."""
     rounds: dict[str, list[tuple[float, float]]] = {name: [] for name in parties}
     to_ns = 0
@@ -259,9 +259,9 @@ def measure(parties: Mapping[str, Party]) -> dict[str, Times]:
 
 def results(count: int, program: Path | None, *, has_ros: bool) -> dict[str, Times]:
     """Return the times with a number of agents, by role and transport, and those of the peers."""
-    inproc = Still(make_hello(PHYSICS, count))
+    inproc = StationaryPhysics(make_hello(PHYSICS, count))
     with ExitStack() as stack:
-        parties = {"physics inproc": Party(lambda to_ns: inproc.advance(to_ns, {}))}
+        parties = {"physics inproc": ExchangePeer(lambda to_ns: inproc.advance(to_ns, {}))}
         answer_bytes = _PHYSICS_ANSWER_BYTES + count * STATE.size
         parties["plain socket"] = stack.enter_context(floor(_PHYSICS_REQUEST_BYTES, answer_bytes))
         if program is not None:
@@ -298,7 +298,7 @@ def main() -> None:
         return
     if arguments.serve:
         role, *address = arguments.serve
-        serve(Still if role == "physics" else Silent, address=address[0] if address else None)
+        serve(StationaryPhysics if role == "physics" else IdleNetwork, address=address[0] if address else None)
         return
     with tempfile.TemporaryDirectory() as folder, ros_master() as has_ros:
         program = compiled(Path(folder))

@@ -111,8 +111,8 @@ def places_m(distance_m: float) -> dict[str, tuple[float, float, float]]:
 
 def loss_db(distance_m: float, *, wall: bool) -> float:
     """Return the path loss for ns-3, including the wall."""
-    near, far = (np.array([place]) for place in places_m(distance_m).values())
-    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(near, far, CHANNEL_6_HZ)[0])
+    start_m, end_m = (np.array([place]) for place in places_m(distance_m).values())
+    return path_loss_db(distance_m) + float(world(wall=wall).penetration_loss_db(start_m, end_m, CHANNEL_6_HZ)[0])
 
 
 class Link:
@@ -211,20 +211,20 @@ def measure_link(ns3: Ns3, cell: Cell, pool: ProcessPoolExecutor) -> Row:
             return Row(cell, newreno, cubic, udp_loss)
 
 
-def ratio_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float, float]:
+def ratio_of(fieldkit: np.ndarray, ns3: np.ndarray) -> tuple[float, float, float]:
     """Return the ratio of two means and its 95 % interval, from the logarithm's variance; NaN without goodput."""
-    if min(ours.mean(), theirs.mean()) < 0.01:
+    if min(fieldkit.mean(), ns3.mean()) < 0.01:
         return math.nan, math.nan, math.nan
-    spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) / runs.mean() ** 2 for runs in (ours, theirs)))
-    factor = math.exp(student.ppf(0.975, 2 * len(ours) - 2) * spread)
-    ratio = float(ours.mean() / theirs.mean())
+    spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) / runs.mean() ** 2 for runs in (fieldkit, ns3)))
+    factor = math.exp(student.ppf(0.975, 2 * len(fieldkit) - 2) * spread)
+    ratio = float(fieldkit.mean() / ns3.mean())
     return ratio, ratio / factor, ratio * factor
 
 
-def points_of(ours: np.ndarray, theirs: np.ndarray) -> tuple[float, float]:
+def points_of(fieldkit: np.ndarray, ns3: np.ndarray) -> tuple[float, float]:
     """Return the difference of two mean shares in percentage points, and half of its 95 % interval."""
-    spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) for runs in (ours, theirs)))
-    return 100 * float(ours.mean() - theirs.mean()), 100 * float(student.ppf(0.975, 2 * len(ours) - 2)) * spread
+    spread = math.sqrt(sum(runs.var(ddof=1) / len(runs) for runs in (fieldkit, ns3)))
+    return 100 * float(fieldkit.mean() - ns3.mean()), 100 * float(student.ppf(0.975, 2 * len(fieldkit) - 2)) * spread
 
 
 def rows(ns3: Ns3, name_parts: Sequence[str]) -> Iterable[Row]:
@@ -246,8 +246,8 @@ def traces(ns3: Ns3) -> dict[Control, tuple[Trace, Trace]]:
     cell = Cell("g54", wall=False, distance_m=20)
     for control in CONTROLS:
         links = Ns3Link(ns3, cell, 1, "802.11g"), Link(cell, 1)
-        theirs, ours = (link.tcp(control, TRACE_S)[1] for link in links)
-        result[control] = theirs, ours
+        ns3_trace, trace = (link.tcp(control, TRACE_S)[1] for link in links)
+        result[control] = ns3_trace, trace
     return result
 
 
@@ -284,7 +284,7 @@ def line(row: Row) -> str:
     parts = [f"{row.cell!s:32}{len(row.newreno):3} runs"]
     for name, values in (("newreno", row.newreno), ("cubic", row.cubic)):
         means = " ".join(f"{mean:6.2f}" for mean in values.mean(axis=0))
-        ratios = (ratio_of(values[:, -1], theirs) for theirs in values.T[:-1])
+        ratios = (ratio_of(values[:, -1], ns3) for ns3 in values.T[:-1])
         intervals = " ".join(
             "-" if math.isnan(ratio[0]) else "{:.2f} [{:.2f}, {:.2f}]".format(*ratio) for ratio in ratios
         )
@@ -315,11 +315,13 @@ def draw(path: Path, results: Sequence[Row], windows: dict[Control, tuple[Trace,
         left.plot(at_m, means[:, -1], "o", color=f"C{number}", markerfacecolor="none")
     left.set(xlabel="distance (m)", ylabel="goodput of NewReno (Mbit/s)", ylim=(-1, 38))
     left.legend(title="ns-3, corrected: lines; ours: marks", fontsize="small", ncols=2, loc="upper right")
-    for axes, (control, (theirs, ours)) in zip(others, windows.items(), strict=True):
-        for trace, colour, label in ((theirs, "0.6", "ns-3"), (ours, "C0", "ours")):
+    for axes, (control, (ns3, fieldkit)) in zip(others, windows.items(), strict=True):
+        for trace, colour, label in ((ns3, "0.6", "ns-3"), (fieldkit, "C0", "ours")):
             # One value per 20 ms is enough for the figure.
-            kept = {round(at_s / 0.02): window for at_s, window in trace}
-            axes.plot([0.02 * step for step in kept], list(kept.values()), color=colour, label=label, linewidth=1)
+            sampled = {round(at_s / 0.02): window for at_s, window in trace}
+            axes.plot(
+                [0.02 * step for step in sampled], list(sampled.values()), color=colour, label=label, linewidth=1
+            )
         axes.set(xlabel="time (s)", ylabel="congestion window (segments)", title=CONTROLS[control], ylim=(0, 210))
         axes.legend(fontsize="small")
     figure.savefig(path, metadata={"Date": None})

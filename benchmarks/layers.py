@@ -111,10 +111,10 @@ def _transmit(model: RadioModel[int], receiver: str, packets: int) -> tuple[floa
 
 def round_trips(layer: Layer) -> Figures:
     """Return round trips in ms through the medium, and their mean without the delays from the model."""
-    with swarm(2, layer.radio(), layer.load()) as (medium, (near, _)):
-        near.run("ping", "-c", "3", "10.9.0.2")
+    with swarm(2, layer.radio(), layer.load()) as (medium, (client, _)):
+        client.run("ping", "-c", "3", "10.9.0.2")
         before_ms = _modelled_ms(medium)
-        pings = near.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
+        pings = client.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
         rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
         modelled_ms = (_modelled_ms(medium) - before_ms) / len(rtt_ms)
     return {

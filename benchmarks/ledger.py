@@ -69,8 +69,8 @@ def store_attempt(ledger: Ledger, plan: Plan, folder: Path, repeat: RepeatId) ->
     attempt_folder = store.open_attempt(folder, repeat)
     (attempt_folder / "ping.txt").write_text(_PING, encoding="ascii")
     ledger.measured(attempt)
-    judged = gates.judge(plan, repeat, AttemptEvidence(attempt_folder))
-    ledger.commit(attempt_folder, replace(attempt, status=Status.VALID), judged.measured)
+    verdict = gates.judge(plan, repeat, AttemptEvidence(attempt_folder))
+    ledger.commit(attempt_folder, replace(attempt, status=Status.VALID), verdict.measured)
     return time.perf_counter() - started_s
 
 

@@ -49,14 +49,14 @@ def medium_path(
     options: RadioOptions, seed: int = 1, *, on_cosimulation: bool = False
 ) -> Iterator[tuple[Namespace, Namespace]]:
     """Yield two namespaces 9 m apart on a medium with `options`; the second has the address 10.9.0.2."""
-    client = _cosimulated(options, seed) if on_cosimulation else MediumClient(options, seed=seed)
-    with Namespace() as near, Namespace() as far, client as medium:
-        for name, namespace, address in (("near", near, "10.9.0.1/24"), ("far", far, "10.9.0.2/24")):
+    medium_client = _cosimulated(options, seed) if on_cosimulation else MediumClient(options, seed=seed)
+    with Namespace() as client, Namespace() as server, medium_client as medium:
+        for name, namespace, address in (("client", client, "10.9.0.1/24"), ("server", server, "10.9.0.2/24")):
             fd = namespace.tun("wlan0", address)
             medium.attach(name, address, RADIO, fd)
             os.close(fd)
-        medium.place({"near": (0.0, 0.0, 0.0), "far": (9.0, 0.0, 0.0)})
-        yield near, far
+        medium.place({"client": (0.0, 0.0, 0.0), "server": (9.0, 0.0, 0.0)})
+        yield client, server
 
 
 def _cosimulated(options: RadioOptions, seed: int) -> MediumClient:
@@ -67,21 +67,21 @@ def _cosimulated(options: RadioOptions, seed: int) -> MediumClient:
 @contextmanager
 def veth_path() -> Iterator[tuple[Namespace, Namespace]]:
     """Yield two namespaces joined by a veth pair; the second has the address 10.9.0.2."""
-    with Namespace() as near, Namespace() as far:
-        near.veth(far, "10.9.0.1/24", "10.9.0.2/24")
-        yield near, far
+    with Namespace() as client, Namespace() as server:
+        client.veth(server, "10.9.0.1/24", "10.9.0.2/24")
+        yield client, server
 
 
-def measure_throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:
+def measure_throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
     """Return round-trip times in ms, TCP bit/s and packets per second."""
-    near.run("ping", "-c", "3", "10.9.0.2")
-    pings = near.run("ping", "-c", "1000", "-i", "0.002", "10.9.0.2", timeout_s=60.0).stdout
+    client.run("ping", "-c", "3", "10.9.0.2")
+    pings = client.run("ping", "-c", "1000", "-i", "0.002", "10.9.0.2", timeout_s=60.0).stdout
     rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
-    with listening_iperf(far):
-        tcp = iperf(near, seconds)
-        carried_before = packets_in(far)
-        udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
-        carried = packets_in(far) - carried_before
+    with listening_iperf(server):
+        tcp = iperf(client, seconds)
+        carried_before = packets_in(server)
+        udp = iperf(client, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
+        carried = packets_in(server) - carried_before
     received = udp["sum"]["packets"] - udp["sum"]["lost_packets"]
     return {
         "rtt_median_ms": statistics.median(rtt_ms),
@@ -121,13 +121,13 @@ def iperf(namespace: Namespace, seconds: float, *options: str) -> dict[str, dict
     return end
 
 
-def measure_delay(near: Namespace, far: Namespace, probes: int) -> list[float]:
+def measure_delay(client: Namespace, server: Namespace, probes: int) -> list[float]:
     """Return one-way delays in ms of datagrams sent every 2 ms."""
     module = ("-m", "benchmarks.medium", "--probes", str(probes))
-    receiver = far.start(sys.executable, *module, "--probe", "receive")
+    receiver = server.start(sys.executable, *module, "--probe", "receive")
     assert receiver.stdout is not None
     receiver.stdout.readline()
-    sender = near.start(sys.executable, *module, "--probe", "send")
+    sender = client.start(sys.executable, *module, "--probe", "send")
     delays, _ = receiver.communicate(timeout=probes * 0.002 + 30)
     sender.communicate(timeout=10)
     return [float(word) for word in delays.split()]
@@ -184,10 +184,10 @@ def measure_round(seconds: float, probes: int, *, on_cosimulation: bool = False)
         ends = stack.enter_context(veth_path())
         veth = measure_throughput(*ends, seconds)
         veth |= errors("delay_error", measure_delay(*ends, probes))
-    with medium_path(radio("0ms"), on_cosimulation=on_cosimulation) as (near, far):
-        medium = measure_throughput(near, far, seconds)
-    with medium_path(radio(f"{DELAY_MS}ms"), on_cosimulation=on_cosimulation) as (near, far):
-        delays_ms = measure_delay(near, far, probes)
+    with medium_path(radio("0ms"), on_cosimulation=on_cosimulation) as (client, server):
+        medium = measure_throughput(client, server, seconds)
+    with medium_path(radio(f"{DELAY_MS}ms"), on_cosimulation=on_cosimulation) as (client, server):
+        delays_ms = measure_delay(client, server, probes)
         medium |= errors("delay_error", [value - DELAY_MS for value in delays_ms])
     return {"veth": veth, "medium": medium, "timer": errors("delay_error", timer_lateness_ms(500))}
 

@@ -1,4 +1,4 @@
-"""Processor time of the medium per packet, in turns with another version: `python -m benchmarks.medium_cost FOLDER`.
+"""Processor time of the medium per packet, compared with another version: `python -m benchmarks.medium_cost FOLDER`.
 
 FOLDER is a checkout of the other version, for example by `git worktree add`; the program needs root. Only the process
 of the medium is of that version: the senders are the same. Each round sends datagrams of 64 bytes at a fixed rate
@@ -49,19 +49,19 @@ def processor_us(project: Path, options: RadioOptions, rate: int, seconds: float
     """
     with ExitStack() as stack:
         stack.enter_context(mock.patch.object(worker, "PROJECT", project))
-        near, far = stack.enter_context(Namespace()), stack.enter_context(Namespace())
+        client, server = stack.enter_context(Namespace()), stack.enter_context(Namespace())
         medium = stack.enter_context(MediumClient(options, seed=1))
-        for name, namespace, address in (("near", near, "10.9.0.1/24"), ("far", far, "10.9.0.2/24")):
+        for name, namespace, address in (("client", client, "10.9.0.1/24"), ("server", server, "10.9.0.2/24")):
             fd = namespace.tun("wlan0", address)
             medium.attach(name, address, RADIO, fd)
             os.close(fd)
-        medium.place({"near": (0.0, 0.0, 0.0), "far": (9.0, 0.0, 0.0)})
-        near.run("ping", "-c", "3", "10.9.0.2")
-        carried, spent_ns = packets_in(far), _processor_ns(medium.pid)
-        near.run(sys.executable, "-c", _SEND, str(round(rate * seconds)), str(1 / rate), timeout_s=seconds + 60)
+        medium.place({"client": (0.0, 0.0, 0.0), "server": (9.0, 0.0, 0.0)})
+        client.run("ping", "-c", "3", "10.9.0.2")
+        carried, spent_ns = packets_in(server), _processor_ns(medium.pid)
+        client.run(sys.executable, "-c", _SEND, str(round(rate * seconds)), str(1 / rate), timeout_s=seconds + 60)
         time.sleep(0.1)
         spent_ns = _processor_ns(medium.pid) - spent_ns
-        carried = packets_in(far) - carried
+        carried = packets_in(server) - carried
     if not carried:
         raise RuntimeError(f"the medium of {project} delivered no packet")
     return spent_ns / 1e3 / carried
@@ -82,14 +82,14 @@ def main() -> None:
     print(f"{arguments.rounds} rounds, median (lowest to highest), processor time of the medium in us per packet")
     print(f"{'':14}{'this version':>26}{'the other':>26}{'ratio':>24}")
     for name, (options, rate) in RADIOS.items():
-        here: list[float] = []
-        there: list[float] = []
+        here_us: list[float] = []
+        other_us: list[float] = []
         for number in range(arguments.rounds):
-            turns = [(worker.PROJECT, here), (arguments.other.resolve(), there)]
+            turns = [(worker.PROJECT, here_us), (arguments.other.resolve(), other_us)]
             for project, spent_us in turns if number % 2 == 0 else reversed(turns):
                 spent_us.append(processor_us(project, options, rate, arguments.seconds))
-        ratios = [this / other for this, other in zip(here, there, strict=True)]
-        print(f"{name:14}{_spread(here, 1):>26}{_spread(there, 1):>26}{_spread(ratios, 3):>24}")
+        ratios = [this / other for this, other in zip(here_us, other_us, strict=True)]
+        print(f"{name:14}{_spread(here_us, 1):>26}{_spread(other_us, 1):>26}{_spread(ratios, 3):>24}")
 
 
 def _spread(values: list[float], digits: int) -> str:

@@ -69,8 +69,8 @@ def measure_mujoco(count: int, seconds: float) -> dict[str, float]:
 
     MuJoCo alone and the co-simulation alternate, so that a drift of the machine's speed favours neither.
     """
-    alone, coupled = moving_robots(count), moving_robots(count)
-    model, data = alone.model, alone.data
+    uncoupled, coupled = moving_robots(count), moving_robots(count)
+    model, data = uncoupled.model, uncoupled.data
     coordinator = Coordinator(Agents(coupled, {}), NoPackets(), SlidingWindow(WINDOW_S), [])
     coordinator.advance(START_NS)
     alone_s, coupled_s = [], []
@@ -78,7 +78,7 @@ def measure_mujoco(count: int, seconds: float) -> dict[str, float]:
     for block in range(1, round(seconds / WINDOW_S / BLOCK) + 1):
         started_s = time.process_time()
         for _ in range(BLOCK):
-            alone.run_controllers()
+            uncoupled.run_controllers()
             mujoco.mj_step(model, data, nstep=STEPS)
         between_s = time.process_time()
         coordinator.advance(START_NS + block * BLOCK * STEPS * STEP_NS)

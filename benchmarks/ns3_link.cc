@@ -1,6 +1,7 @@
 // Results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: frame error by mode and SNR;
 // `durations`: airtime in ns by frame size in bytes; `link`:
-// goodput in Mbit/s of saturated stations that send UDP to one receiver, all with the same distance from each other; `udp`
+// goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same distance
+// from each other; `udp`
 // and `tcp`: goodput and loss of a stream at a rate, or at the full rate of TCP, and the events of the TCP sender.
 
 #include "ns3/applications-module.h"
@@ -86,6 +87,9 @@ struct Options
     uint16_t streams = 1;
     uint16_t guard_ns = 800;
     uint32_t ampdu = 0;
+    uint32_t rts = 4692480;
+    bool bare = false;
+    std::string classes = "0";
     std::string band = "BAND_2_4GHZ";
     bool relay = false;
     bool adapt = false;
@@ -135,8 +139,8 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     phy.Set("Antennas", UintegerValue(options.streams));
     phy.Set("MaxSupportedTxSpatialStreams", UintegerValue(options.streams));
     phy.Set("MaxSupportedRxSpatialStreams", UintegerValue(options.streams));
-    // Without RTS, also before aggregates of more than 65,535 bytes; the window of Block Acks of 802.11ax.
-    Config::SetDefault("ns3::WifiRemoteStationManager::RtsCtsThreshold", UintegerValue(4692480));
+    // By default without RTS, also before aggregates of more than 65,535 bytes; the window of Block Acks of 802.11ax.
+    Config::SetDefault("ns3::WifiRemoteStationManager::RtsCtsThreshold", UintegerValue(options.rts));
     Config::SetDefault("ns3::HeConfiguration::MpduBufferSize", UintegerValue(256));
     Config::SetDefault("ns3::HtConfiguration::ShortGuardIntervalSupported", BooleanValue(options.guard_ns == 400));
     Config::SetDefault("ns3::HeConfiguration::GuardInterval", TimeValue(NanoSeconds(std::max<int>(options.guard_ns, 800))));
@@ -148,14 +152,17 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     }
     else
     {
+        std::string prefix = high ? "OfdmRate" : "ErpOfdmRate";
         wifi.SetRemoteStationManager("ns3::ConstantRateWifiManager", "DataMode", StringValue(options.mode),
-                                     "NonUnicastMode", StringValue(high ? "OfdmRate6Mbps" : "ErpOfdmRate6Mbps"));
+                                     "ControlMode", StringValue(prefix + "24Mbps"),
+                                     "NonUnicastMode", StringValue(prefix + "6Mbps"));
     }
     WifiMacHelper mac;
     auto ampdu = UintegerValue(options.ampdu);
     if (!options.relay)
     {
-        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", ampdu);
+        mac.SetType("ns3::AdhocWifiMac", "BE_MaxAmpduSize", ampdu,
+                    "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
         return wifi.Install(phy, mac, nodes);
     }
     auto ssid = SsidValue(Ssid("fieldkit"));
@@ -164,15 +171,26 @@ NetDeviceContainer Install(const Options& options, NodeContainer nodes)
     {
         stations.Add(nodes.Get(n));
     }
-    mac.SetType("ns3::StaWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", ampdu);
+    mac.SetType("ns3::StaWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", ampdu,
+                    "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
     auto devices = wifi.Install(phy, mac, stations);
-    mac.SetType("ns3::ApWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", ampdu);
+    mac.SetType("ns3::ApWifiMac", "Ssid", ssid, "BE_MaxAmpduSize", ampdu,
+                    "BK_MaxAmpduSize", ampdu, "VI_MaxAmpduSize", ampdu, "VO_MaxAmpduSize", ampdu);
     devices.Add(wifi.Install(phy, mac, nodes.Get(nodes.GetN() - 1)));
     return devices;
 }
 
-double Goodput(const Options& options)
+// Goodput of the stations of each traffic class.
+std::vector<double> Goodputs(const Options& options)
 {
+    if (options.bare)
+    {
+        // ns-3 3.37 counts failed aggregates to a receiver until 7, also if others succeeded in between, and then drops
+        // a whole aggregate. After each failed aggregate it sends a BlockAckReq with a backoff of its own.
+        Config::SetDefault("ns3::QosTxop::UseExplicitBarAfterMissedBlockAck", BooleanValue(false));
+        Config::SetDefault("ns3::WifiRemoteStationManager::MaxSsrc", UintegerValue(1000000));
+        Config::SetDefault("ns3::WifiRemoteStationManager::MaxSlrc", UintegerValue(1000000));
+    }
     if (options.ampdu)
     {
         // Frames that exceed a time limit would leave gaps in the windows of the Block Acks.
@@ -189,25 +207,48 @@ double Goodput(const Options& options)
     internet.Install(nodes);
     Ipv4AddressHelper addresses("10.0.0.0", "255.255.255.0");
     auto interfaces = addresses.Assign(devices);
-    auto to = InetSocketAddress(interfaces.GetAddress(options.stations), 9);
-    PacketSinkHelper sink("ns3::UdpSocketFactory", to);
-    auto received = DynamicCast<PacketSink>(sink.Install(nodes.Get(options.stations)).Get(0));
+    std::vector<uint8_t> classes;
+    std::istringstream words(options.classes);
+    for (std::string word; std::getline(words, word, ',');)
+    {
+        classes.push_back(std::stoul(word));
+    }
+    std::vector<InetSocketAddress> targets;
+    std::vector<Ptr<PacketSink>> sinks;
+    for (std::size_t number = 0; number < classes.size(); number++)
+    {
+        InetSocketAddress to(interfaces.GetAddress(options.stations), 9 + number);
+        to.SetTos(classes[number]);
+        PacketSinkHelper sink("ns3::UdpSocketFactory", to);
+        sinks.push_back(DynamicCast<PacketSink>(sink.Install(nodes.Get(options.stations)).Get(0)));
+        targets.push_back(to);
+    }
     // A saturated station, without events for many packets that exceed its queue.
     uint64_t offered_bit_s =
         options.ampdu ? 1.1 * WifiMode(options.mode).GetDataRate(options.width, options.guard_ns, options.streams) : 70000000;
     for (uint32_t n = 0; n < options.stations; n++)
     {
-        OnOffHelper source("ns3::UdpSocketFactory", to);
+        OnOffHelper source("ns3::UdpSocketFactory", targets[n % targets.size()]);
         source.SetConstantRate(DataRate(offered_bit_s), options.payload);
         source.Install(nodes.Get(n)).Start(Seconds(kWarmUpS + 0.001 * n));
     }
-    uint64_t before = 0;
-    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { before = received->GetTotalRx(); });
+    std::vector<double> bits(sinks.size());
+    auto count = [&](double sign) {
+        for (std::size_t number = 0; number < sinks.size(); number++)
+        {
+            bits[number] += sign * 8.0 * sinks[number]->GetTotalRx();
+        }
+    };
+    Simulator::Schedule(Seconds(2 * kWarmUpS), [&] { count(-1); });
     Simulator::Stop(Seconds(2 * kWarmUpS + options.seconds));
     Simulator::Run();
-    double bits = 8.0 * (received->GetTotalRx() - before);
+    count(1);
     Simulator::Destroy();
-    return bits / options.seconds / 1e6;
+    for (auto& value : bits)
+    {
+        value /= options.seconds * 1e6;
+    }
+    return bits;
 }
 
 // Lost packets, by comma-separated numbers from 0, in the order of arrival.
@@ -409,6 +450,9 @@ int main(int argc, char** argv)
     command.AddValue("streams", "spatial streams", options.streams);
     command.AddValue("guard", "guard interval, ns", options.guard_ns);
     command.AddValue("ampdu", "maximum size of an A-MPDU, bytes; 0 for none", options.ampdu);
+    command.AddValue("rts", "size of the largest frame without RTS, bytes", options.rts);
+    command.AddValue("bare", "without BlockAckReq and without a retry limit", options.bare);
+    command.AddValue("classes", "traffic classes (TOS) of the stations, by turns, comma-separated", options.classes);
     command.AddValue("band", "ns-3's name of the band", options.band);
     command.AddValue("relay", "send through an access point", options.relay);
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);
@@ -443,7 +487,11 @@ int main(int argc, char** argv)
     }
     else
     {
-        std::cout << Goodput(options) << "\n";
+        for (double value : Goodputs(options))
+        {
+            std::cout << value << " ";
+        }
+        std::cout << "\n";
     }
     return 0;
 }

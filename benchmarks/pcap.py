@@ -276,7 +276,10 @@ def main() -> None:
     print(f"load average before: {load:.2f} on {os.cpu_count()} cores\n")
     print("| | packets/s, median (lowest to highest) | fieldkit is faster by |\n| --- | --- | --- |")
     for peer, values in rates_by_peer.items():
-        ratios = [ours / theirs for ours, theirs in zip(rates_by_peer["fieldkit"], values, strict=True)]
+        ratios = [
+            fieldkit_rate / peer_rate
+            for fieldkit_rate, peer_rate in zip(rates_by_peer["fieldkit"], values, strict=True)
+        ]
         spread = f"{statistics.median(values):,.0f} ({min(values):,.0f} to {max(values):,.0f})"
         print(f"| {peer} | {spread} | {statistics.median(ratios):,.1f} |")
     print("\n" + ", ".join(f"{key} {value:,.1f}" for key, value in big.items()))

@@ -136,23 +136,23 @@ def path_loss_db(distance_m: float) -> float:
 def rows(ns3: Ns3) -> list[Row]:
     """Return goodputs in Mbit/s over distance, for contending stations, and through an access point."""
 
-    def theirs(**options: object) -> float:
+    def ns3_mbit_s(**options: object) -> float:
         return float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
 
     results: list[Row] = []
     for mode in FIXED:
         for distance_m in DISTANCES_M:
-            ns3_value = theirs(loss=path_loss_db(distance_m), mode=ns3_name(mode))
+            ns3_value = ns3_mbit_s(loss=path_loss_db(distance_m), mode=ns3_name(mode))
             results.append((f"{mode.name}, {distance_m} m", ns3_value, goodput_mbit_s(distance_m, mode=mode)))
     for distance_m in DISTANCES_M:
-        ns3_value = theirs(loss=path_loss_db(distance_m), adapt=1)
+        ns3_value = ns3_mbit_s(loss=path_loss_db(distance_m), adapt=1)
         results.append((f"minstrel, {distance_m} m", ns3_value, goodput_mbit_s(distance_m)))
     for mode in (FIXED[0], FIXED[-1]):
         for stations in STATIONS:
-            ns3_value = theirs(loss=path_loss_db(5), mode=ns3_name(mode), stations=stations)
-            ours = goodput_mbit_s(5, stations=stations, mode=mode)
-            results.append((f"{mode.name}, {stations} contending", ns3_value, ours))
-        ns3_value = theirs(loss=path_loss_db(5), mode=ns3_name(mode), relay=1)
+            ns3_value = ns3_mbit_s(loss=path_loss_db(5), mode=ns3_name(mode), stations=stations)
+            fieldkit_mbit_s = goodput_mbit_s(5, stations=stations, mode=mode)
+            results.append((f"{mode.name}, {stations} contending", ns3_value, fieldkit_mbit_s))
+        ns3_value = ns3_mbit_s(loss=path_loss_db(5), mode=ns3_name(mode), relay=1)
         results.append((f"{mode.name}, through an access point", ns3_value, goodput_mbit_s(5, mode=mode, relay=True)))
     return results
 
@@ -171,9 +171,9 @@ def main() -> None:
     print("packet error against ratio, largest shift at errors of 50, 10 and 1 % (dB):")
     print("  " + ", ".join(f"{name} {shift_db(curve):+.2f}" for name, curve in curves.items()))
     print(f"{'UDP goodput (Mbit/s)':32}{'ns-3':>9}{'ours':>9}{'ratio':>8}")
-    for what, theirs, ours in goodputs:
-        ratio = f"{ours / theirs:8.3f}" if theirs > 0.05 else f"{'-':>8}"
-        print(f"{what:32}{theirs:9.2f}{ours:9.2f}{ratio}")
+    for what, ns3_mbit_s, fieldkit_mbit_s in goodputs:
+        ratio = f"{fieldkit_mbit_s / ns3_mbit_s:8.3f}" if ns3_mbit_s > 0.05 else f"{'-':>8}"
+        print(f"{what:32}{ns3_mbit_s:9.2f}{fieldkit_mbit_s:9.2f}{ratio}")
     if arguments.figure:
         draw(arguments.figure, curves, goodputs)
 

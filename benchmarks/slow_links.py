@@ -81,12 +81,12 @@ class SlowLinks:
         for opened in (*self._listeners, self._wake_sender, self._wake_receiver):
             opened.close()
 
-    def carry(self, far: socket.socket) -> socket.socket:
-        """Return the near end of a new stream to `far`."""
+    def carry(self, far_end: socket.socket) -> socket.socket:
+        """Return the near end of a new stream to `far_end`."""
         with socket.create_server(("127.0.0.1", 0)) as listener:
-            near = socket.create_connection(listener.getsockname(), _CONNECT_S)
-            self._add(listener.accept()[0], far)
-        return near
+            near_end = socket.create_connection(listener.getsockname(), _CONNECT_S)
+            self._add(listener.accept()[0], far_end)
+        return near_end
 
     def port(self, connect: Connect) -> int:
         """Return a loopback port whose streams are connected by `connect`."""
@@ -97,12 +97,12 @@ class SlowLinks:
         port: int = listener.getsockname()[1]
         return port
 
-    def _add(self, near: socket.socket, far: socket.socket) -> None:
-        for end in (near, far):
+    def _add(self, near_end: socket.socket, far_end: socket.socket) -> None:
+        for end in (near_end, far_end):
             end.settimeout(_CONNECT_S)
             end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
-            self._streams.append(_Stream(_Direction(near, far), _Direction(far, near)))
+            self._streams.append(_Stream(_Direction(near_end, far_end), _Direction(far_end, near_end)))
         self._wake_sender.send(b"x")
 
     def _run(self) -> None:

@@ -87,27 +87,27 @@ def swarm(
 
 def measure_medium(size: int, options: RadioOptions, seconds: float) -> Figures:
     """Return the figures of the medium for two of `size` robots."""
-    with swarm(size, options) as (medium, (near, far, *_)):
-        near.run("ping", "-c", "3", "10.9.0.2")
+    with swarm(size, options) as (medium, (client, server, *_)):
+        client.run("ping", "-c", "3", "10.9.0.2")
         before = Counter(medium.stats().late)
-        figures = round_trips(near)
+        figures = round_trips(client)
         figures |= lateness(medium, before)
-        figures |= throughput(near, far, seconds)
+        figures |= throughput(client, server, seconds)
         if size in TCP_SIZES:
-            figures |= tcp(near, far, seconds)
+            figures |= tcp(client, server, seconds)
         return figures
 
 
 def measure_veth(seconds: float) -> Figures:
     """Return the figures of a veth pair."""
-    with veth_path() as (near, far):
-        near.run("ping", "-c", "3", "10.9.0.2")
-        return round_trips(near) | throughput(near, far, seconds) | tcp(near, far, seconds)
+    with veth_path() as (client, server):
+        client.run("ping", "-c", "3", "10.9.0.2")
+        return round_trips(client) | throughput(client, server, seconds) | tcp(client, server, seconds)
 
 
-def round_trips(near: Namespace) -> Figures:
-    """Return the round trips from `near` to 10.9.0.2, in ms."""
-    pings = near.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
+def round_trips(client: Namespace) -> Figures:
+    """Return the round trips from `client` to 10.9.0.2, in ms."""
+    pings = client.run("ping", "-c", str(PINGS), "-i", "0.01", "10.9.0.2", timeout_s=60.0).stdout
     rtt_ms = [float(value) for value in re.findall(r"time=([\d.]+)", pings)]
     return {"rtt_median_ms": statistics.median(rtt_ms), "rtt_p99_ms": quantile(rtt_ms, 0.99)}
 
@@ -121,18 +121,18 @@ def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
     }
 
 
-def throughput(near: Namespace, far: Namespace, seconds: float) -> Figures:
-    """Return the rate of small packets that `far` receives."""
-    with listening_iperf(far):
-        arrived = packets_in(far)
-        udp = iperf(near, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
-        return {"packets_s": (packets_in(far) - arrived) / udp["sum"]["seconds"]}
+def throughput(client: Namespace, server: Namespace, seconds: float) -> Figures:
+    """Return the rate of small packets that `server` receives."""
+    with listening_iperf(server):
+        arrived = packets_in(server)
+        udp = iperf(client, seconds, "-u", "-b", "0", "-l", str(PAYLOAD_BYTES))
+        return {"packets_s": (packets_in(server) - arrived) / udp["sum"]["seconds"]}
 
 
-def tcp(near: Namespace, far: Namespace, seconds: float) -> Figures:
+def tcp(client: Namespace, server: Namespace, seconds: float) -> Figures:
     """Return the throughput of TCP."""
-    with listening_iperf(far):
-        return {"tcp_mbit_s": iperf(near, seconds)["sum_received"]["bits_per_second"] / 1e6}
+    with listening_iperf(server):
+        return {"tcp_mbit_s": iperf(client, seconds)["sum_received"]["bits_per_second"] / 1e6}
 
 
 def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: int, pairs: int) -> Figures:

@@ -54,20 +54,22 @@ def cosim_bit_s(link: Link, congestion: Congestion, seconds: float, seed: int) -
     """Return the goodput of the co-simulation's TCP in bit/s."""
     network = RadioNetwork(
         UniformLinks(seed, link.options),
-        ("near", "far"),
+        ("client", "server"),
         transports={"tcp": partial(Tcp, options=TcpOptions(congestion=congestion))},
     )
     count = math.ceil(_MAX_GOODPUT_BIT_S * seconds / (8 * MESSAGE_BYTES))
-    stream = [Packet(number, "near", "far", MESSAGE_BYTES, ("s", number), 0, 0, "tcp") for number in range(count)]
-    states = {"near": State((0.0, 0.0, 0.0)), "far": State((9.0, 0.0, 0.0))}
+    stream = [
+        Packet(number, "client", "server", MESSAGE_BYTES, ("s", number), 0, 0, "tcp") for number in range(count)
+    ]
+    states = {"client": State((0.0, 0.0, 0.0)), "server": State((9.0, 0.0, 0.0))}
     arrivals, _ = network.advance(round(seconds * 1e9), stream, states)
     return len(arrivals) * MESSAGE_BYTES * 8 / seconds
 
 
 def kernel_bit_s(link: Link, control: str, seconds: float, seed: int) -> float:
     """Return the goodput of the kernel's TCP in bit/s."""
-    with medium_path(link.options, seed=seed) as (near, far), listening_iperf(far):
-        return iperf(near, seconds, "--congestion", control)["sum_received"]["bits_per_second"]
+    with medium_path(link.options, seed=seed) as (client, server), listening_iperf(server):
+        return iperf(client, seconds, "--congestion", control)["sum_received"]["bits_per_second"]
 
 
 def ratio(cosim_runs: np.ndarray, kernel_array: np.ndarray) -> tuple[float, float]:

@@ -124,9 +124,10 @@ class AlternatingPeers:
         for phase in self.script.repeat(protocol, number, SCRIPT_LIMIT_S):
             self._phases[phase] = time.monotonic_ns()
         tools = self._store("script", protocol, number, time.monotonic_ns())
-        ours, theirs = command_lines(expected), command_lines(tools)
-        if ours and theirs and ours != theirs:
-            raise RuntimeError(f"the peers differ: fieldkit ran {ours - theirs}, the script {theirs - ours}")
+        fieldkit_lines, script_lines = command_lines(expected), command_lines(tools)
+        if fieldkit_lines and script_lines and fieldkit_lines != script_lines:
+            only_fieldkit, only_script = fieldkit_lines - script_lines, script_lines - fieldkit_lines
+            raise RuntimeError(f"the peers differ: fieldkit ran {only_fieldkit}, the script {only_script}")
 
     def _restart_timing(self) -> None:
         self._phases = {}

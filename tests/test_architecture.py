@@ -125,7 +125,8 @@ ONE_IMPORTER = {
     # Connections, and key formats.
     "paramiko": "fieldkit/remote/keys.py fieldkit/remote/link.py",
     "keyring": "fieldkit/remote/passwords.py",
-    "rich": "fieldkit/cli/display.py",
+    # The width of texts on a terminal.
+    "rich": "fieldkit/cli/display.py fieldkit/cli/event_words.py",
     "argcomplete": "fieldkit/cli/commands/completion.py",
     # Messages of the drone, and, in a separate process, reading its log.
     "pymavlink": "fieldkit/motion/logs/tlog_reader.py sim_backends/emulated/autopilot/mavlink_frames.py",
@@ -396,6 +397,7 @@ FEDERATE_SEAMS = {
         "simulator_options",
         "transports",
     },
+    "sim_backends/cosim/scenario/build.py": {"ip_radio"},
     "sim_backends/cosim/scenario/federate_choice.py": {"frames", "named", "simulator_options"},
     "sim_backends/cosim/scenario/served.py": {"frames", "handshake", "serving"},
     "sim_backends/cosim/commands/conform.py": {"conformance", "frames", "handshake", "named", "protocols", "session"},

@@ -200,7 +200,7 @@ def policy_tables(rows: Sequence[StudyRow]) -> Iterator[str]:
         yield ""
         yield f"{title}:"
         yield ""
-        yield f"| method | {' | '.join(', '.join(pair) for pair in pairs)} |"
+        yield f"| policy | {' | '.join(', '.join(pair) for pair in pairs)} |"
         yield f"| --- |{' --- |' * len(pairs)}"
         for policy in policies:
             cells = [_cell(cell, by_pair.get((pair, policy), []), by_pair[pair, REFERENCE]) for pair in pairs]
@@ -233,8 +233,8 @@ def cost_text(runs: Sequence[StudyRow], _: Sequence[StudyRow]) -> str:
 
 
 MEASURES: Final[Mapping[str, Cell]] = {
-    "Mean delay that the method adds (ms)": added_text,
-    "Distance of robots from their positions with the exact method (mm)": path_text,
+    "Mean delay that the policy adds (ms)": added_text,
+    "Distance of robots from their positions with the exact policy (mm)": path_text,
     "Exchanges and wall time (s), per simulated second": cost_text,
 }
 

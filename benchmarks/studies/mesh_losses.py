@@ -42,8 +42,8 @@ ANTENNA_M: Final = 0.2
 Places = Mapping[str, tuple[float, float]]
 
 THREE_HOPS: Final[Places] = {"sender": (0, 0), "first": (35, -60), "last": (95, -60), "receiver": (130, 0)}
-BESIDE_FOUR: Final[Places] = {**THREE_HOPS, "left": (20, 75), "middle": (75, 95), "right": (130, 75)}
-BESIDE_THREE: Final[Places] = {**THREE_HOPS, "left": (35, 60), "right": (95, 60)}
+THREE_AND_FOUR_HOPS: Final[Places] = {**THREE_HOPS, "left": (20, 75), "middle": (75, 95), "right": (130, 75)}
+TWICE_THREE_HOPS: Final[Places] = {**THREE_HOPS, "left": (35, 60), "right": (95, 60)}
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,9 @@ class Detour:
 
 
 DETOURS: Final = (
-    Detour("four hops beside three", BESIDE_FOUR, ("first",), fading=False),
-    Detour("three hops beside three", BESIDE_THREE, ("first", "left"), fading=True),
-    Detour("four hops beside three", BESIDE_FOUR, ("first",), fading=True),
+    Detour("paths of three and four hops", THREE_AND_FOUR_HOPS, ("first",), fading=False),
+    Detour("two paths of three hops", TWICE_THREE_HOPS, ("first", "left"), fading=True),
+    Detour("paths of three and four hops", THREE_AND_FOUR_HOPS, ("first",), fading=True),
 )
 
 

@@ -144,7 +144,7 @@ class ImageLab:
         path = self._folder / f"{verb}.bin"
         path.write_bytes(data)
         log = topic_samples.read_log(path)
-        if not log.whole:
+        if not log.is_complete:
             raise RuntimeError(f"{path} is incomplete")
         return [int(number) for number in log.samples.sequence]
 

@@ -29,16 +29,16 @@ SAME: Final = (
 VARIED: Final = frozenset({"distance_m"})
 """Columns among `SAME` that may be the variable of a comparison; another protocol or topology changes more."""
 
-_OF_SYSTEMS: Final = frozenset({"tcp_congestion_control"})
+_KERNEL_COLUMNS: Final = frozenset({"tcp_congestion_control"})
 """Columns of the robots' operating systems. A comparison of backends includes their difference: the kernels of real
 robots, of the laptop that emulates them, or the TCP of a simulation."""
 
-_IDENTITY: Final = frozenset({"profiles_sha256", "procedure_sha256"})
+_IDENTITY_COLUMNS: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 
 SIZE_TOLERANCE: Final = 0.05
 """Largest acceptable difference of the median sent sizes, as a share of the smaller one."""
 
-_MIXED: Final = (
+_MIXTURES: Final = (
     (
         "code_sha256",
         "schema_version",
@@ -51,7 +51,9 @@ _MIXED: Final = (
 
 _PAYLOAD: Final = "rtt_payload_bytes"
 
-MIXED_BY: Final = frozenset((*(name for column, within, _ in _MIXED for name in (column, within)), _PAYLOAD))
+MIXTURE_COLUMNS: Final = frozenset(
+    (*(name for column, grouping, _ in _MIXTURES for name in (column, grouping)), _PAYLOAD)
+)
 """Columns that `mixtures` needs in addition to those that identify conditions."""
 
 _MESSAGES: Final = 2
@@ -118,8 +120,8 @@ def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
         repeats: All attempts of the run.
         by: Columns that identify a condition.
     """
-    for name, within, message in _MIXED:
-        if len(set(repeats.keys((within, name)))) > len(set(repeats.column(within))):
+    for name, grouping, message in _MIXTURES:
+        if len(set(repeats.keys((grouping, name)))) > len(set(repeats.column(grouping))):
             yield message
     for name in (column for column in repeats.numbers if plain_name(column) == _PAYLOAD):
         with_payload = repeats.where(np.isfinite(repeats.numbers[name]))
@@ -132,7 +134,7 @@ def notes(a: Repeats, b: Repeats) -> Iterator[Concern]:
     """Yield notes on all repeats: different versions of fieldkit, or attempts that are in both runs."""
     yield from _compare_column("code_sha256", a, b, refuses=False)
     if common := len(_attempts(a) & _attempts(b)):
-        yield Concern("attempts that the other run has too", str(common), str(common), (), refuses=False)
+        yield Concern("attempts that are in both runs", str(common), str(common), (), refuses=False)
 
 
 def _attempts(rows: Repeats) -> set[Key]:
@@ -142,7 +144,7 @@ def _attempts(rows: Repeats) -> set[Key]:
 def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[Concern]:
     for name in SAME:
         is_varied = name in varied and all(len(set(rows.column(name))) == 1 for rows in (a, b))
-        is_of_backends = name in _OF_SYSTEMS and not set(a.column("backend")) & set(b.column("backend"))
+        is_of_backends = name in _KERNEL_COLUMNS and not set(a.column("backend")) & set(b.column("backend"))
         yield from _compare_column(name, a, b, refuses=not (is_varied or is_of_backends))
     yield from _file_sizes(a, b)
     yield from _datagram_sizes(a, b)
@@ -153,8 +155,8 @@ def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iter
     of_a, of_b = _values(name, a), _values(name, b)
     unknown = UNKNOWN in {of_a, of_b}
     # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
-    if of_a != of_b or (unknown and name in _IDENTITY):
-        yield Concern(name, of_a, of_b, (), refuses and (not unknown or name in _IDENTITY))
+    if of_a != of_b or (unknown and name in _IDENTITY_COLUMNS):
+        yield Concern(name, of_a, of_b, (), refuses and (not unknown or name in _IDENTITY_COLUMNS))
 
 
 def _values(name: str, rows: Repeats) -> str:

@@ -38,9 +38,14 @@ def _metadata(folder: Path, key: str) -> object:
     return json.loads((_schema(folder).metadata or {}).get(key.encode(), b"[]"))
 
 
-def condition(folder: Path) -> tuple[str, ...]:
-    """Return the columns that identify a condition: the flow and the factors of the sweep; errors as `read`."""
-    return tuple(map(str, _metadata(folder, "by")))  # type: ignore[call-overload]
+def condition(folder: Path) -> dict[str, str]:
+    """Return the columns that identify a condition: the flow and the factors of the sweep; errors as `read`.
+
+    Returns:
+        The columns, in order; for each, the column that has its values as in the command of the sweep.
+    """
+    by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
+    return dict(zip(by, (*by[:1], *partitions), strict=True))
 
 
 def declared_columns(folder: Path) -> tuple[Column, ...]:

@@ -164,7 +164,10 @@ def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
 def _texts(column: pa.ChunkedArray) -> Texts:
     encoded = column.unify_dictionaries().combine_chunks()
     distinct = np.array([*map(unescape_formula, encoded.dictionary.to_pylist()), ""], dtype=np.object_)
-    return np.asarray(distinct[_buffer_values(encoded.indices, np.int32)], dtype=np.object_)
+    codes = _buffer_values(encoded.indices, np.int32)
+    if encoded.null_count:
+        codes = np.where(_missing(column), len(distinct) - 1, codes)
+    return np.asarray(distinct[codes], dtype=np.object_)
 
 
 def _numbers(column: pa.ChunkedArray) -> Numbers:
@@ -175,8 +178,12 @@ def _numbers(column: pa.ChunkedArray) -> Numbers:
         typed = column.cast(pa.uint8()) if column.type == pa.bool_() else column
         numbers = _buffer_values(typed.cast(pa.float64()).combine_chunks(), np.float64).copy()
     if column.null_count:
-        numbers[_buffer_values(column.is_null().cast(pa.uint8()).combine_chunks(), np.uint8) != 0] = np.nan
+        numbers[_missing(column)] = np.nan
     return numbers
+
+
+def _missing(column: pa.ChunkedArray) -> NDArray[np.bool_]:
+    return np.asarray(_buffer_values(column.is_null().cast(pa.uint8()).combine_chunks(), np.uint8) != 0)
 
 
 def _buffer_values(array: pa.Array, kind: type[np.generic]) -> NDArray[Any]:

@@ -62,14 +62,14 @@ def read(
         parts.append(part)
         order.append(np.repeat(batch.numbers, counts))
 
-    known = frozenset[Path]()
+    indexed_paths = frozenset[Path]()
     paths = list(paths)
     if indexed is not None and (from_index := _read_indexed(indexed, paths, named)) is not None:
-        known = indexed.tables
+        indexed_paths = indexed.tables
         parts.append(from_index[0])
         order.append(from_index[1])
     for number, path in enumerate(paths):
-        if path in known:
+        if path in indexed_paths:
             continue
         if path.is_dir():
             dataset = _read_dataset(path, named)

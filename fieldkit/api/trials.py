@@ -257,5 +257,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", us
         raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')
     # Processes that read plans would import the main module of a script, which may not be prepared for it.
     workers = sources.ALL_PROCESSORS if rebuild else Workers(jobs=1)
-    found = sources.find([Path(path) for path in paths], _note, rebuild=rebuild, workers=workers, use_index=use_index)
-    return Trials(found.with_filter(where))
+    trial_sources = sources.find(
+        [Path(path) for path in paths], _note, rebuild=rebuild, workers=workers, use_index=use_index
+    )
+    return Trials(trial_sources.with_filter(where))

@@ -13,8 +13,9 @@ from fieldkit.campaign.journal import CampaignJournal, TrialProgress
 from fieldkit.campaign.order import PlannedTrial, walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.core import files
+from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent, Note, Sink
+from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Topology
 from fieldkit.core.prompts import Operator
 from fieldkit.core.units import TimeEstimate, format_bytes

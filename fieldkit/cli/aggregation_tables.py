@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.analysis import paper_tables, result_tables, table_lines, wording
 from fieldkit.analysis.cells import Cell, aggregate
-from fieldkit.analysis.comparable import MIXED_BY, mixtures
+from fieldkit.analysis.comparable import MIXTURE_COLUMNS, mixtures
 from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.judgements import Judgement, judge_by_trial
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
@@ -68,7 +68,7 @@ def show(arguments: argparse.Namespace) -> int:
     widths = dict(_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
     needed = {name for quantity in quantities for name in quantity.needed} | {quantity.name for quantity in counted}
-    mixed = {column.name for column in data.columns if plain_name(column.name) in MIXED_BY}
+    mixed = {column.name for column in data.columns if plain_name(column.name) in MIXTURE_COLUMNS}
     repeats = data.read({*by, *needed, *mixed, "started_utc_ns"})
     for mixture in mixtures(repeats, by):
         show_note(mixture.removesuffix("."))

@@ -63,7 +63,7 @@ def read(arguments: argparse.Namespace) -> Sides:
         return Sides(a.read(also=by), b.read(also=by), by, a, frozenset())
     column, _, values = arguments.between.partition("=")
     (name,) = a.condition(column, option="--between")
-    varied = _DISTANCE if name in _DISTANCE else frozenset({name})
+    varied = next((names for names in (_DISTANCE, *_same_factor(a)) if name in names), frozenset({name}))
     if is_default:
         by = tuple(other for other in by if other not in varied)
     rows = [run.read(also=(*by, name)) for run in (a, b)]
@@ -76,6 +76,11 @@ def read(arguments: argparse.Namespace) -> Sides:
         a,
         varied | (_OF_SETTINGS if is_sweep else frozenset()),
     )
+
+
+def _same_factor(run: Sources) -> list[frozenset[str]]:
+    """Return the columns of each factor of a sweep: its values as in the command, and as numbers."""
+    return [frozenset(names) for names in run.sweep_columns.items()]
 
 
 def _require_two(paths: Sequence[Path]) -> None:

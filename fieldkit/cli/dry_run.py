@@ -17,7 +17,7 @@ from fieldkit.trial.plan import Plan
 def print_commands(plan: Plan) -> None:
     """Print the commands of one repeat per protocol, in order, grouped by robot.
 
-    Jobs are shown as a person would type them. In a trial `job.sh` starts them detached.
+    Jobs are shown as they are typed on the robot. In a trial `job.sh` starts them detached.
     """
     repeats_text = f"{format_count(plan.repeats, 'repeat')} per protocol"
     print_text(f"# procedure {plan.procedure.name}, {plan.distance}, {plan.topology}; {repeats_text}")
@@ -46,7 +46,7 @@ def _remarks(plan: Plan) -> Iterator[str]:
     """Yield the remarks that follow from the plan alone, without a query to any robot."""
     for refusal in plan.refusals({}):
         name = plan.cast[refusal.role].name
-        yield f"if {name} is as its profile says, this will be refused: {refusal.what}; {refusal.remedy}"
+        yield f"if {name} has the tools of its profile, this will be refused: {refusal.what}; {refusal.remedy}"
     for line in plan.dry_run_notes(plan.scene(RepeatId(plan.protocols[0], 1), "")):
         yield f"while steps run: {line}"
 

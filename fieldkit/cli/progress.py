@@ -3,22 +3,21 @@
 import time
 from typing import Final
 
+from fieldkit.core.campaign_events import CampaignEnded, CampaignTrial
 from fieldkit.core.events import (
     Answered,
     Asked,
-    CampaignEnded,
-    CampaignTrial,
     Entered,
     Event,
     PhaseStarted,
     Progress,
     RepeatEnded,
     Request,
-    SweepEnded,
     TrialEnded,
     TrialStarted,
     TrialStopped,
 )
+from fieldkit.core.sweep_events import SweepEnded
 from fieldkit.core.units import format_duration
 
 Words = tuple[tuple[str, str], ...]

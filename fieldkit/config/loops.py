@@ -81,20 +81,20 @@ class _Expander:
 
     def _append(self, result: list[Any], items: list[Any], at: Location, to: Location, values: Values) -> None:
         for index, item in enumerate(items):
-            here = (*at, index)
+            key_path = (*at, index)
             if isinstance(item, dict) and _LOOP in item:
                 if len(item) > 1:
                     raise self._problem(
-                        "for: must be the only key of its entry", here, "start another entry with - for:"
+                        "for: must be the only key of its entry", key_path, "start another entry with - for:"
                     )
-                self._append_loop(result, item[_LOOP], (*here, _LOOP), to, values)
+                self._append_loop(result, item[_LOOP], (*key_path, _LOOP), to, values)
                 continue
             self._steps += 1
             if self._steps > MAX_STEPS:
                 raise self._problem(
-                    f"there are more than {MAX_STEPS} steps after for: is expanded", here, "give fewer values"
+                    f"there are more than {MAX_STEPS} steps after for: is expanded", key_path, "give fewer values"
                 )
-            result.append(self._copy(item, here, (*to, len(result)), values))
+            result.append(self._copy(item, key_path, (*to, len(result)), values))
 
     def _append_loop(self, result: list[Any], loop: Any, at: Location, to: Location, values: Values) -> None:  # noqa: ANN401 (any YAML)
         if not isinstance(loop, dict) or set(loop) != set(_KEYS):
@@ -120,20 +120,23 @@ class _Expander:
             raise self._problem("each: of for: has no variable", at, "each: {bytes: [502, 1400]}")
         values_by_name: dict[str, list[Scalar]] = {}
         for name, value_list in each.items():
-            here = (*at, name)
+            key_path = (*at, name)
             if not _VARIABLE.fullmatch(name):
-                raise self._problem(f"{name!r} is not a valid variable", here, "use lower-case letters, digits and _")
+                raise self._problem(
+                    f"{name!r} is not a valid variable", key_path, "use lower-case letters, digits and _"
+                )
             if name in outer:
-                raise self._problem(f"{name} is a variable of an enclosing for:", here, "give it another name")
+                raise self._problem(f"{name} is a variable of an enclosing for:", key_path, "give it another name")
             if not isinstance(value_list, list) or not value_list:
-                raise self._problem(f"the values of {name} are not a list", here, f"{name}: [1, 2]")
+                raise self._problem(f"the values of {name} are not a list", key_path, f"{name}: [1, 2]")
             values_by_name[name] = [
-                self._copy(item, (*here, index), (*here, index), outer) for index, item in enumerate(value_list)
+                self._copy(item, (*key_path, index), (*key_path, index), outer)
+                for index, item in enumerate(value_list)
             ]
             for index, value in enumerate(values_by_name[name]):
                 if not isinstance(value, Scalar):
                     raise self._problem(
-                        f"a value of {name} is not a text or a number", (*here, index), f"{name}: [1, 2]"
+                        f"a value of {name} is not a text or a number", (*key_path, index), f"{name}: [1, 2]"
                     )
         return values_by_name
 

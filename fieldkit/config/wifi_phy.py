@@ -1,13 +1,14 @@
 """Physical layer of a robot's Wi-Fi since 802.11n: the keys of `radio.phy`, and which combinations exist."""
 
 import re
-from typing import Final, Literal, cast
+from typing import Annotated, Final, Literal, cast
 
 from fieldkit.config import schema
-from fieldkit.config.schema import Int, Strict
+from fieldkit.config.schema import Duration, Field, Int, Number, Strict
 
 WifiAmendment = Literal["n", "ac", "ax"]
 WifiBand = Literal["2.4 GHz", "5 GHz", "6 GHz"]
+WifiRateControl = Literal["minstrel", "minstrel_ht", "firmware"]
 
 _STANDARD: Final = re.compile(r"802\.11(n|ac|ax) (2\.4 GHz|5 GHz|6 GHz)")
 _STANDARD_EXAMPLES: Final = "802.11n 2.4 GHz, 802.11n 5 GHz, 802.11ac 5 GHz, 802.11ax 2.4, 5 or 6 GHz"
@@ -36,11 +37,21 @@ class WifiPhy(Strict):
         streams: Number of spatial streams, 1 or 2.
         guard_interval_ns: Shortest guard interval: 400 or 800 ns for 802.11n and ac, 800, 1600 or 3200 ns for
             802.11ax.
+        rate_control: Algorithm that selects its rates: `minstrel_ht` of Linux (SoftMAC drivers), `firmware` for
+            radios whose firmware selects them (brcmfmac, iwlwifi, ath10k), or `minstrel`, Linux's for 802.11g.
+        firmware_margin_db: Rate control `firmware`: margin in dB below the measured signal, 0 to 20.
+        firmware_interval: Rate control `firmware`: time between two selections of a rate, 1 ms to 10 s.
+        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
+            key it sends no RTS, as with `iw phy PHY set rts off`.
     """
 
     width_mhz: Int = 20
     streams: Int = 1
     guard_interval_ns: Int = 800
+    rate_control: WifiRateControl = "minstrel"
+    firmware_margin_db: Annotated[Number | Int, Field(ge=0, le=20)] = 3.0
+    firmware_interval: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
+    rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
 
     @schema.model_validator(mode="after")
     def _check(self) -> "WifiPhy":

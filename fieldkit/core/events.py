@@ -1,10 +1,12 @@
-"""Events of a trial, a campaign or a computation, which the display, the log and `--json` receive."""
+"""Events of a trial, and all events, which the display, the log and `--json` receive."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent
 from fieldkit.core.model import Status, Verdict
+from fieldkit.core.sweep_events import SweepEnded, SweepPlanned, SweepRunEnded
 
 
 @dataclass(frozen=True)
@@ -263,143 +265,6 @@ class TrialStopped:
 
     folder: str
     done: int
-    total: int
-
-
-@dataclass(frozen=True)
-class CampaignPlanned:
-    """The remaining work of a campaign.
-
-    Attributes:
-        name: Its name.
-        trials: The remaining trials, in order.
-        done: Number of finished trials.
-        total: Number of all trials.
-        walk_m: Distance for which robots must be carried, in metres.
-        left_s: Estimated time.
-        needed_bytes: Disk space on this machine that the evidence may need.
-        free_bytes: Free disk space on this machine.
-        left_most_s: Upper estimate of `left_s`, without repeats that must be run again.
-    """
-
-    name: str
-    trials: tuple[str, ...]
-    done: int
-    total: int
-    walk_m: float
-    left_s: float
-    needed_bytes: int
-    free_bytes: int
-    left_most_s: float = 0.0
-
-
-@dataclass(frozen=True)
-class CampaignTrial:
-    """A campaign starts a trial.
-
-    Attributes:
-        trial: Name of the trial.
-        number: Its number among the trials that are run, from 1.
-        total: Number of all trials.
-    """
-
-    trial: str
-    number: int
-    total: int
-
-
-@dataclass(frozen=True)
-class CampaignWent:
-    """A trial of a campaign is finished, or was postponed.
-
-    Attributes:
-        trial: Name of the trial.
-        done: Number of finished trials.
-        total: Number of all trials.
-        left_s: Estimated remaining time.
-        left_most_s: Upper estimate of the remaining time, without repeats that must be run again.
-    """
-
-    trial: str
-    done: int
-    total: int
-    left_s: float
-    left_most_s: float = 0.0
-
-
-@dataclass(frozen=True)
-class CampaignEnded:
-    """The campaign is finished or was stopped; the same command continues it.
-
-    Attributes:
-        folder: Its folder.
-        done: Number of finished trials.
-        total: Number of all trials.
-    """
-
-    folder: str
-    done: int
-    total: int
-
-
-@dataclass(frozen=True)
-class SweepPlanned:
-    """A sweep of simulations starts or continues.
-
-    Attributes:
-        folder: Its folder.
-        done: Number of runs that were finished before.
-        total: Number of all runs.
-        settings: Number of combinations of settings.
-        seeds: Number of seeds of each combination.
-    """
-
-    folder: str
-    done: int
-    total: int
-    settings: int
-    seeds: int
-
-
-@dataclass(frozen=True)
-class SweepRunEnded:
-    """An attempt at a run of a sweep ended.
-
-    Attributes:
-        settings: Its settings: `policy=scheduled, window=10ms`.
-        seed: Its seed.
-        run: Name of its result.
-        reason: Why it failed; empty if it is finished.
-        remedy: What to do about the failure; may be empty.
-        attempt: Number of the attempt, from 1.
-        done: Number of finished runs.
-        total: Number of all runs.
-    """
-
-    settings: str
-    seed: int
-    run: str
-    reason: str
-    remedy: str
-    attempt: int
-    done: int
-    total: int
-
-
-@dataclass(frozen=True)
-class SweepEnded:
-    """A sweep is finished or was stopped; the same command continues it.
-
-    Attributes:
-        folder: Its folder.
-        done: Number of finished runs.
-        failed: Number of failed runs that are not tried again.
-        total: Number of all runs.
-    """
-
-    folder: str
-    done: int
-    failed: int
     total: int
 
 

@@ -1,7 +1,9 @@
 """Atomic replacement of files, sync to disk, free disk space, and safe access to files that other programs wrote."""
 
 import errno
+import fcntl
 import os
+import secrets
 import shutil
 import stat
 from collections.abc import Collection, Iterator
@@ -22,33 +24,80 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     The mode of an existing file is kept, and the file is unchanged if the body raises. An existing symbolic link is
     replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
 
+    If several processes replace a file at the same time, each of them writes complete content, and the last one
+    remains.
+
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.
     """
-    temporary = path.with_name(f".{path.name}.new")
+    temporary: Path | None = None
     with suppress(FileNotFoundError):
         mode = path.lstat().st_mode
         if not stat.S_ISLNK(mode) and (reason := special_file_type(mode)):
             raise OSError(errno.EINVAL, reason, str(path))
     try:
-        with suppress(FileNotFoundError):
-            temporary.unlink()  # left by a crash, or an attacker's link to another file
-        with os.fdopen(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666), "wb") as file:
+        temporary, descriptor = _create_temporary(path)
+        with os.fdopen(descriptor, "wb") as file:
             with suppress(FileNotFoundError):
                 if stat.S_ISREG(mode := path.lstat().st_mode):
                     os.fchmod(file.fileno(), stat.S_IMODE(mode))
             yield file
             file.flush()
             os.fsync(file.fileno())
-        temporary.rename(path)
+            temporary.rename(path)  # before the file is closed, which releases its lock
+            temporary = None
     except OSError as error:
         if error.filename is None:  # the error of a failed write names no file
             error.filename = str(path)
         raise
     finally:
-        with suppress(OSError):  # an earlier error is more useful
-            temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            with suppress(OSError):  # an earlier error is more useful
+                temporary.unlink(missing_ok=True)
     sync_folder(path.parent)
+
+
+def _create_temporary(path: Path) -> tuple[Path, int]:
+    """Create a file next to `path`; return its path and its descriptor, which locks the file until it is closed.
+
+    A file that a killed process left is removed; its lock was released. If another process writes the file now, the
+    new file gets another name.
+
+    Raises:
+        OSError: It cannot be created.
+    """
+    temporary = path.with_name(f".{path.name}.new")
+    _remove_unlocked(temporary)
+    with suppress(FileExistsError):
+        descriptor = _create(temporary)
+        with suppress(OSError):  # a file system without locks, or another process removes the file
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(descriptor).st_nlink:
+            return temporary, descriptor
+        os.close(descriptor)
+    temporary = path.with_name(f".{secrets.token_hex(8)}.new")
+    return temporary, _create(temporary)
+
+
+def _create(path: Path) -> int:
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+
+
+def _remove_unlocked(path: Path) -> None:
+    """Remove a file or a link, unless a process has locked the file or it cannot be removed."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except OSError:
+        with suppress(OSError):  # there is no such file
+            path.unlink()  # for example an attacker's link to another file
+        return
+    try:
+        with suppress(OSError):  # it is locked
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), path.lstat()):
+                path.unlink()
+    finally:
+        os.close(descriptor)
 
 
 def write(path: Path, content: bytes) -> None:

@@ -88,7 +88,7 @@ class _Submission(Generic[Task, Result]):
     ) -> None:
         self._work, self._tasks, self._workers, self._note = work, tasks, workers, note
         self._waiting = deque(range(len(tasks)))
-        self._alone: deque[int] = deque()
+        self._run_alone: deque[int] = deque()
         self._deaths: Counter[int] = Counter()
         self._submitted: dict[Future[Result], int] = {}
         self._executor = workers.open(len(tasks))
@@ -97,7 +97,7 @@ class _Submission(Generic[Task, Result]):
 
     def ends(self) -> Iterator[TaskEnd[Result]]:
         try:
-            while self._waiting or self._alone or self._submitted:
+            while self._waiting or self._run_alone or self._submitted:
                 self._submit()
                 done, _ = wait(self._submitted, _POLL_S, FIRST_COMPLETED)
                 for future in done:
@@ -122,10 +122,10 @@ class _Submission(Generic[Task, Result]):
         self._is_without_worker = not capacity
         limit = max(_PER_WORKER * capacity, self._executor.MIN_SUBMITTED)
         while not self._executor.is_broken():
-            if self._alone:
+            if self._run_alone:
                 if self._submitted:
                     return
-                tasks = self._alone
+                tasks = self._run_alone
             else:
                 tasks = self._waiting
             if not tasks or len(self._submitted) >= limit:
@@ -135,7 +135,7 @@ class _Submission(Generic[Task, Result]):
             except BrokenExecutor:
                 return
             self._submitted[future] = tasks.popleft()
-            if tasks is self._alone:
+            if tasks is self._run_alone:
                 return
 
     def _end(self, future: Future[Result]) -> TaskEnd[Result] | None:
@@ -156,6 +156,6 @@ class _Submission(Generic[Task, Result]):
             remedy = "if memory ran out, use fewer workers: --jobs 1"
             what = f"its worker died {format_count(MAX_DEATHS, 'time')}"
             return TaskEnd(number, error=WorkerDiedError(what, remedy=remedy))
-        (self._alone if self._deaths[number] >= ALONE_AFTER else self._waiting).appendleft(number)
+        (self._run_alone if self._deaths[number] >= ALONE_AFTER else self._waiting).appendleft(number)
         self._lost += 1
         return None

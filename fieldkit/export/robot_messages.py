@@ -180,7 +180,7 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
     """Return the readable recordings of an attempt."""
     captures = {name: evidence.read_or_none(pcap.read, name) for name in planned_evidence.captures(plan)}
     pings = {
-        pinging.file: evidence.read_or_none(ping.read, pinging.file) for pinging in planned_evidence.pingings(plan)
+        source.file: evidence.read_or_none(ping.read, source.file) for source in planned_evidence.ping_sources(plan)
     }
     bags = {role: evidence.read_or_none(recordings.read, name) for role, name in planned_evidence.bags(plan).items()}
     return AttemptRecord(
@@ -242,9 +242,9 @@ def _step(file: str) -> str:
 
 def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
     """Yield the replies to ping that a robot printed, and ICMP errors, at the times of their output."""
-    for pinging in planned_evidence.pingings(record.plan):
-        if pinging.role == role and pinging.file in record.pings:
-            yield from _replies(record, role, pinging.name, pinging.file)
+    for source in planned_evidence.ping_sources(record.plan):
+        if source.role == role and source.file in record.pings:
+            yield from _replies(record, role, source.name, source.file)
 
 
 def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterator[Message]:
@@ -293,9 +293,9 @@ def _spans(record: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, i
                 times_ns = (forward.where(forward.dport == transfer.port) if transfer.name else forward).time_ns
                 if len(times_ns) and times_ns.min() != NO_TIME:
                     yield transfer.name, "transfer", int(times_ns.min()), int(times_ns.max())
-    for pinging in planned_evidence.pingings(record.plan):
-        if pinging.role == role and pinging.file in record.pings:
-            replies = record.pings[pinging.file].replies
+    for source in planned_evidence.ping_sources(record.plan):
+        if source.role == role and source.file in record.pings:
+            replies = record.pings[source.file].replies
             stamps_ns = [reply.at_utc_ns for reply in replies if reply.at_utc_ns is not None]
             if stamps_ns:
-                yield pinging.name, "ping", min(stamps_ns), max(stamps_ns)
+                yield source.name, "ping", min(stamps_ns), max(stamps_ns)

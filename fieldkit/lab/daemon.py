@@ -213,7 +213,7 @@ def _overview(robots: Lab) -> bytes:
 def _state(robots: Lab, up_s: float) -> bytes:
     """Return the state of the lab, or the error of a lab that has lost a process."""
     try:
-        return requests.pack_state(LabState(os.getpid(), up_s, tuple(_robot_states(robots))))
+        return requests.pack_state(LabState(os.getpid(), up_s, tuple(_robot_states(robots)), robots.lateness()))
     except FieldkitError as error:
         return requests.pack_error(error)
 

@@ -80,6 +80,25 @@ class Overview:
     links: Sequence[LabLink]
 
 
+@dataclass(frozen=True)
+class LabLateness:
+    """Lateness of the co-simulation of a lab since the lab was up.
+
+    Attributes:
+        bound_s: Maximum lateness; if a packet or a window was later, results that were measured then are not valid.
+        packet_max_s: Maximum lateness of a packet; None if no packet arrived.
+        window_max_s: Maximum time by which the results of a window were later than its end; None if no window ended.
+        windows: Number of windows that ended.
+        late: Number of packets and windows that were later than the bound.
+    """
+
+    bound_s: float
+    packet_max_s: float | None
+    window_max_s: float | None
+    windows: int
+    late: int
+
+
 class Lab(Protocol):
     """The running robots of a lab."""
 
@@ -130,6 +149,14 @@ class Lab(Protocol):
         """
         ...
 
+    def lateness(self) -> LabLateness | None:
+        """Return the lateness of the co-simulation since the lab was up, or None without a co-simulation.
+
+        Raises:
+            LinkError: The radio does not answer.
+        """
+        ...
+
 
 @runtime_checkable
 class LabBackend(Protocol):
@@ -170,6 +197,22 @@ def unknown_robot(name: str, names: Iterable[str]) -> ConfigurationError:
     return ConfigurationError(
         f"there is no robot {name!r} in this lab", remedy=did_you_mean(name, names, "fieldkit lab ps lists them")
     )
+
+
+@runtime_checkable
+class GazeboWorlds(Protocol):
+    """A backend whose robots a Gazebo of the user can move."""
+
+    def gazebo_world(self, version: str) -> str:
+        """Return the world of the robots as SDF.
+
+        Args:
+            version: Names of the plugins, `fortress`, or `garden` for it and later versions.
+
+        Raises:
+            ConfigurationError: A profile is missing or invalid.
+        """
+        ...
 
 
 def as_lab_backend(name: str, backend: Backend) -> LabBackend:

@@ -15,7 +15,7 @@ from fieldkit.config.json_records import Codec
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError
 from fieldkit.core.model import Vector
 from fieldkit.lab.folder import LabFolder
-from fieldkit.lab.protocol import Overview
+from fieldkit.lab.protocol import LabLateness, Overview
 from fieldkit.lab.robots import Destination
 
 _ERROR_CLASSES: Final = {error_class.__name__: error_class for error_class in (ConfigurationError, LinkError)}
@@ -50,11 +50,13 @@ class LabState:
         pid: Process id.
         up_s: Time since its start was complete.
         robots: Its robots.
+        lateness: Lateness of its co-simulation; None without one.
     """
 
     pid: int
     up_s: float
     robots: tuple[RobotState, ...]
+    lateness: LabLateness | None = None
 
 
 @dataclass(frozen=True)

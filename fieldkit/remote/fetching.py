@@ -24,8 +24,8 @@ ALWAYS_ALLOWED_BYTES: Final = 1 << 30
 EXPECTED_TIMES: Final = 4
 UNEXPECTED_SHARE: Final = 0.1
 """The total size of large files is limited to the largest of three values: `ALWAYS_ALLOWED_BYTES`, `EXPECTED_TIMES`
-the expected size, and `UNEXPECTED_SHARE` of the free disk. A camera may send more than its profile says, but must not
-fill this disk."""
+the expected size, and `UNEXPECTED_SHARE` of the free disk. A camera may send more than its profile states, but must
+not fill this disk."""
 
 RESERVE_BYTES: Final = 100 << 20
 """Disk space of this machine that evidence must leave free."""

@@ -329,6 +329,8 @@ class _Stream:
                 raise UnfitServerError("the answer to a command has no valid exit code")
         else:
             # Only a possible start of the nonce is kept, because a caller may wait for the output before it.
-            held = next((n for n in range(len(self._nonce) - 1, 0, -1) if output.endswith(self._nonce[:n])), 0)
-            output, self._incomplete = output[: len(output) - held], output[len(output) - held :]
+            partial_bytes = next(
+                (n for n in range(len(self._nonce) - 1, 0, -1) if output.endswith(self._nonce[:n])), 0
+            )
+            output, self._incomplete = output[: len(output) - partial_bytes], output[len(output) - partial_bytes :]
         self.output += output

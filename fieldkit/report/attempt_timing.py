@@ -95,8 +95,8 @@ def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> A
     ]
     bags = {transfer.sent_file: evidence.read_or_none(recordings.read, transfer.sent_file) for transfer in transfers}
     outputs = [
-        (pinging.name, pinging.role, evidence.read_or_none(ping.read, pinging.file))
-        for pinging in planned_evidence.pingings(plan)
+        (source.name, source.role, evidence.read_or_none(ping.read, source.file))
+        for source in planned_evidence.ping_sources(plan)
     ]
     offset_ns, clocks = _clock_offset(
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}

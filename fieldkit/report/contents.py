@@ -32,6 +32,7 @@ from fieldkit.report.charts import Chart
 from fieldkit.report.coverage import absences
 from fieldkit.report.headlines import Headline, Ranking, headlines
 from fieldkit.report.series import Identities
+from fieldkit.report.theme import CYCLE
 from fieldkit.report.trial_folders import Evidence, load_evidence
 
 _ALWAYS_VISIBLE: Final = frozenset(
@@ -53,6 +54,10 @@ _MAX_FURTHER: Final = 12
 """Maximum number of charts of quantities that are not defined by fieldkit."""
 MAX_TRIALS_IN_TABLE: Final = 200
 """Maximum number of trials in the table of their provenance."""
+_CROWDED: Final = (
+    "Figures with a line or a strip per setting are left out, because there are too many settings to distinguish; "
+    "--where chooses fewer."
+)
 _MAX_IN_TABLE: Final = 8
 """Maximum number of visible columns of quantities that are not defined by fieldkit."""
 
@@ -155,7 +160,7 @@ def build_contents(
     paths: Sequence[str] = (),
     quantities: Sequence[str] = (),
     unmeasured: Sequence[str] = (),
-    sweep_condition: Sequence[str] = (),
+    sweep: Mapping[str, str] | None = None,
 ) -> Contents:
     """Return the contents of a report on `repeats`.
 
@@ -167,7 +172,8 @@ def build_contents(
         paths: The paths in it.
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
-        sweep_condition: Columns of the flow and the factors, if the repeats are the runs of sweeps.
+        sweep: Columns of the flow and the factors, each with the column that has its values as in the command, if
+            the repeats are the runs of sweeps.
     """
     evidence = load_evidence(repeats, repeat)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
@@ -176,42 +182,48 @@ def build_contents(
     row = repeat_to_draw(cells, evidence, repeat)
     ranking = Ranking(evidence)
     first = list(dict.fromkeys(plain_name(quantity.name) for quantity in ranking.first(measured_in(cells))))
-    against_distance = [
-        ChartSection(
-            heading.replace(" ", "-"),
-            f"{heading.capitalize()} against distance",
-            [*distance.charts(cells, identities, evidence, names)],
-        )
-        for heading, names in (
-            (_FIRST, first),
-            *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),
-        )
-    ]
-    if sweep_condition:
-        maps = list(heat_maps.charts(repeats, sweep_condition, quantities))
-        against_distance.insert(0, ChartSection("factors", "Figures over two factors", maps))
-    against_distance.append(_further_charts(cells, identities, evidence, quantities, first))
-    sections = (
-        ChartSection("quantities", "Quantities at one distance", list(dots.charts(cells, identities, evidence))),
-        ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
-        ChartSection("one-repeat", "One repeat", [] if row is None else list(timeline.charts(row, evidence))),
-    )
+    is_crowded = bool(sweep) and len({identities.of(cell).rank for cell in cells}) > len(CYCLE)
+    against_distance: list[ChartSection] = []
+    sections: list[ChartSection] = []
+    if sweep:
+        maps = list(heat_maps.charts(repeats, sweep, quantities, one_factor=is_crowded))
+        against_distance.append(ChartSection("factors", "Figures over factors", maps, _CROWDED if is_crowded else ""))
+    if not is_crowded:
+        against_distance += _against_distance(cells, identities, evidence, first)
+        against_distance.append(_further_charts(cells, identities, evidence, quantities, first))
+        sections = [
+            ChartSection("quantities", "Quantities at one distance", list(dots.charts(cells, identities, evidence))),
+            ChartSection("distributions", "Distributions", list(distribution.charts(cells, identities, evidence))),
+            ChartSection("one-repeat", "One repeat", [] if row is None else list(timeline.charts(row, evidence))),
+        ]
     return Contents(
-        title=title or summary.title(cells),
-        paragraph=summary.paragraph(cells, evidence),
+        title=title or summary.title(cells, sweep or {}),
+        paragraph=summary.paragraph(cells, evidence, sweep or {}),
         headlines=list(headlines(cells, evidence, unmeasured)),
         warnings=list(summary.warnings(cells, evidence)),
         verdicts=expected.verdicts(cells, evidence),
         against_distance=[section for section in against_distance if section.charts],
         tables=_tables(cells, evidence),
         sections=[section for section in sections if section.charts],
-        strips=list(strips.groups(cells, identities, evidence)),
+        strips=[] if is_crowded else list(strips.groups(cells, identities, evidence)),
         bursts=list(packet_rasters.groups(cells, evidence)),
         trials=list(summary.trial_provenance(evidence)),
         evidence=evidence,
         command=shlex.join([*command, "--rebuild"] if is_whole else command),
         export_command=shlex.join(("fieldkit", "export", *paths, "--format", "csv", "-o", "attempts.csv")),
     )
+
+
+def _against_distance(
+    cells: Sequence[Cell], identities: Identities, evidence: Evidence, first: Sequence[str]
+) -> Iterator[ChartSection]:
+    """Yield the charts of quantities that fieldkit defines; those with the plain names `first` come first."""
+    for heading, names in (
+        (_FIRST, first),
+        *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),
+    ):
+        drawn = list(distance.charts(cells, identities, evidence, names))
+        yield ChartSection(heading.replace(" ", "-"), f"{heading.capitalize()} against distance", drawn)
 
 
 def _further_charts(
@@ -288,9 +300,15 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) ->
     return None
 
 
-def _sort_key(cell: Cell) -> tuple[str | float, ...]:
-    names = ("protocol", "topology", "scenario", "procedure")
-    return *(wording.text(cell, name) for name in names), wording.metres(cell), wording.text(cell, "backend")
+def _sort_key(cell: Cell) -> tuple[object, ...]:
+    names = ("protocol", "topology", "scenario")
+    procedure = wording.with_numbers(wording.text(cell, "procedure"))
+    return (
+        *(wording.text(cell, name) for name in names),
+        procedure,
+        wording.metres(cell),
+        wording.text(cell, "backend"),
+    )
 
 
 def _tables(cells: Sequence[Cell], evidence: Evidence) -> list[CellTable]:

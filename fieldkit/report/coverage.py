@@ -168,8 +168,8 @@ def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence
         return True
     if (declared := evidence.declared(cell)) is not None:
         return quantity.name in declared
-    same = ("procedure", "scenario", "topology", "backend", "protocol")
-    similar = (other for other in cells if all(other.key[name] == cell.key[name] for name in same))
+    similar_by = ("procedure", "scenario", "topology", "backend", "protocol")
+    similar = (other for other in cells if all(other.key[name] == cell.key[name] for name in similar_by))
     if not cell.n_valid or any(quantity.name in other.estimates for other in similar):
         return True
     return bool(nothing_arrived(evidence.repeats, quantity, evidence.rows(cell)).any())
@@ -182,8 +182,8 @@ def _absences_of(cell: Cell, quantity: Quantity, evidence: Evidence) -> Iterator
         return
     rows = evidence.rows(cell)
     rows = rows[evidence.repeats.texts["status"][rows] == Status.VALID]
-    lacking = rows[~np.isfinite(evidence.repeats.observed(quantity)[0][rows])]
-    silent = int(nothing_arrived(evidence.repeats, quantity, lacking).sum())
-    for reason, count in ((NOTHING_ARRIVED, silent), (NO_VALUE, len(lacking) - silent)):
+    rows_without_value = rows[~np.isfinite(evidence.repeats.observed(quantity)[0][rows])]
+    silent = int(nothing_arrived(evidence.repeats, quantity, rows_without_value).sum())
+    for reason, count in ((NOTHING_ARRIVED, silent), (NO_VALUE, len(rows_without_value) - silent)):
         if count:
             yield Absence(cell, reason, count, len(rows))

@@ -38,6 +38,12 @@ _DARK: Final = 0.6
 _ON_LIGHT: Final = "#111111"
 _ON_DARK: Final = "#fefefe"
 """They are not colours of the theme, because the colours of a heat map are the same in the dark theme."""
+_LEVEL_CHARACTERS: Final = 40
+"""Number of characters of the labels below a heat map from which they are vertical."""
+_NOTE_COLUMNS: Final = 12
+"""Number of columns of a heat map from which its texts are smaller."""
+_SMALLEST: Final = 3.5
+"""Smallest font size of texts in a heat map."""
 _EDGE_TEXT: Final = 34
 """Maximum number of characters of a text at the edge."""
 
@@ -64,12 +70,17 @@ def _draw_heat(axes: Axes, heat: HeatMap) -> None:
     """Draw a heat map with the text of each value, dark on light colours."""
     low, high = heat.limits
     axes.pcolormesh(heat.values, cmap="Blues", vmin=low, vmax=high, edgecolors=LIGHT["paper"], linewidth=1.0)
+    columns = len(heat.columns)
+    font_size = _NOTE if columns <= _NOTE_COLUMNS else max(_NOTE * _NOTE_COLUMNS / columns, _SMALLEST)
     for row, texts in enumerate(heat.texts):
         for column, text in enumerate(texts):
             is_dark = heat.values[row][column] > low + _DARK * (high - low)
             colour = _ON_DARK if is_dark else _ON_LIGHT
-            axes.text(column + 0.5, row + 0.5, text, color=colour, ha="center", va="center", fontsize=_NOTE)
-    axes.set_xticks([index + 0.5 for index in range(len(heat.columns))], [_shorten(x, _TICK) for x in heat.columns])
+            axes.text(column + 0.5, row + 0.5, text, color=colour, ha="center", va="center", fontsize=font_size)
+    labels = [_shorten(label, _TICK) for label in heat.columns]
+    axes.set_xticks([index + 0.5 for index in range(len(labels))], labels)
+    if len(labels) * max(map(len, labels)) > _LEVEL_CHARACTERS:
+        axes.tick_params(axis="x", rotation=90)
     axes.set_yticks([index + 0.5 for index in range(len(heat.rows))], [_shorten(y, _LANE) for y in heat.rows])
     axes.grid(visible=False)
 

@@ -31,6 +31,7 @@ _STRIP_INCHES: Final = (5.8, 1.25)
 _STRIP_MARGINS_INCHES: Final = (1.45, 0.15, 0.42, 0.28)
 """Left, right, lower and upper margin of a strip, the same for all so that their x axes are aligned."""
 _LANE_INCHES: Final = 0.3
+_HEAT_ROW_INCHES: Final = 0.16
 _LANE_MARGINS_INCHES: Final = 1.05
 # IEEE requires a width of one column, 3.5 in, or of both, 7.16 in, and a font of 8 pt in figures.
 _COLUMN_INCHES: Final = 3.5
@@ -84,6 +85,8 @@ def panel_svg(panel: Panel) -> str:
 def _inches(panel: Panel) -> tuple[float, float]:
     """Return width and height of a panel of the page."""
     lanes = _LANE_MARGINS_INCHES + _LANE_INCHES * len(panel.lanes)
+    if panel.heat is not None:
+        return _PANEL_INCHES[0], max(_PANEL_INCHES[1], _LANE_MARGINS_INCHES + _HEAT_ROW_INCHES * len(panel.heat.rows))
     if panel.is_strip:
         return _STRIP_INCHES[0], lanes if panel.lanes else _STRIP_INCHES[1]
     return _PANEL_INCHES[0], lanes if panel.lanes else _PANEL_INCHES[1]

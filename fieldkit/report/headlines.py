@@ -253,10 +253,10 @@ def _line_of_value(
     values: Sequence[tuple[Cell, Estimate]], text: str, place: Callable[[Cell, Quantity], str]
 ) -> HeadlineLine:
     """Return a value with all conditions that have it, and its interval if only one condition has it."""
-    same = [(cell, estimate) for cell, estimate in values if wording.value(estimate) == text]
-    interval = wording.interval(same[0][1]) if len(same) == 1 else ""
+    matching = [(cell, estimate) for cell, estimate in values if wording.value(estimate) == text]
+    interval = wording.interval(matching[0][1]) if len(matching) == 1 else ""
     return HeadlineLine(
-        "", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in same])
+        "", text, interval, _first_places([place(cell, estimate.quantity) for cell, estimate in matching])
     )
 
 
@@ -275,12 +275,12 @@ def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> s
 
 def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
     """Return the quantities called `names`, or the first ones if none exists, with variants in other steps."""
-    existing = [same for name in names if (same := _quantities_named(quantities, name))]
+    existing = [matching for name in names if (matching := _quantities_named(quantities, name))]
     others = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
     return existing or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
     """Return the quantity called `name`, or those of named steps if no other step measures it."""
-    same = with_plain_name(quantities, name)
-    return same[:1] if same and not same[0].step else same
+    matching = with_plain_name(quantities, name)
+    return matching[:1] if matching and not matching[0].step else matching

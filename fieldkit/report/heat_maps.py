@@ -1,7 +1,8 @@
 """Heat maps of a sweep: a quantity over two of its factors, one map per flow and combination of the other factors."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, aggregate
@@ -18,18 +19,40 @@ _DRAWN: Final = ("datagram_loss", "rtt_loss", "byte_loss", "one_way_median_s", "
 _MAX_PANELS: Final = 12
 
 
-def charts(repeats: Repeats, condition: Sequence[str], requested: Sequence[str] = ()) -> Iterator[Chart]:
-    """Yield a chart per quantity; none if fewer than two factors have several values.
+@dataclass(frozen=True)
+class _Axis:
+    """An axis of a map.
+
+    Attributes:
+        column: The column of its values.
+        name: The name that is shown.
+        labels: The labels of its values, which are those in the command.
+    """
+
+    column: str
+    name: str
+    labels: Mapping[str | float | None, str]
+
+
+def charts(
+    repeats: Repeats, sweep: Mapping[str, str], requested: Sequence[str] = (), *, one_factor: bool = False
+) -> Iterator[Chart]:
+    """Yield a chart per quantity; none if too few factors have several values.
 
     Args:
         repeats: The runs of sweeps.
-        condition: The columns of the flow and of the factors.
+        sweep: The columns of the flow and of the factors; for each, the column with its values as in the command.
         requested: Names of quantities that are drawn in any case.
+        one_factor: Whether to draw one factor that has several values over the flows; otherwise two are needed.
     """
-    flow, *factors = condition
+    flow, *factors = sweep
     varied = [name for name in factors if len(set(repeats.column(name))) > 1]
+    if len(varied) == 1 and one_factor:
+        varied.append(flow)
     if len(varied) < 2:
         return
+    all_axes = {name: _Axis(name, sweep[name], _labels(repeats, name, sweep[name])) for name in (flow, *varied)}
+    axes = [all_axes.pop(name) for name in varied[:2]]
     names = (*_DRAWN, *(name for name in requested if name not in _DRAWN))
     quantities = [quantity for quantity in repeats.quantities if quantity.name in names]
     cells = aggregate(repeats, (flow, *factors), quantities=quantities, words=())
@@ -38,16 +61,20 @@ def charts(repeats: Repeats, condition: Sequence[str], requested: Sequence[str] 
         if measured and (
             quantity.name in requested or len({cell.estimates[quantity.name].value for cell in measured}) > 1
         ):
-            yield _chart(quantity, measured, (varied[0], varied[1]), (flow, *varied[2:]))
+            yield _chart(quantity, measured, axes, list(all_axes.values()))
 
 
-def _chart(quantity: Quantity, cells: Sequence[Cell], axes: tuple[str, str], others: Sequence[str]) -> Chart:
+def _labels(repeats: Repeats, name: str, text: str) -> dict[str | float | None, str]:
+    return {
+        value: columns.cell(label) for value, label in zip(repeats.column(name), repeats.column(text), strict=True)
+    }
+
+
+def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], others: Sequence[_Axis]) -> Chart:
     groups: dict[str, list[Cell]] = {}
     for cell in cells:
-        title = ", ".join(
-            columns.cell(cell.key[name]) if name == others[0] else f"{name} {columns.cell(cell.key[name])}"
-            for name in others
-        )
+        labels = [(axis.name, axis.labels[cell.key[axis.column]]) for axis in others]
+        title = ", ".join(label if number == 0 else f"{name} {label}" for number, (name, label) in enumerate(labels))
         groups.setdefault(title, []).append(cell)
     values = [cell.estimates[quantity.name].value for cell in cells]
     scale = scale_of(quantity, values)
@@ -59,7 +86,7 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: tuple[str, str], oth
     caption = "Estimates over the valid seeds; the table has their intervals."
     if omitted:
         caption += f" {omitted} more maps are left out."
-    title = f"{scale.head(quantity.label)} over {axes[0]} and {axes[1]}"
+    title = f"{scale.head(quantity.label)} over {axes[0].name} and {axes[1].name}"
     return Chart(f"map-{quantity.name}".replace(".", "-"), title, caption, panels)
 
 
@@ -68,25 +95,27 @@ def _panel(
     quantity: Quantity,
     cells: Sequence[Cell],
     *,
-    axes: tuple[str, str],
+    axes: Sequence[_Axis],
     scale: Scale,
     limits: tuple[float, float],
 ) -> Panel:
-    across, up = (sorted({cell.key[name] for cell in cells}, key=_order) for name in axes)
+    across, up = (sorted({cell.key[axis.column] for cell in cells}, key=_order) for axis in axes)
     values = [[math.nan] * len(across) for _ in up]
     for cell in cells:
-        row, column = up.index(cell.key[axes[1]]), across.index(cell.key[axes[0]])
+        row, column = up.index(cell.key[axes[1].column]), across.index(cell.key[axes[0].column])
         values[row][column] = cell.estimates[quantity.name].value
     texts = [["" if math.isnan(value) else scale.number(value) for value in row] for row in values]
-    across_labels, up_labels = ([columns.cell(key) for key in keys] for keys in (across, up))
+    across_labels, up_labels = (
+        [axis.labels[key] for key in keys] for axis, keys in zip(axes, (across, up), strict=True)
+    )
     heat = HeatMap(across_labels, up_labels, values, texts, limits)
     words = "; ".join(
-        f"{axes[0]} {x}, {axes[1]} {y}: {text} {scale.unit}"
+        f"{axes[0].name} {x}, {axes[1].name} {y}: {text} {scale.unit}"
         for y, row in zip(heat.rows, texts, strict=True)
         for x, text in zip(heat.columns, row, strict=True)
         if text
     )
-    return Panel(title, axes[0], axes[1], (), f"{quantity.label}, {title}. {words}", heat=heat)
+    return Panel(title, axes[0].name, axes[1].name, (), f"{quantity.label}, {title}. {words}", heat=heat)
 
 
 def _order(key: str | float | None) -> tuple[bool, float, str]:

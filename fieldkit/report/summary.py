@@ -1,7 +1,7 @@
 """The first part of a report: description of the trials, warnings for readers who quote figures, and provenance."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -38,12 +38,23 @@ class Caution:
     reasons: Sequence[str] = ()
 
 
-def paragraph(cells: Sequence[Cell], evidence: Evidence) -> str:
-    """Return a sentence about the trials: procedures, times, distances and numbers of attempts."""
+def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str]) -> str:
+    """Return a sentence about the trials: procedures, times, distances and numbers of attempts.
+
+    Args:
+        cells: Conditions.
+        evidence: The table and the available evidence.
+        sweep: Columns of the flow and the factors of a sweep, with those that are shown; empty for trials.
+    """
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")
+    subject = f"{trials} of {wording.join_names(_values(cells, 'procedure'))}"
+    if sweep:
+        flow, *factors = sweep
+        settings = format_count(len(set(repeats.keys(factors))), "setting")
+        subject = f"{settings} of {_factor_names(sweep)}; {wording.join_names(sorted(set(repeats.texts[flow])))}"
     return (
-        f"{trials} of {wording.join_names(_values(cells, 'procedure'))}{_start_text(repeats)}: {_distances(cells)}; "
+        f"{subject}{_start_text(repeats)}: {_distances(cells)}; "
         f"{wording.join_words([name.upper() for name in _values(cells, 'protocol')])}; "
         f"{_topologies(cells)}{wording.join_words(_values(cells, 'backend'))} robots. "
         f"{format_count(len(repeats), 'attempt')}: {status_counts(Counter(repeats.texts['status']))}. "
@@ -129,8 +140,14 @@ def _counted(reasons: Sequence[str]) -> list[str]:
     )
 
 
-def title(cells: Sequence[Cell]) -> str:
-    """Return the default title of a report."""
+def _factor_names(sweep: Mapping[str, str]) -> str:
+    return wording.join_names(list(sweep.values())[1:])
+
+
+def title(cells: Sequence[Cell], sweep: Mapping[str, str]) -> str:
+    """Return the default title of a report; `sweep` as for `paragraph`."""
+    if len(sweep) > 1:
+        return f"Sweep over {_factor_names(sweep)}"
     return f"Loss and delay: {wording.join_names(_values(cells, 'procedure'))}"
 
 

@@ -134,12 +134,12 @@ class Evidence:
     def pings(self, row: int, step: str = "") -> ping.Ping | None:
         """Return the output of ping in a row's attempt, optionally of a named step, or None if unavailable."""
         evidence, plan = self.attempt(row), self.plan(row)
-        pinging = (
-            next((candidate for candidate in planned_evidence.pingings(plan) if candidate.name == step), None)
+        source = (
+            next((candidate for candidate in planned_evidence.ping_sources(plan) if candidate.name == step), None)
             if plan
             else None
         )
-        return evidence.read_or_none(ping.read, pinging.file) if evidence and pinging else None
+        return evidence.read_or_none(ping.read, source.file) if evidence and source else None
 
 
 def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:

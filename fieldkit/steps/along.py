@@ -19,7 +19,7 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
 
     Attributes:
         duration_key: The key that sets its duration without `along`: `duration` or `count`.
-        along: Whether the step lasts as long as the path of the `move` around it, instead of its own duration or
+        along: Whether the step lasts as long as the path of the `move` that contains it, instead of its duration or
             count. Inside `fly` it is not possible.
     """
 

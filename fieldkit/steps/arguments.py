@@ -85,8 +85,8 @@ def suggestion(name: str) -> str:
         return ""
     kind, dot, role = name.strip().lower().partition(".")
     if dot:
-        near = did_you_mean(kind, (_ADDRESS,), "")
-        return f"did you mean '{{address.{role}}}'?" if near else ""
+        match = did_you_mean(kind, (_ADDRESS,), "")
+        return f"did you mean '{{address.{role}}}'?" if match else ""
     for variable in (*_VALUES, PUT):
         if kind == variable or (variable != PUT and _resembles(kind, variable)):
             return f"did you mean '{{{variable}}}'?"

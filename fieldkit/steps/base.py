@@ -41,10 +41,10 @@ FileName = Annotated[
 class Step(Strict, ABC):
     """One action of a procedure.
 
-    Its fields are its YAML keys. Plans, preflight, gates, rows and reports call the methods below and contain no name
-    of a kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that runs one
-    program is a `fieldkit.steps.program.ProgramStep`, which needs two methods. Methods that few kinds need are in
-    `fieldkit.steps.capabilities`.
+    Its fields are its YAML keys. Plans, preflight checks, gates, rows and reports call the methods below and contain
+    no name of a kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that
+    runs one program is a `fieldkit.steps.program.ProgramStep`, which needs two methods. Methods that few kinds need
+    are in `fieldkit.steps.capabilities`.
 
     `jobs` is pure: `--dry-run` prints it, tests compare it with golden lines, and `run` starts the same jobs. To add
     a kind, write its module and name its class in `fieldkit.steps.kinds`, or in an entry point of the group

@@ -15,7 +15,7 @@ from fieldkit.backends.protocols import Cast, Testbed
 from fieldkit.core.columns import Value
 from fieldkit.core.model import Role
 from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, Pinging, RecordedFile, Refusal, Scene
+from fieldkit.steps.scene import Announce, Flow, ListeningPort, Need, PingSource, RecordedFile, Refusal, Scene
 from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 
 
@@ -152,7 +152,7 @@ class UsesSpace(Capability):
     """A step that leaves more than small text files on robots."""
 
     @abstractmethod
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         """Return the approximate size of its files on the robot in `role`, in bytes, without small text files."""
 
 
@@ -200,7 +200,7 @@ class Pings(Capability):
     """A step that measures round-trip times."""
 
     @abstractmethod
-    def pinging(self) -> Pinging | None:
+    def ping_source(self) -> PingSource | None:
         """Return the source of the step's round-trip times; None if it measures none."""
 
 
@@ -236,7 +236,7 @@ class Summarizes(Capability):
 
     @abstractmethod
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        """Yield the most important figures for the line of a repeat: `IP loss 3.2 %`.
+        """Yield the most important figures for the line of a repeat: `IP packet loss 3.2 %`.
 
         Parts with the word `loss` come first in that line.
         """
@@ -246,9 +246,9 @@ CAPABILITIES: Final[tuple[type[Capability], ...]] = tuple(Capability.__subclasse
 
 
 def missing_methods(kind: type) -> tuple[str, ...]:
-    """Return the methods that a class lacks of capabilities of which it defines other methods, sorted.
+    """Return the missing methods of all capabilities that a class defines only in part, sorted.
 
-    The harness would not call these other methods.
+    The harness calls no method of such a capability.
     """
     missing = set[str]()
     for capability in CAPABILITIES:

@@ -1,4 +1,4 @@
-"""Directions as procedures write them: a segment of a path, or the place of a robot relative to another."""
+"""Directions in a procedure: a segment of a path, or the position of a robot relative to another."""
 
 import math
 from typing import Annotated
@@ -14,8 +14,8 @@ class PathLeg(Strict):
     """A straight segment of a path; several keys together are one diagonal segment.
 
     Attributes:
-        away: Distance away from the robot at the other end of the link, along the line between them (the relay: from
-            the sender). For a drone: forward.
+        away: Distance away from the robot at the other end of the link, along the line between them (for the
+            relay: away from the sender). For a drone: forward.
         towards: Distance towards that robot. For a drone: backward.
         left: Distance to the left, seen by an observer who looks away from that robot. Combined with `away` or
             `towards` it is a diagonal.

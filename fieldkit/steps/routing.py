@@ -1,4 +1,4 @@
-"""Preflight check of robots that forward packets for each other: does each run a routing protocol?"""
+"""Preflight check that each of the robots that forward packets for each other runs a routing protocol."""
 
 from collections.abc import Iterator
 from typing import Final

@@ -137,7 +137,7 @@ class Planned:
     Attributes:
         role: Role of the robot that runs it.
         job: The job.
-        program: The program of the command line, for which preflight searches.
+        program: The program of the command line; a preflight check searches for it.
         setup: Shell files to source before this search.
         tool: The tool of the program; None if it has no variants.
         permitted_causes: Permitted causes of its end; after another cause its evidence is incomplete.
@@ -174,7 +174,7 @@ class Refusal:
 
 @dataclass(frozen=True)
 class CommandResult:
-    """Result of a command that preflight ran on a robot.
+    """Result of the command of a preflight check on a robot.
 
     Attributes:
         text: Its standard output and standard error.
@@ -195,7 +195,7 @@ class CommandResult:
 
 @dataclass(frozen=True)
 class Need:
-    """A permission or setting that a step needs on a robot, which preflight checks with a command.
+    """A permission or setting that a step needs on a robot, and the command of its preflight check.
 
     Attributes:
         role: Role of the robot.
@@ -218,7 +218,7 @@ class Need:
 
 
 @dataclass(frozen=True)
-class Pinging:
+class PingSource:
     """Round-trip times that a step measures.
 
     Attributes:

@@ -98,11 +98,11 @@ def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
             entries[table] = index.entries[stamps]
         elif _can_be_indexed(stamps, now_ns):
             new[table] = stamps
-    known = IndexedTables(path, index, entries)
+    indexed = IndexedTables(path, index, entries)
     if len(new) < (MIN_NEW if index.entries else MIN_TABLES):
-        return known
+        return indexed
     facts = _facts(list(new), workers, note)
-    return replace(known, new={table: (new[table], facts[table]) for table in facts})
+    return replace(indexed, new={table: (new[table], facts[table]) for table in facts})
 
 
 def _unused(path: Path, error: OSError) -> str:
@@ -141,42 +141,42 @@ def _declarations(table: Path) -> str:
     return frozen.to_json(frozen_columns(table))
 
 
-def write(known: IndexedTables, columns: Sequence[Column], note: Note) -> IndexedTables:
+def write(indexed: IndexedTables, columns: Sequence[Column], note: Note) -> IndexedTables:
     """Write the index with its new tables, and return the tables that it covers.
 
     Args:
-        known: The tables, as `find` returned them.
+        indexed: The tables, as `find` returned them.
         columns: Columns of all tables.
         note: Receives a note if the index cannot be written.
     """
-    if known.path is None or not known.new:
-        return known
+    if indexed.path is None or not indexed.new:
+        return indexed
     declared = {column.name: column for column in columns}
-    index = known.index if known.index.has_types(columns) else TableIndex()
+    index = indexed.index if indexed.index.has_types(columns) else TableIndex()
     types = {**index.types, **{name: table_index.type_name(column) for name, column in declared.items()}}
     try:
-        with table_index.replacing(known.path, types) as writer:
+        with table_index.replacing(indexed.path, types) as writer:
             if index.entries:
-                writer.copy(index, _kept(known))
-            for arrays, counts in table_files.typed_tables(_unchanged(known.new), declared):
-                added = [Entry(str(table.absolute()), *known.new[table], 0, rows) for table, rows in counts]
+                writer.copy(index, _kept_entries(indexed))
+            for arrays, counts in table_files.typed_tables(_unchanged(indexed.new), declared):
+                added = [Entry(str(table.absolute()), *indexed.new[table], 0, rows) for table, rows in counts]
                 writer.add(arrays, added)
-        written = table_index.load(known.path)
+        written = table_index.load(indexed.path)
     except OSError as error:
-        note(_unused(known.path, error))
-        return replace(known, new={})
-    stamps = {table: entry.stamp for table, entry in known.entries.items()}
-    stamps |= {table: stamp for table, (stamp, _) in known.new.items()}
+        note(_unused(indexed.path, error))
+        return replace(indexed, new={})
+    stamps = {table: entry.stamp for table, entry in indexed.entries.items()}
+    stamps |= {table: stamp for table, (stamp, _) in indexed.new.items()}
     entries = {table: written.entries[stamp] for table, stamp in stamps.items() if stamp in written.entries}
-    return IndexedTables(known.path, written, entries)
+    return IndexedTables(indexed.path, written, entries)
 
 
-def _kept(known: IndexedTables) -> list[Entry]:
+def _kept_entries(indexed: IndexedTables) -> list[Entry]:
     """Return the entries of an index whose tables have not changed."""
-    requested = {entry.stamp for entry in known.entries.values()}
+    requested = {entry.stamp for entry in indexed.entries.values()}
     return [
         entry
-        for entry in known.index.entries.values()
+        for entry in indexed.index.entries.values()
         if entry.stamp in requested or entry.stamp == _stamp(Path(entry.path))
     ]
 

@@ -107,7 +107,7 @@ class Plan(Strict):
         return self.model_copy(update={"notes": "; ".join(filter(None, (self.notes, note)))})
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
-        """Return the inputs of the command lines of one attempt; `variants` are those found by preflight."""
+        """Return the inputs of the command lines of one attempt; `variants` are from the preflight checks."""
         scene = self.procedure.scene(repeat.protocol, self.cast, folder, variants)
         return replace(scene, placement=self.placement, repeat=repeat.number)
 

@@ -6,7 +6,7 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.steps.capabilities import Pings, SendsFile
 from fieldkit.steps.nest import Nest
-from fieldkit.steps.scene import Pinging
+from fieldkit.steps.scene import PingSource
 from fieldkit.trial.plan import Plan
 
 
@@ -21,10 +21,10 @@ def transfers(plan: Plan, protocol: Protocol) -> tuple[Transfer, ...]:
     return tuple(transfer for transfer in specs if transfer is not None)
 
 
-def pingings(plan: Plan) -> tuple[Pinging, ...]:
+def ping_sources(plan: Plan) -> tuple[PingSource, ...]:
     """Return all round-trip time measurements of a repeat, in the order of their starts."""
-    specs = (placed.step.pinging() for placed in plan.procedure.walk() if isinstance(placed.step, Pings))
-    return tuple(pinging for pinging in specs if pinging is not None)
+    specs = (placed.step.ping_source() for placed in plan.procedure.walk() if isinstance(placed.step, Pings))
+    return tuple(source for source in specs if source is not None)
 
 
 def captures(plan: Plan) -> Mapping[str, Role]:

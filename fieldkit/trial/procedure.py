@@ -147,7 +147,7 @@ class Procedure(catalog.Named, Sectioned):
         filled = set[str]()
         for placed in self.walk():
             step = placed.step
-            before = [other.step for other in earlier if not placed.runs_beside(other)]
+            before = [other.step for other in earlier if not placed.runs_at_same_time_as(other)]
             with step_errors.before_trial(f"{placed.label} cannot be planned"):
                 resources, file_names, step_columns = step.exclusive_resources(), step.files(), columns.of_step(step)
             if isinstance(step, ChecksPlacement) and (reason := step.placement_error(before, placed.within)):
@@ -213,7 +213,7 @@ class Procedure(catalog.Named, Sectioned):
             protocol: The transport protocol under test.
             cast: The robot in each role.
             folder: The attempt's folder on every robot.
-            variants: The tools of each robot, as found by preflight.
+            variants: The tools of each robot, as determined by the preflight checks.
         """
         recorded: dict[Role, tuple[RecordedFile, ...]] = {}
         for step in self._steps():
@@ -288,7 +288,7 @@ class PlacedStep:
         A port of a robot accepts one listener at a time. In one capture, packets are distinguished by the two robots
         and the port.
         """
-        is_simultaneous = self.runs_beside(other) or any(nest is other.step for nest in self.within)
+        is_simultaneous = self.runs_at_same_time_as(other) or any(nest is other.step for nest in self.within)
         is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
         if not (isinstance(self.step, Listens) and isinstance(other.step, Listens)):
             return None
@@ -300,15 +300,15 @@ class PlacedStep:
                 and (listener.role, listener.port) == (other_listener.role, other_listener.port)
             ):
                 conflict = f"port {listener.port} is used twice at the same time on {listener.role}"
-                return f"{conflict}; give one another {listener.by}"
+                return f"{conflict}; change the {listener.by} of one of them"
             if is_captured and listener.looks_like(other_listener):
                 conflict = (
                     f"port {listener.port} is used twice in one capture, from {listener.peer} to {listener.role}"
                 )
-                return f"{conflict}; give one another {listener.by}, or a separate capture each"
+                return f"{conflict}; change the {listener.by} of one of them, or use separate captures"
         return None
 
-    def runs_beside(self, other: "PlacedStep") -> bool:
+    def runs_at_same_time_as(self, other: "PlacedStep") -> bool:
         """Return True if an earlier step runs at the same time and neither contains the other."""
         paths = zip((*self.within, self.step), (*other.within, other.step), strict=False)
         fork = next((index for index, (step, other_step) in enumerate(paths) if step is not other_step), 0)
@@ -327,7 +327,7 @@ def _duplicate_resource_message(step: Step, resource: str) -> str:
     """Return the message for two steps that use the same exclusive resource under one name."""
     if step.prefix:
         return (
-            f"{resource} named {step.prefix} is defined twice; give one another name, inside for: with its variable"
+            f"{resource} named {step.prefix} is defined twice; rename one, inside for: with its variable in the name"
         )
     return f"{resource} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
 

@@ -73,7 +73,7 @@ def measured(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
 
 
 def describe(plan: Plan, row: Row) -> str:
-    """Return the most important numbers of a row for display, losses first: `IP loss 3.2 %, RTT 12.1 ms`.
+    """Return the most important numbers of a row for display, losses first: `IP packet loss 3.2 %, RTT 12.1 ms`.
 
     The steps that a fault disturbs come before the duration of the fault itself.
     """

@@ -1,8 +1,8 @@
 """Jobs that run on robots during a whole session, such as a bridge of topics.
 
-They run from before the first check until the end of the session, so preflight, people and every trial of the
-session use the robot in the same state. They are normal jobs: `fieldkit abort` ends them, and a resumed session joins
-them. Packages add them by entry points (`plugins.SESSION_JOBS`).
+They run from before the first check until the end of the session, so the preflight checks, people and every trial of
+the session use the robot in the same state. They are normal jobs: `fieldkit abort` ends them, and a resumed session
+joins them. Packages add them by entry points (`plugins.SESSION_JOBS`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence

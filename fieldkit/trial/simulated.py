@@ -188,22 +188,22 @@ class SimulatedTrial:
                 for role, content in simulated.captures.items():
                     (folder / str(capture_around(placed.within, role))).write_bytes(content)
             if isinstance(placed.step, PingStep):
-                (folder / placed.step.pinging().file).write_text(simulated.ping, encoding="ascii")
+                (folder / placed.step.ping_source().file).write_text(simulated.ping, encoding="ascii")
 
 
-def differences(measured: Mapping[str, Value], known: Mapping[str, Value]) -> str:
+def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]) -> str:
     """Return the columns that the evidence and the simulation know differently, as text; empty if there are none."""
     same_names = {"received_bytes": "tcp_received_bytes", "sent_bytes": "tcp_unique_bytes"}
-    pairs = list(known.items())
-    pairs += [(same_names[name], value) for name, value in known.items() if name in same_names]
-    found_differences = []
+    pairs = list(known_values.items())
+    pairs += [(same_names[name], value) for name, value in known_values.items() if name in same_names]
+    difference_texts = []
     for name, value in pairs:
-        found = measured.get(name)
-        if not isinstance(found, int | float) or not isinstance(value, int | float):
+        measured_value = measured.get(name)
+        if not isinstance(measured_value, int | float) or not isinstance(value, int | float):
             continue
-        if not math.isclose(found, value, rel_tol=1e-9, abs_tol=1e-12):
-            found_differences.append(f"{name} is {found:g} in the captures and {value:g} in the simulation")
-    return "; ".join(found_differences)
+        if not math.isclose(measured_value, value, rel_tol=1e-9, abs_tol=1e-12):
+            difference_texts.append(f"{name} is {measured_value:g} in the captures and {value:g} in the simulation")
+    return "; ".join(difference_texts)
 
 
 def _goodput(row: Mapping[str, Value]) -> dict[str, Value]:

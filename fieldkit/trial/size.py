@@ -25,8 +25,8 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
         return 0
     scene = plan.scenes()[0]
     steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, UsesSpace))
-    left_bytes = sum(step.bytes_left(scene, role) for step in steps)
-    return round((_TEXT_BYTES + left_bytes) * SPARE)
+    sum_bytes = sum(step.stored_bytes(scene, role) for step in steps)
+    return round((_TEXT_BYTES + sum_bytes) * SPARE)
 
 
 def attempt_bytes(plan: Plan) -> int:

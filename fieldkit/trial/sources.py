@@ -87,13 +87,18 @@ class Sources:
         return tuple(dict.fromkeys(names))
 
     @cached_property
-    def sweep_condition(self) -> tuple[str, ...]:
-        """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
+    def sweep_columns(self) -> Mapping[str, str]:
+        """The columns that define a condition, as `datasets.condition`; empty if not all tables are sweeps."""
         if not all(table.is_dir() for table in self.tables):
-            return ()
+            return {}
         from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
 
-        return tuple(dict.fromkeys(name for table in self.tables for name in datasets.condition(table)))
+        return {name: text for table in self.tables for name, text in datasets.condition(table).items()}
+
+    @property
+    def sweep_condition(self) -> tuple[str, ...]:
+        """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
+        return tuple(self.sweep_columns)
 
     def chosen(
         self, names: Collection[str], *, option: str = "--quantity"

@@ -41,8 +41,8 @@ def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column,
     planned_columns = merge_columns(
         (table.parent / PLAN_FILE, columns)
         for table in others
-        for known in [facts(table)]
-        for columns in [frozen_columns(table) if known is None else frozen.from_json(known.declarations)]
+        for known_facts in [facts(table)]
+        for columns in [frozen_columns(table) if known_facts is None else frozen.from_json(known_facts.declarations)]
     )
     installed_columns = {column.name: column for column in installed()}
     other_names = dict.fromkeys(name for names in others.values() for name in names)
@@ -86,8 +86,8 @@ def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str
     return {name: column for name, (_, column) in merged.items()}
 
 
-def _other_names_of(table: Path, known: TableFacts | None) -> tuple[str, ...]:
-    return other_names(table_files.names(table) if known is None else known.names)
+def _other_names_of(table: Path, known_facts: TableFacts | None) -> tuple[str, ...]:
+    return other_names(table_files.names(table) if known_facts is None else known_facts.names)
 
 
 @lru_cache  # thousands of tables have the same columns

@@ -169,9 +169,9 @@ class Coordinator:
     def _run_windows(self, to_ns: int, max_windows: int | None, report: Callable[[int], None] | None) -> None:
         """Advance window by window.
 
-        The time of this loop is the cost of coordination. It therefore uses local names, and in a window without
-        packets it does nothing that can be done for many windows together. Unless the run is observed, the time that
-        a window takes after the answer of the network is part of the first lap of the next window.
+        The time of this loop is the cost of coordination. It therefore uses local names, and work that can be done
+        for many windows together is not done in windows without packets. Unless the run is observed, the time that a
+        window takes after the answer of the network is part of the first lap of the next window.
         """
         policy, agents, network, situation = self.policy, self._agents, self._network, self.situation
         windows_ns, quiet_ends_ns = self.run.windows_ns, self._digest.quiet_ends_ns

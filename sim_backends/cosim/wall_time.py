@@ -24,7 +24,7 @@ class Waits(Protocol):
 class WallTime:
     """Stopwatch that adds each lap to one part of the wall time.
 
-    Time that a federate of the part only waited is added to `wait` instead.
+    Time during which a federate of that part waited is added to `wait` instead.
 
     Args:
         total_s: Receives the sums, in seconds by part, whenever `window` is called.

@@ -237,6 +237,22 @@ class EmulatedBackend:
         members = self._members()
         return interactive_lab.overview(members, placement.square_m(members, self._world), self._options, self._world)
 
+    def gazebo_world(self, version: str) -> str:
+        """Implement `GazeboWorlds.gazebo_world`; the robots are at the places of an interactive lab."""
+        from sim_backends.emulated import placement, simulator_choice  # noqa: PLC0415 (as in `open`)
+        from sim_backends.gazebo.sdf import SdfRobot, world_sdf  # noqa: PLC0415 (as above)
+
+        members, options = self._members(), self._options.model_copy(update={"physics": simulator_choice.GAZEBO})
+        places_m = placement.square_m(members, self._world)
+        robots = {
+            name: SdfRobot(body.limits, placement.below_antenna_m(places_m[name]), 0.0)
+            for name, body in simulator_choice.bodies_of(members.values(), options).items()
+        }
+        step_ns = simulator_choice.sync_of(options).step_ns
+        return world_sdf(
+            self._world, robots, step_ns=step_ns, version="garden" if version == "garden" else "fortress"
+        )
+
     def _members(self) -> "dict[str, LabRobot]":
         from sim_backends.emulated import interactive_lab  # noqa: PLC0415 (as in `open`)
 

@@ -97,7 +97,7 @@ class Ros2Options(Strict):
 
 
 class SyncOptions(Strict):
-    """The [sync policy](method-cosim.md#synchronization-methods) of a lab on the co-simulation.
+    """The [sync policy](method-cosim.md#sync-policies) of a lab on the co-simulation.
 
     Attributes:
         name: Its name. `event_driven` adds no delay to a packet.
@@ -152,8 +152,7 @@ class EmulatedOptions(Strict):
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
         physics: The robots move [on the co-simulation](lab-cosim.md), by this physics: `kinematic`, `mujoco` or
-            `gazebo`. If only `network` is given, `kinematic`. Drones fly in `kinematic` only; elsewhere they have no
-            autopilot.
+            `gazebo`. If only `network` is given, `kinematic`. In `gazebo` drones have no autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
         sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which
             adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event
@@ -188,8 +187,8 @@ class EmulatedOptions(Strict):
 
     @property
     def has_autopilots(self) -> bool:
-        """True if drones have an autopilot: it flies the quadrotor of the kinematic physics, and of no other."""
-        return self.physics in {None, "kinematic"}
+        """True if drones have an autopilot: Gazebo's robots have no thrust, so it cannot fly them."""
+        return self.physics != "gazebo"
 
     @schema.model_validator(mode="after")
     def _check_sync(self) -> "EmulatedOptions":

@@ -3,6 +3,7 @@
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import combinations
@@ -15,7 +16,7 @@ from fieldkit.config.schema import Document
 from fieldkit.config.site import Site
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Vector
-from fieldkit.lab.protocol import LabLink, Login, Outline, Overview
+from fieldkit.lab.protocol import LabLateness, LabLink, Login, Outline, Overview
 from fieldkit.lab.robots import Destination, LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
@@ -59,6 +60,7 @@ class EmulatedLab:
             self._assign_place(name, self._places_m[name])
         up.medium.place(self._places_m)
         up.places.write(self._places_m)
+        self._first_stats = up.medium.stats() if options.is_cosimulated else None
         self.members = members
         self.login = Login(USER, up.private_key, up.host_keys)
 
@@ -122,6 +124,21 @@ class EmulatedLab:
                 self._running.medium.place(self._places_m, velocities_m_s=velocities_m_s)
                 self._running.places.write(self._places_m)
         return WATCH_S
+
+    def lateness(self) -> LabLateness | None:
+        """Implement `Lab.lateness`."""
+        before = self._first_stats
+        if before is None:
+            return None
+        now, bound_ns = self._running.medium.stats(), round(self._options.late_bound * 1e9)
+        packets, windows = _added(before.late, now.late), _added(before.late_windows, now.late_windows)
+        return LabLateness(
+            bound_s=self._options.late_bound,
+            packet_max_s=max(packets) / 1e9 if packets else None,
+            window_max_s=max(windows) / 1e9 if windows else None,
+            windows=windows.total(),
+            late=sum(count for late_ns, count in (packets + windows).items() if late_ns > bound_ns),
+        )
 
     def overview(self) -> Overview:
         """Implement `Lab.overview`."""
@@ -187,6 +204,11 @@ def overview(
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]
     robots = {name: place_m[:2] for name, place_m in places_m.items()}
     return Overview(world.name, world.area_m, outlines, robots, links)
+
+
+def _added(before: Mapping[int, int], after: Mapping[int, int]) -> Counter[int]:
+    """Return the counts that were added to a histogram."""
+    return Counter(after) - Counter(before)
 
 
 def _programs(robot_pid: int) -> Iterator[str]:

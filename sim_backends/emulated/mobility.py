@@ -242,10 +242,10 @@ class Mobility:
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
-            away = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
-            self._write_positions({name: state.position_m for name, state in states.items() if name != away})
-            if away is not None:
-                states = {} if away == relay else {name: state for name, state in states.items() if name != away}
+            absent = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
+            self._write_positions({name: state.position_m for name, state in states.items() if name != absent})
+            if absent is not None:
+                states = {} if absent == relay else {name: state for name, state in states.items() if name != absent}
             self._medium.place(
                 {name: state.position_m for name, state in states.items()},
                 relay=relay if relay in states else None,

@@ -154,7 +154,8 @@ class EmulatedRobot(Node):
     Attributes:
         spec: Specification of the robot.
         physics_fds: Descriptors for a physics that moves it, after `build`: the record of its motion, the file of its
-            assigned paths, and the record of its commanded velocity; empty if no such physics moves it.
+            assigned paths, and the record of its commanded velocity, or of its autopilot's commands and of its
+            flight; empty if no such physics moves it.
 
     Raises:
         ConfigurationError: As `Node`.
@@ -343,7 +344,7 @@ def _cosimulated(
     simulators = simulator_choice.resolve(options)
     sync = simulator_choice.sync_of(options)
     policy = {"name": sync.name, **sync.parameters}
-    bodies = simulator_choice.bodies_of(robots.values())
+    bodies = simulator_choice.bodies_of(robots.values(), options)
     return CosimulatedClient(
         options.radio, world, seed=seed, framing=framing, bodies=bodies, simulators=simulators, policy=policy
     )

@@ -58,8 +58,8 @@ def assigned_path(placement: Placement, move: Move, world: World, start_ns: int)
     """
     line, (along_m, left_m) = _line(placement, world), _along_line_m(placement)[move.role]
     ahead_m = math.cos(geometry.heading_rad(move.role, "away"))
-    here, ahead = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
-    facing_rad = math.atan2(ahead[1] - here[1], ahead[0] - here[0])
+    start, goal = line.at(along_m, left_m), line.at(along_m + ahead_m, left_m)
+    facing_rad = math.atan2(goal[1] - start[1], goal[0] - start[0])
     points_m = [antenna_m(world, corner) for corner in _corners_m(placement, move, world)]
     return AssignedPath(start_ns, points_m, move.speed_m_s, facing_rad)
 
@@ -91,6 +91,12 @@ def _along_line_m(placement: Placement) -> dict[Role, tuple[float, float]]:
 def antenna_m(world: World, place_m: tuple[float, float]) -> Vector:
     """Return the position of a ground robot's antenna above a point on the ground, metres east and north."""
     return (*place_m, world.ground_m(place_m) + ANTENNA_M)
+
+
+def below_antenna_m(antenna_m: Vector) -> Vector:
+    """Return the lowest point of a robot with its antenna at a position."""
+    east_m, north_m, up_m = antenna_m
+    return east_m, north_m, up_m - ANTENNA_M
 
 
 def on_ground(state: State, world: World) -> State:

@@ -269,6 +269,7 @@ def robot_spec(
         registered=_registered(robots, key),
         definitions=_definitions(robot),
         mavlink_port=mavlink.port if mavlink else None,
+        simulated_flight=mavlink is not None and options.is_cosimulated,
         max_speed_m_s=limits.max_speed_m_s,
         max_height_m=limits.max_height_m,
         fence_m=limits.fence_m,

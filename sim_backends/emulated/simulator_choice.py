@@ -24,7 +24,7 @@ from sim_backends.federates.named import (
     named,
 )
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
-from sim_backends.physics.robot_limits import BODIES
+from sim_backends.physics.robot_limits import BODIES, quadrotor
 
 _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
 """Default for a network in another process: an exchange at each of its events would take too long for real time.
@@ -77,12 +77,19 @@ def _physics(options: EmulatedOptions) -> str:
 
 
 def _gazebo_options() -> dict[str, Any]:
-    """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks."""
+    """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks.
+
+    Velocities are means over a window: those of its last step need a second request per window.
+    """
     set_options = {
         option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
         for option, variable in (("partition", "PARTITION"), ("ip", "IP"))
     }
-    return default_options(GAZEBO, PHYSICS) | {option: value for option, value in set_options.items() if value}
+    return (
+        default_options(GAZEBO, PHYSICS)
+        | {"velocity": "window"}
+        | {option: value for option, value in set_options.items() if value}
+    )
 
 
 def _network(options: EmulatedOptions) -> str:
@@ -102,16 +109,22 @@ def _network(options: EmulatedOptions) -> str:
     return command_line(name, NETWORK)
 
 
-def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
-    """Return the bodies of robots on wheels, by name.
-
-    A drone has none: its autopilot flies the quadrotor of the kinematic physics, and the lab follows it.
-    """
-    return {robot.name: _body(robot.profile) for robot in robots if mavlink_of(robot.profile) is None}
+def bodies_of(robots: Iterable[Robot | LabRobot], options: EmulatedOptions) -> dict[str, RobotBody]:
+    """Return the bodies of robots, by name; a drone has one if the physics flies it."""
+    return {
+        robot.name: _body(robot.profile)
+        for robot in robots
+        if mavlink_of(robot.profile) is None or options.has_autopilots
+    }
 
 
 def _body(profile: RobotProfile) -> RobotBody:
-    """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base."""
+    """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base.
+
+    The limits of a drone are those of its airframe: its autopilot keeps those of the profile.
+    """
+    if mavlink_of(profile) is not None:
+        return RobotBody(profile.name, quadrotor(profile.name))
     body = BODIES.get(profile.name)
     limits = body if isinstance(body, DriveLimits) else TURTLEBOT3_BURGER
     limits = replace(limits, speed_m_s=float(profile.limits.max_speed_m_s))
@@ -121,7 +134,7 @@ def _body(profile: RobotProfile) -> RobotBody:
 
 
 def summary(options: EmulatedOptions) -> Mapping[str, str]:
-    """Return the simulators and the policy of a lab, by what they are."""
+    """Return the physics, the network, the sync policy and the physics step of a lab as texts, by these words."""
     sync = sync_of(options)
     policy = make_policy(sync.name, **sync.parameters)
     defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}

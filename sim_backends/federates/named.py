@@ -73,7 +73,7 @@ def federates() -> dict[str, NamedFederate]:
 
 
 def named(where: str, role: int) -> NamedFederate | None:
-    """Return the federate of a name; None if it is not a name, but a command or an address.
+    """Return the federate with a name; None if `where` is a command or an address.
 
     Args:
         where: A name, command or address.
@@ -95,7 +95,7 @@ def named(where: str, role: int) -> NamedFederate | None:
 
 
 def default_options(where: str, role: int) -> dict[str, Any]:
-    """Return the defaults of the options that the federate of a name declares; empty for a command or an address.
+    """Return the default options of the federate with a name; empty if `where` is a command or an address.
 
     Raises:
         ConfigurationError: As for `named`.
@@ -114,7 +114,7 @@ def _load(point: EntryPoint) -> NamedFederate:
 
 
 def is_single_threaded(where: str, role: int) -> bool:
-    """Return True if the federate of a name is a program that declares one thread; False for commands and addresses.
+    """Return True if `where` is the name of a program that declares one thread; False for a command or an address.
 
     Raises:
         ConfigurationError: As for `named`.
@@ -124,7 +124,7 @@ def is_single_threaded(where: str, role: int) -> bool:
 
 
 def command_line(where: str, role: int) -> str:
-    """Return the command that starts the federate of a name, or `where` itself if it is not a name.
+    """Return the command that starts the federate with a name, or `where` itself if it is a command or an address.
 
     Raises:
         ConfigurationError: The federate cannot be used; the remedy states how to install what is missing.

@@ -35,7 +35,7 @@ LAYOUTS: Final = {
     "u32, `flow` text, `protocol` text",
     "arrival": "`id` u64, `at_ns` i64, `agent` u32, `reserved` u32",
     "drop": "`id` u64, `reason` text",
-    "delay parts": "`queueing_ns` i64, `transmission_ns` i64, `propagation_ns` i64, none negative; the rest of the "
+    "delay parts": "`queuing_ns` i64, `transmission_ns` i64, `propagation_ns` i64, none negative; the rest of the "
     "delay, from `enters_ns` to `at_ns`, is processing in hosts",
     "radio sample": "`agent` u32, `reserved` u32, `noise_dbm` f64, `active_ns` i64, `busy_ns` i64 (as in `iw survey "
     "dump`)",
@@ -174,12 +174,12 @@ class ArrivalDelay(NamedTuple):
     """Parts of the delay of an arrival; the rest of its delay is processing in hosts.
 
     Attributes:
-        queueing_ns: Time in queues.
+        queuing_ns: Time in queues.
         transmission_ns: Time from the first attempt of a frame to the end of the received one.
         propagation_ns: Time in the air.
     """
 
-    queueing_ns: int
+    queuing_ns: int
     transmission_ns: int
     propagation_ns: int
 

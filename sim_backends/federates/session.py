@@ -257,7 +257,7 @@ class FederateSession:
 
 
 def _child(where: str, role: int) -> Child:
-    """Start the federate of a name or a command.
+    """Start a federate by its name or its command.
 
     Raises:
         ConfigurationError: It cannot be started; `where` may be an address of a transport that does not exist.
@@ -282,8 +282,8 @@ def open_session(
     Args:
         role: `PHYSICS` or `NETWORK`.
         where: A name, a command, or an address of a transport (`transports.transport_table`).
-        hello: The hello that it receives; the token is added, and the interval of heartbeats
-            suits the deadline.
+        hello: The hello that it receives; the token is added, and the interval of its heartbeats
+            is reduced to a quarter of the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.
 
     Raises:

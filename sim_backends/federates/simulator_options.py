@@ -37,6 +37,15 @@ class SimulatorOptions(Strict):
         del scenario
         yield from ()
 
+    def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
+        """Return further keys of the configuration of hello, for a simulator that cannot compute them itself.
+
+        Args:
+            configuration: The configuration with `scenario`, `world`, `robots` and `options`, in JSON values.
+        """
+        del configuration
+        return {}
+
     def to_json(self) -> dict[str, Any]:
         """Return all options as JSON values, defaults included, without those that are None."""
         return self.model_dump(mode="json", by_alias=True, exclude_none=True)

@@ -31,13 +31,21 @@ class Federate
         }
     }
 
-    // Stop the robots at the end of the run.
-    void Stop()
+    // Stop the robots at the end of the run, and restore the models. False if Gazebo did not do it.
+    bool Stop()
+    try
     {
         if (m_world)
         {
             m_world->Stop();
+            m_world->RestoreModels();
         }
+        return true;
+    }
+    catch (const Refusal& error)
+    {
+        std::fprintf(stderr, "%s\n", error.what());
+        return false;
     }
 
   private:
@@ -50,7 +58,6 @@ class Federate
         protocol::Hello hello = protocol::ReadHello(body, protocol::kPhysics);
         m_heartbeat.SetInterval(hello.heartbeat_ms);
         Json configuration = Json::parse(hello.configuration);
-        CheckLifetimes(configuration);
         Options options(configuration);
         for (const auto& [name, value] :
              {std::pair<std::string, std::string>{"IP", options.ip}, {"PARTITION", options.partition}})
@@ -64,9 +71,9 @@ class Federate
         m_limit_m_s2 = options.limit_m_s2;
         protocol::Welcome welcome;
         welcome.role = protocol::kPhysics;
-        welcome.capabilities = options.deterministic ? uint32_t{protocol::kDeterministic} : 0;
+        welcome.capabilities = protocol::kAgentsDisappear | (options.deterministic ? protocol::kDeterministic : 0);
         m_heartbeat.Send(0); // the first use of Gazebo Transport takes some time
-        std::vector<Agent> agents = AgentsOf(hello, options);
+        std::vector<Agent> agents = AgentsOf(hello, configuration.at("scenario").at("agents"), options);
         m_world = std::make_unique<LockStep>(std::move(options), std::move(agents), m_heartbeat);
         m_world->Begin();
         welcome.step_ns = m_world->StepNs();
@@ -75,21 +82,6 @@ class Federate
         welcome.software = FIELDKIT_GAZEBO_SOFTWARE;
         welcome.commands = {protocol::kTwist, protocol::kVelocity};
         return protocol::WelcomeBody(welcome);
-    }
-
-    // Models are neither created nor removed during a run.
-    static void CheckLifetimes(const Json& configuration)
-    {
-        Json scenario = configuration.value("scenario", Json::object());
-        Json plans = scenario.value("agents", Json::object());
-        for (const auto& [name, plan] : plans.items())
-        {
-            if (plan.contains("disappears") || std::strtod(plan.value("appears", "0").c_str(), nullptr) > 0)
-            {
-                throw Refusal("robots cannot appear or disappear in Gazebo: remove appears and disappears of " + name +
-                              ", or use another physics");
-            }
-        }
     }
 
     std::string Advance(const std::string& body)
@@ -123,11 +115,16 @@ class Federate
         ApplyPending(to_ns);
         m_world->Advance(to_ns / step_ns);
         std::vector<protocol::State> states;
-        for (const Agent& agent : agents)
+        for (uint32_t number = 0; number < agents.size(); number++)
         {
+            const Agent& agent = agents[number];
+            if (!agent.is_present)
+            {
+                continue;
+            }
             Vector position = agent.AntennaAt(agent.pose);
             const Vector& velocity = agent.velocity;
-            states.push_back({static_cast<uint32_t>(states.size()),
+            states.push_back({number,
                               {position.x, position.y, position.z},
                               {velocity.x, velocity.y, velocity.z},
                               agent.pose.Yaw(),
@@ -146,7 +143,10 @@ class Federate
         m_world->Advance(m_pendingStep);
         for (const protocol::Command& command : m_pending)
         {
-            m_world->Agents()[command.agent].command = command;
+            if (m_world->Agents()[command.agent].is_present)
+            {
+                m_world->Agents()[command.agent].command = command;
+            }
         }
         m_pending.clear();
         m_world->SendCommands();
@@ -170,6 +170,5 @@ main()
     fieldkit::protocol::Serve(stdin, output, heartbeat, [&federate](const fieldkit::protocol::Frame& request) {
         return federate.AnswerTo(request);
     });
-    federate.Stop();
-    return 0;
+    return federate.Stop() ? 0 : 1;
 }

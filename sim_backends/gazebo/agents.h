@@ -22,6 +22,22 @@ struct Agent
     protocol::Command command; // that applies
     Pose pose;
     Vector velocity;
+    int64_t appears_ns = 0, disappears_ns = -1; // -1 for never
+    bool is_present = true; // it has a model, which may not have been seen yet
+    bool is_new = false;    // its model has not been seen yet
+    bool had_model = true;  // before the run
+
+    bool HasLifetime() const
+    {
+        return appears_ns > 0 || disappears_ns >= 0;
+    }
+
+    Pose Start() const
+    {
+        Pose pose = Pose::WithYaw(start_yaw);
+        pose.position = start;
+        return pose;
+    }
 
     Vector AntennaAt(const Pose& place) const
     {
@@ -36,7 +52,7 @@ struct Agent
     // Whether it has a direction that it has not reached yet.
     bool Turns() const
     {
-        return flies && !std::isnan(command.values[3]) && std::fabs(YawError()) > 1e-3;
+        return is_present && flies && !std::isnan(command.values[3]) && std::fabs(YawError()) > 1e-3;
     }
 
     void Stop()
@@ -47,7 +63,7 @@ struct Agent
 
 // The agents of hello, with their models and the starts of these.
 inline std::vector<Agent>
-AgentsOf(const protocol::Hello& hello, const Options& options)
+AgentsOf(const protocol::Hello& hello, const Json& plans, const Options& options)
 {
     std::vector<Agent> agents;
     for (const protocol::Agent& announced : hello.agents)
@@ -69,6 +85,16 @@ AgentsOf(const protocol::Hello& hello, const Options& options)
         const auto& position_m = announced.start.position_m;
         Vector start{position_m[0], position_m[1], position_m[2]};
         agent.start = start - Pose::WithYaw(agent.start_yaw).Rotated(agent.antenna);
+        agent.pose = agent.Start();
+        auto plan = plans.value(agent.name, Json::object());
+        auto read_ns = [&plan](const char* key, int64_t& time_ns) {
+            if (plan.contains(key))
+            {
+                time_ns = std::llround(std::strtod(plan[key].get<std::string>().c_str(), nullptr) * 1e9);
+            }
+        };
+        read_ns("appears", agent.appears_ns);
+        read_ns("disappears", agent.disappears_ns);
         agents.push_back(agent);
     }
     return agents;

@@ -15,13 +15,14 @@ namespace fieldkit
 class Connection
 {
   public:
-    Connection(const Options& options, const std::vector<Agent>& agents, WorldMonitor& monitor)
+    Connection(const Options& options, std::vector<Agent>& agents, WorldMonitor& monitor)
         : m_options(options),
+          m_agents(agents),
           m_monitor(monitor)
     {
         for (const Agent& agent : agents)
         {
-            m_receivers.push_back({agent.name, agent.model, options.CommandTopic(agent.name, agent.model), {}});
+            m_receivers.push_back({agent.name, options.CommandTopic(agent.name, agent.model), {}});
         }
     }
 
@@ -46,8 +47,22 @@ class Connection
             [&] {
                 return "no poses have been received on " + poses + "; the world needs the SceneBroadcaster plugin";
             });
+        SetPresence();
+        for (Agent& agent : m_agents)
+        {
+            agent.had_model = agent.is_present;
+        }
         CheckModels();
         WaitForSubscribers(lock);
+    }
+
+    // Set which of the agents with a lifetime have a model now; the others must have one.
+    void SetPresence()
+    {
+        for (Agent& agent : m_agents)
+        {
+            agent.is_present = !agent.HasLifetime() || m_monitor.present.count(agent.model) > 0;
+        }
     }
 
     // Wait until the plugins of all models subscribe to commands.
@@ -55,9 +70,10 @@ class Connection
     {
         const CommandReceiver* missing = nullptr;
         auto all_connected = [&] {
-            for (CommandReceiver& receiver : m_receivers)
+            for (size_t i = 0; i < m_receivers.size(); i++)
             {
-                if (!receiver.publisher.HasConnections())
+                CommandReceiver& receiver = m_receivers[i];
+                if (m_agents[i].is_present && !receiver.publisher.HasConnections())
                 {
                     missing = &receiver;
                     return false;
@@ -192,7 +208,7 @@ class Connection
     // What receives the commands of an agent.
     struct CommandReceiver
     {
-        std::string agent, model, topic;
+        std::string agent, topic;
         transport::Node::Publisher publisher;
     };
 
@@ -273,11 +289,11 @@ class Connection
     void CheckModels() const
     {
         std::string missing;
-        for (const CommandReceiver& receiver : m_receivers)
+        for (const Agent& agent : m_agents)
         {
-            if (!m_monitor.present.count(receiver.model))
+            if (!agent.HasLifetime() && !m_monitor.present.count(agent.model))
             {
-                missing += (missing.empty() ? "" : ", ") + receiver.model;
+                missing += (missing.empty() ? "" : ", ") + agent.model;
             }
         }
         if (!missing.empty())
@@ -288,6 +304,7 @@ class Connection
     }
 
     const Options& m_options;
+    std::vector<Agent>& m_agents;
     WorldMonitor& m_monitor;
     std::vector<CommandReceiver> m_receivers; // by agent
     bool m_usesFence = false;

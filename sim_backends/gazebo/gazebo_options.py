@@ -6,7 +6,11 @@ from typing import Annotated, Any, Literal
 from typing_extensions import override
 
 from fieldkit.config.schema import Bool, Field, Location
+from fieldkit.core.units import parse_duration_s
 from sim_backends.federates.simulator_options import SimulatorOptions
+from sim_backends.gazebo.sdf import VERSIONS, model_sdf
+from sim_backends.physics.differential_drive import DriveLimits
+from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.obstacles import Coordinate, Real
 
 Positive = Annotated[Real, Field(gt=0, le=1e6)]
@@ -28,6 +32,10 @@ class GazeboOptions(SimulatorOptions):
         ip: Value of `IGN_IP` and `GZ_IP`; if omitted, that of the environment.
         control_service: Service that advances, pauses and resets the world.
         pose_service: Service that places robots.
+        create_service: Service that creates the model of an agent when it appears.
+        remove_service: Service that removes the model of an agent when it disappears.
+        model_files: SDF file, on the machine of Gazebo, of the model of each agent that has another model than in
+            `fieldkit cosim sdf` when it appears.
         pose_topic: Topic of the poses of the models.
         clock_topic: Topic of the simulated time.
         command_topic: Topic of the commands to an agent.
@@ -58,6 +66,9 @@ class GazeboOptions(SimulatorOptions):
     ip: str | None = None
     control_service: str = "/world/{world}/control"
     pose_service: str = "/world/{world}/set_pose"
+    create_service: str = "/world/{world}/create"
+    remove_service: str = "/world/{world}/remove"
+    model_files: dict[str, str] = Field(default_factory=dict)
     pose_topic: str = "/world/{world}/dynamic_pose/info"
     clock_topic: str = "/world/{world}/clock"
     command_topic: str = "/model/{model}/cmd_vel"
@@ -79,12 +90,22 @@ class GazeboOptions(SimulatorOptions):
 
     @override
     def agent_names(self) -> Iterator[tuple[str, Location]]:
-        for key in ("models", "origins_m", "command_topics"):
+        for key in ("models", "origins_m", "command_topics", "model_files"):
             yield from ((name, (key, name)) for name in getattr(self, key))
 
     @override
-    def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        for name, plan in scenario["agents"].items():
-            for key in ("appears", "disappears"):
-                if plan.get(key, "0s") not in {"0s", "0.0s"}:
-                    yield f"robots cannot appear or disappear in Gazebo; remove {key}", ("agents", name, key)
+    def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `sdf`: the model of each agent, by the version that has the names of its plugins."""
+        step_ns = round(parse_duration_s(configuration["scenario"]["physics"]["step"]) * 1e9)
+        models: dict[str, dict[str, str]] = {}
+        for agent, robot in configuration["robots"].items():
+            name, limits = self.models.get(agent, agent), _limits(robot["body"])
+            models[agent] = {
+                version: model_sdf(name, limits, step_ns=step_ns, version=version) for version in VERSIONS
+            }
+        return {"sdf": models}
+
+
+def _limits(body: Mapping[str, Any]) -> DriveLimits | QuadrotorLimits:
+    """Return the limits of a body in the configuration; only those of a quadrotor have a mass."""
+    return QuadrotorLimits(**body) if "mass_kg" in body else DriveLimits(**body)

@@ -10,6 +10,8 @@
 #include <gz/msgs/boolean.pb.h>
 #include <gz/msgs/clock.pb.h>
 #include <gz/msgs/empty.pb.h>
+#include <gz/msgs/entity.pb.h>
+#include <gz/msgs/entity_factory.pb.h>
 #include <gz/msgs/pose.pb.h>
 #include <gz/msgs/pose_v.pb.h>
 #include <gz/msgs/twist.pb.h>
@@ -17,6 +19,7 @@
 #include <gz/transport/Node.hh>
 #include <gz/transport/config.hh>
 #define FIELDKIT_GAZEBO_SOFTWARE "Gazebo Transport " GZ_TRANSPORT_VERSION_FULL
+#define FIELDKIT_GAZEBO_PLUGINS "garden"
 
 namespace fieldkit
 {
@@ -27,6 +30,8 @@ namespace transport = gz::transport;
 #include <ignition/msgs/boolean.pb.h>
 #include <ignition/msgs/clock.pb.h>
 #include <ignition/msgs/empty.pb.h>
+#include <ignition/msgs/entity.pb.h>
+#include <ignition/msgs/entity_factory.pb.h>
 #include <ignition/msgs/pose.pb.h>
 #include <ignition/msgs/pose_v.pb.h>
 #include <ignition/msgs/twist.pb.h>
@@ -34,6 +39,7 @@ namespace transport = gz::transport;
 #include <ignition/transport/Node.hh>
 #include <ignition/transport/config.hh>
 #define FIELDKIT_GAZEBO_SOFTWARE "Ignition Transport " IGNITION_TRANSPORT_VERSION_FULL
+#define FIELDKIT_GAZEBO_PLUGINS "fortress"
 
 namespace fieldkit
 {

@@ -5,6 +5,8 @@
 
 #include "connection.h"
 
+#include <deque>
+
 namespace fieldkit
 {
 
@@ -44,6 +46,14 @@ class LockStep
         {
             Reset();
         }
+        for (Agent& agent : m_agents)
+        {
+            bool is_present = agent.appears_ns < m_stepNs;
+            if (is_present != agent.is_present)
+            {
+                is_present ? Create(agent) : Remove(agent);
+            }
+        }
         if (m_options.place)
         {
             Place();
@@ -54,10 +64,89 @@ class LockStep
         m_monitor.reached_ns = 0;
         CheckStart();
         m_windowPoses = Poses();
+        for (Agent& agent : m_agents)
+        {
+            if (agent.appears_ns >= m_stepNs)
+            {
+                // It is created before the step, which publishes its first pose.
+                m_changes.push_back({agent.appears_ns / m_stepNs - 1, agent, true});
+            }
+            if (agent.disappears_ns >= 0)
+            {
+                m_changes.push_back({(agent.disappears_ns + m_stepNs - 1) / m_stepNs, agent, false});
+            }
+        }
+        std::stable_sort(m_changes.begin(), m_changes.end(),
+                         [](const Change& first, const Change& second) { return first.step < second.step; });
     }
 
     // Advance to a number of steps after the start.
     void Advance(int64_t to_step)
+    {
+        // An agent that appears at a step has been created before it.
+        while (!m_changes.empty() && m_changes.front().step + m_changes.front().appears <= to_step)
+        {
+            Change change = m_changes.front();
+            m_changes.pop_front();
+            AdvanceSteps(change.step);
+            change.appears ? Create(change.agent) : Remove(change.agent);
+        }
+        AdvanceSteps(to_step);
+    }
+
+    // Publish the command of each agent, and wait until Gazebo has received them all.
+    void SendCommands()
+    {
+        for (size_t i = 0; i < m_agents.size(); i++)
+        {
+            if (m_agents[i].is_present && !m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs)))
+            {
+                m_monitor.Fail("a command to " + m_agents[i].name + " cannot be published on " +
+                               m_connection.CommandTopic(i));
+            }
+        }
+        m_connection.Acknowledge();
+    }
+
+    // Stop all robots, without waiting; the world stays paused.
+    void Stop()
+    {
+        for (size_t i = 0; i < m_agents.size(); i++)
+        {
+            m_agents[i].Stop();
+            if (m_agents[i].is_present)
+            {
+                m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs));
+            }
+        }
+    }
+
+    // Remove the models that the run has created, and create those that it has removed.
+    void RestoreModels()
+    {
+        for (Agent& agent : m_agents)
+        {
+            if (agent.is_present && !agent.had_model)
+            {
+                Remove(agent);
+            }
+            else if (agent.had_model && !agent.is_present)
+            {
+                RequestModel(agent);
+            }
+        }
+    }
+
+  private:
+    // The step after which an agent gets a model, or loses it.
+    struct Change
+    {
+        int64_t step;
+        std::reference_wrapper<Agent> agent;
+        bool appears;
+    };
+
+    void AdvanceSteps(int64_t to_step)
     {
         int64_t at = m_monitor.reached_ns / m_stepNs;
         if (to_step <= at)
@@ -105,31 +194,53 @@ class LockStep
         m_windowAt = at;
     }
 
-    // Publish the command of each agent, and wait until Gazebo has received them all.
-    void SendCommands()
+    // The service answers before it creates the model, which happens at the latest before the next step. A request that
+    // arrives twice creates it once, because its name must be new.
+    void RequestModel(const Agent& agent)
     {
-        for (size_t i = 0; i < m_agents.size(); i++)
+        msgs::EntityFactory request;
+        auto file = m_options.model_files.find(agent.name);
+        if (file != m_options.model_files.end())
         {
-            if (!m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs)))
-            {
-                m_monitor.Fail("a command to " + m_agents[i].name + " cannot be published on " +
-                               m_connection.CommandTopic(i));
-            }
+            request.set_sdf_filename(file->second);
         }
-        m_connection.Acknowledge();
+        else
+        {
+            request.set_sdf(m_options.sdf.at(agent.name));
+        }
+        request.set_name(agent.model);
+        *request.mutable_pose() = StartOf(agent);
+        m_connection.Call(m_options.Name(m_options.create_service), request);
     }
 
-    // Stop all robots, without waiting; the world stays paused.
-    void Stop()
+    void Create(Agent& agent)
     {
-        for (size_t i = 0; i < m_agents.size(); i++)
+        RequestModel(agent);
+        agent.is_present = agent.is_new = true;
+        size_t number = static_cast<size_t>(&agent - m_agents.data());
+        agent.pose = agent.Start();
+        if (!m_windowPoses.empty())
         {
-            m_agents[i].Stop();
-            m_connection.Publish(i, TwistOf(m_agents[i], m_options, m_stepNs));
+            m_windowPoses[number] = agent.pose;
         }
+        {
+            WorldMonitor::Lock lock(m_monitor.mutex);
+            m_connection.WaitForSubscribers(lock);
+        }
+        SendCommands();
     }
 
-  private:
+    // As for Create: the model is removed at the latest before the next step.
+    void Remove(Agent& agent)
+    {
+        msgs::Entity request;
+        request.set_name(agent.model);
+        request.set_type(msgs::Entity::MODEL);
+        m_connection.Call(m_options.Name(m_options.remove_service), request);
+        agent.is_present = agent.is_new = false;
+        agent.Stop();
+    }
+
     int64_t StepsOf(double seconds) const
     {
         return std::max<int64_t>(std::llround(seconds * 1e9 / double(m_stepNs)), 1);
@@ -172,15 +283,24 @@ class LockStep
                 }
             }
             int64_t before_ns = m_nowNs;
+            int64_t target_ns = before_ns + steps * m_stepNs;
+            SetAwaited(target_ns);
             auto answer = m_connection.Send(m_options.ControlService(), Connection::ControlRequest(steps));
             WorldMonitor::Lock lock(m_monitor.mutex);
-            WaitForPoses(lock, before_ns + steps * m_stepNs, before_ns, answer);
+            WaitForPoses(lock, target_ns, before_ns, answer);
+            m_monitor.awaited_ns = -1;
             count -= steps;
         }
         for (size_t i = 0; i < m_agents.size(); i++)
         {
             m_agents[i].pose = m_monitor.poses[i];
         }
+    }
+
+    void SetAwaited(int64_t time_ns)
+    {
+        WorldMonitor::Lock lock(m_monitor.mutex);
+        m_monitor.awaited_ns = time_ns;
     }
 
     // The clock of a step is published before the step is made, so only poses with its time stamp are valid.
@@ -197,9 +317,14 @@ class LockStep
             {
                 m_monitor.Fail("it was reset" + m_monitor.LastMessage());
             }
-            return m_monitor.pose_ns == target_ns;
+            return m_monitor.pose_ns == target_ns && NewAgents().empty();
         };
         m_monitor.Wait(lock, have_arrived, [&]() -> std::string {
+            if (m_monitor.pose_ns == target_ns)
+            {
+                return "the models of " + NewAgents() + " have not been created by " +
+                       m_options.Name(m_options.create_service);
+            }
             if (m_monitor.clock_ns == target_ns)
             {
                 return "no poses of Gazebo's time " + Seconds(target_ns) + " have arrived on " +
@@ -213,13 +338,28 @@ class LockStep
         {
             m_monitor.reached_ns = m_nowNs - m_startNs;
         }
-        for (const Agent& agent : m_agents)
+        for (Agent& agent : m_agents)
         {
-            if (!m_monitor.present.count(agent.model))
+            agent.is_new = false;
+            if (agent.is_present && !m_monitor.present.count(agent.model))
             {
                 m_monitor.Fail("the model " + agent.model + " has been removed");
             }
         }
+    }
+
+    // The agents whose models have been requested and not been seen, for messages.
+    std::string NewAgents() const
+    {
+        std::string names;
+        for (const Agent& agent : m_agents)
+        {
+            if (agent.is_new && !m_monitor.present.count(agent.model))
+            {
+                names += (names.empty() ? "" : ", ") + agent.name;
+            }
+        }
+        return names;
     }
 
     // Robots may still move from an earlier run, and a new position keeps the velocity.
@@ -258,7 +398,8 @@ class LockStep
             lock, [&] { return m_monitor.pose_ns == 0; },
             [] { return std::string("no poses have arrived after a reset"); });
         m_nowNs = 0;
-        // Newer versions create the plugins again, which then subscribe again.
+        // Newer versions create the models and plugins again, which then subscribe again.
+        m_connection.SetPresence();
         m_connection.WaitForSubscribers(lock);
     }
 
@@ -267,16 +408,24 @@ class LockStep
     {
         for (const Agent& agent : m_agents)
         {
-            Pose start = Pose::WithYaw(agent.start_yaw);
-            msgs::Pose pose;
-            pose.set_name(agent.model);
-            pose.mutable_position()->set_x(agent.start.x);
-            pose.mutable_position()->set_y(agent.start.y);
-            pose.mutable_position()->set_z(agent.start.z);
-            pose.mutable_orientation()->set_w(start.w);
-            pose.mutable_orientation()->set_z(start.z);
-            m_connection.Call(m_options.Name(m_options.pose_service), pose);
+            if (agent.is_present)
+            {
+                m_connection.Call(m_options.Name(m_options.pose_service), StartOf(agent));
+            }
         }
+    }
+
+    static msgs::Pose StartOf(const Agent& agent)
+    {
+        Pose start = agent.Start();
+        msgs::Pose pose;
+        pose.set_name(agent.model);
+        pose.mutable_position()->set_x(start.position.x);
+        pose.mutable_position()->set_y(start.position.y);
+        pose.mutable_position()->set_z(start.position.z);
+        pose.mutable_orientation()->set_w(start.w);
+        pose.mutable_orientation()->set_z(start.z);
+        return pose;
     }
 
     void CheckStart() const
@@ -285,7 +434,7 @@ class LockStep
         {
             Vector error = agent.pose.position - agent.start;
             double distance_m = std::sqrt(error.x * error.x + error.y * error.y + error.z * error.z);
-            if (!(distance_m <= m_options.start_error_m))
+            if (agent.is_present && !(distance_m <= m_options.start_error_m))
             {
                 m_monitor.Fail(
                     "the model " + agent.model + " is " + std::to_string(distance_m) + " m away from the start of " +
@@ -314,6 +463,7 @@ class LockStep
     int64_t m_startNs = 0;
     int64_t m_windowAt = 0; // step at which the last window has ended
     std::vector<Pose> m_windowPoses;
+    std::deque<Change> m_changes;
 };
 
 } // namespace fieldkit

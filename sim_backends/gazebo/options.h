@@ -4,6 +4,7 @@
 #define FIELDKIT_GAZEBO_OPTIONS_H
 
 #include "fieldkit/bytes.h"
+#include "libraries.h"
 
 #include <array>
 #include <limits>
@@ -21,8 +22,10 @@ using protocol::Refusal;
 struct Options
 {
     std::string world, partition, ip, acknowledge, velocity;
+    std::string create_service, remove_service;
     std::string control_service, pose_service, pose_topic, clock_topic, command_topic, fence_topic, fence_answer;
-    std::map<std::string, std::string> models, command_topics;
+    std::map<std::string, std::string> models, model_files, command_topics;
+    std::map<std::string, std::string> sdf; // of the model of each agent
     std::map<std::string, std::array<double, 3>> origins_m;
     double timeout_s, settle_s, start_error_m, gravity_m_s2, yaw_gain_per_s, control_period_s;
     double limit_m_s2 = std::numeric_limits<double>::infinity();
@@ -38,6 +41,12 @@ struct Options
         auto read = [&](const char* key, auto& value) { json.at(key).get_to(value); };
         read("acknowledge", acknowledge), read("velocity", velocity);
         read("control_service", control_service), read("pose_service", pose_service);
+        read("create_service", create_service), read("remove_service", remove_service);
+        read("model_files", model_files);
+        for (const auto& [agent, versions] : configuration.at("sdf").items())
+        {
+            sdf[agent] = versions.at(FIELDKIT_GAZEBO_PLUGINS);
+        }
         read("pose_topic", pose_topic), read("clock_topic", clock_topic), read("command_topic", command_topic);
         read("fence_topic", fence_topic), read("fence_answer", fence_answer);
         read("models", models), read("command_topics", command_topics), read("origins_m", origins_m);

@@ -6,7 +6,7 @@ The frame of a robot's model is at the lowest point of its vertical axis, where 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fieldkit.core.model import Vector
@@ -19,6 +19,8 @@ from sim_backends.world.world import World
 
 Version = Literal["fortress", "garden"]
 """Names of the plugins: those of Fortress, or those of Garden, which later versions also accept."""
+
+VERSIONS: Final[tuple[Version, ...]] = get_args(Version)
 
 REAL_TIME_FACTOR: Final = 5.0
 """Upper limit of the speed. A paused Gazebo repeats its loop at this rate too, so a larger one uses the processor."""
@@ -109,6 +111,13 @@ def world_sdf(
         _add_robot(element, name, robot, version, step_ns)
     indent(root)
     return '<?xml version="1.0"?>\n' + tostring(root, encoding="unicode") + "\n"
+
+
+def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int, version: Version) -> str:
+    """Return an SDF file with one robot at the origin, with which Gazebo creates its model; arguments as before."""
+    root = Element("sdf", version="1.9")
+    _add_robot(root, name, SdfRobot(limits, _UPRIGHT, 0.0), version, step_ns)
+    return tostring(root, encoding="unicode")
 
 
 def _add_fence(world: Element, parent: World, version: Version) -> None:

@@ -58,6 +58,7 @@ class WorldMonitor
     std::mutex mutex;
     std::condition_variable changed;
     int64_t clock_ns = -1, pose_ns = -1;
+    int64_t awaited_ns = -1; // time whose poses are awaited; earlier messages wake nothing. -1: each message does
     int repeated_clocks = 0;
     std::vector<Pose> poses;
     std::set<std::string> present; // models that have a pose
@@ -73,8 +74,12 @@ class WorldMonitor
         {
             return; // a paused world repeats its clock
         }
+        bool is_expected = clock_ns <= time_ns && time_ns <= awaited_ns;
         clock_ns = time_ns;
-        changed.notify_all();
+        if (!is_expected)
+        {
+            changed.notify_all();
+        }
     }
 
     void Receive(const msgs::Pose_V& message)
@@ -82,11 +87,12 @@ class WorldMonitor
         std::lock_guard<std::mutex> guard(mutex);
         const auto& stamp = message.header().stamp();
         int64_t time_ns = stamp.sec() * 1000000000LL + stamp.nsec();
-        if (time_ns == pose_ns)
+        if (time_ns == pose_ns && message.pose_size() == m_poses)
         {
             return; // a paused world repeats its poses
         }
         pose_ns = time_ns;
+        m_poses = message.pose_size();
         present.clear();
         names.clear();
         for (const msgs::Pose& pose : message.pose())
@@ -104,7 +110,10 @@ class WorldMonitor
             const auto& q = pose.orientation();
             poses[model->second] = Pose{{p.x(), p.y(), p.z()}, q.w(), q.x(), q.y(), q.z()};
         }
-        changed.notify_all();
+        if (pose_ns >= awaited_ns)
+        {
+            changed.notify_all();
+        }
     }
 
     // Fail with the world's name and its last time; the coordinator adds the request.
@@ -186,6 +195,7 @@ class WorldMonitor
     protocol::Heartbeat& m_heartbeat;
     std::map<std::string, size_t> m_indices; // of agents, by model
     Clock::time_point m_clockAt;
+    int m_poses = 0; // number of poses in the last message
 };
 
 } // namespace fieldkit

@@ -11,7 +11,7 @@ from sim_backends.mujoco_physics.chassis import Wheels
 from sim_backends.mujoco_physics.mjcf import quaternion
 from sim_backends.physics.body import Velocity
 from sim_backends.physics.differential_drive import DriveLimits, checked_twist
-from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits, VelocityController
+from sim_backends.physics.quadrotor import FlightTarget, Quadrotor, QuadrotorLimits, VelocityController
 
 TICK_NS: Final = 10_000_000
 """Period of the controllers: PX4's velocity controller runs at 100 Hz."""
@@ -29,6 +29,7 @@ class Registers:
         ctrl: Set-points of the motors.
         qvel: Velocities of the joints; the first three of a free body are its velocity, metres per second.
         xmat: Rotation matrices of the bodies, row by row: 9 numbers each.
+        xquat: Attitudes of the bodies: 4 numbers each.
         mocap_quat: Target attitudes: 4 numbers each.
         xfrc_applied: Forces and torques on the bodies: 6 numbers each.
     """
@@ -36,6 +37,7 @@ class Registers:
     ctrl: "memoryview[float]"
     qvel: "memoryview[float]"
     xmat: "memoryview[float]"
+    xquat: "memoryview[float]"
     mocap_quat: "memoryview[float]"
     xfrc_applied: "memoryview[float]"
 
@@ -114,13 +116,19 @@ class FlightController:
         self._quadrotor = Quadrotor(limits, (0.0, 0.0, 0.0))
         self._indices = body, mocap, dof, motor
         self._target = Velocity()
+        self._is_powered = True
         self._held_rad: float | None = None
         self._max_lean_rad = limits.tilt_rate_rad_s * limits.lag_s
         self._max_turn_rad = limits.yaw_rate_rad_s * limits.lag_s
 
     def command(self, command: object) -> None:
         """Implement `Controller.command`."""
-        self._target = self._quadrotor.target(command)
+        if isinstance(command, FlightTarget):
+            self._law = VelocityController(command.limits_within(self._limits))
+            self._target, self._is_powered = command.velocity, command.powered
+        else:
+            self._law, self._is_powered = VelocityController(self._limits), True
+            self._target = self._quadrotor.target(command)
         self._held_rad = self._target.yaw_rad
 
     def tick(self, registers: Registers, elapsed_s: float) -> bool:  # noqa: ARG002 (see Controller)
@@ -129,6 +137,20 @@ class FlightController:
         # Axes x and z of the body, in components east, north, up; then velocity and wanted thrust in the same order.
         x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[9 * body : 9 * body + 9]
         v_e, v_n, v_u = registers.qvel[dof : dof + 3]
+        drag_n_s_m = limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)
+        forces, first = registers.xfrc_applied, 6 * body
+        forces[first], forces[first + 1], forces[first + 2] = (
+            -drag_n_s_m * v_e,
+            -drag_n_s_m * v_n,
+            -drag_n_s_m * v_u,
+        )
+        targets, first = registers.mocap_quat, 4 * mocap
+        if not self._is_powered:
+            # Towards its present attitude, the control of attitude has no torque except damping.
+            registers.ctrl[motor] = 0.0
+            for index in range(4):
+                targets[first + index] = registers.xquat[4 * body + index]
+            return True
         f_e, f_n, f_u = self._law.thrust_m_s2((v_e, v_n, v_u), self._target)
         yaw_rad = math.atan2(x_n, x_e)
         if self._held_rad is None:
@@ -137,20 +159,12 @@ class FlightController:
         forward, left = f_e * cos + f_n * sin, f_n * cos - f_e * sin
         pitch_rad = math.atan2(z_e * cos + z_n * sin, z_u)
         roll_rad = math.asin(_clamp(z_e * sin - z_n * cos, 1.0))
-        targets, first = registers.mocap_quat, 4 * mocap
         targets[first], targets[first + 1], targets[first + 2], targets[first + 3] = quaternion(
             yaw_rad + _clamp(math.remainder(self._held_rad - yaw_rad, math.tau), self._max_turn_rad),
             pitch_rad + _clamp(math.atan2(forward, f_u) - pitch_rad, self._max_lean_rad),
             roll_rad + _clamp(-math.atan2(left, math.hypot(forward, f_u)) - roll_rad, self._max_lean_rad),
         )
         registers.ctrl[motor] = f_u / z_u * limits.mass_kg if z_u > _UPRIGHT else limits.thrust_n[0]
-        drag_n_s_m = limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)
-        forces, first = registers.xfrc_applied, 6 * body
-        forces[first], forces[first + 1], forces[first + 2] = (
-            -drag_n_s_m * v_e,
-            -drag_n_s_m * v_n,
-            -drag_n_s_m * v_u,
-        )
         return True
 
 

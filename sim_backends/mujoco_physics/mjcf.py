@@ -221,12 +221,14 @@ class _Document:
         _add_inertia(body, limits.mass_kg, centre_m, inertia_kg_m2)
         # A cylinder that turns on a plane gets wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
         half_axes_m = (limits.radius_m, limits.radius_m, limits.height_m / 2)
-        _add(body, "geom", type="ellipsoid", size=_text(half_axes_m), pos=_text(centre_m))
+        shape = f"{name}b"
+        _add(body, "geom", name=shape, type="ellipsoid", size=_text(half_axes_m), pos=_text(centre_m))
+        self._add_grip(shape, _BODY_FRICTION)
         centre, target = f"{name}c", f"{name}t"
         _add(body, "site", name=centre, pos=_text(centre_m))
         attitude = _add(self._bodies, "body", name=target, mocap="true", quat=body.attrib["quat"])
         _add(attitude, "site", name=target)
-        thrust = _text(limits.thrust_n)
+        thrust = _text((0.0, limits.thrust_n[1]))  # the controller's minimum is higher while the rotors turn
         _add(self._motors, "general", name=name, site=centre, gear="0 0 1 0 0 0", ctrlrange=thrust)
         for axis, moment_kg_m2 in enumerate(inertia_kg_m2, start=3):
             damping = moment_kg_m2 * ATTITUDE_RATE_PER_S

@@ -28,7 +28,7 @@ from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, Model, model_xml, q
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.quadrotor import FlightStatus, QuadrotorLimits
 from sim_backends.physics.robot_limits import BODIES, quadrotor
 from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
@@ -37,6 +37,8 @@ _LONGEST_STEP_NS: Final = 1_000_000
 """Longest step of MuJoCo: with longer ones, tires that slide sideways hop."""
 
 
+_CARRIES: Final = 0.5
+"""Minimum vertical component of the normal of a contact that carries a robot."""
 _PARKED_M: Final = 10_000.0
 """Distance east and north at which absent agents are, at most 1 um of rounding error."""
 _PARKED_APART_M: Final = 10.0
@@ -213,6 +215,31 @@ class MujocoPhysics:
         mujoco.mj_step1(model, data)
         self._states = SensedStates(self._rows, self._sensors.tolist())
 
+    def flight_status(self, name: str) -> FlightStatus:
+        """Return attitude and support of a quadrotor."""
+        model, data = self.model, self.data
+        body = model.body(f"a{self._rows[name]}")
+        first = int(model.jnt_qposadr[body.jntadr[0]])
+        x_e, _, z_e, x_n, _, z_n, _, _, z_u = self._registers.xmat[9 * body.id : 9 * body.id + 9]
+        e, n, u = data.qpos[first : first + 3].tolist()
+        heading = math.hypot(x_e, x_n) or 1.0
+        cos, sin = x_e / heading, x_n / heading
+        return FlightStatus(
+            (e, n, u),
+            math.asin(max(-1.0, min(z_e * sin - z_n * cos, 1.0))),
+            math.atan2(z_e * cos + z_n * sin, z_u),
+            self._is_supported(int(body.geomadr[0])),
+        )
+
+    def _is_supported(self, shape: int) -> bool:
+        """Return True if a contact of a shape pushes it up."""
+        contacts = self.data.contact
+        for (first, second), frame in zip(contacts.geom.tolist(), contacts.frame.tolist(), strict=True):
+            # The normal, the first axis of the frame, leads from the first shape to the second.
+            if (second == shape and frame[2] > _CARRIES) or (first == shape and frame[2] < -_CARRIES):
+                return True
+        return False
+
     def run_controllers(self) -> None:
         """Let the controllers that are due at the present step set their motors."""
         step = self._step
@@ -229,8 +256,8 @@ class MujocoPhysics:
     def __deepcopy__(self, memo: dict[int, Any]) -> "MujocoPhysics":
         other = object.__new__(type(self))
         memo[id(self)] = other
-        own = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
-        vars(other).update(copy.deepcopy(own, memo), model=self.model)
+        members = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
+        vars(other).update(copy.deepcopy(members, memo), model=self.model)
         data = mujoco.MjData(self.model)
         mujoco.mj_copyData(data, self.model, self.data)
         other._use(data)
@@ -240,7 +267,7 @@ class MujocoPhysics:
         """Use a state of the simulation; views of its arrays are made once, because reading an attribute is slow."""
         self.data = data
         self._sensors = memoryview(data.sensordata)
-        arrays = data.ctrl, data.qvel, data.xmat, data.mocap_quat, data.xfrc_applied
+        arrays = data.ctrl, data.qvel, data.xmat, data.xquat, data.mocap_quat, data.xfrc_applied
         views: list[Any] = [memoryview(array.reshape(-1)) for array in arrays]
         self._registers = Registers(*views)
 

@@ -1,7 +1,7 @@
 """Transports of bare IP packets: each packet of a program is one IP packet, with its own headers in its size.
 
-The programs are real ones, whose kernels have built the packets. A broadcast or multicast enters the network as one
-packet per receiver, all of one source, number and time; on the air they are one frame.
+The programs are real: their kernels have built the packets. A broadcast or multicast enters the network as one packet
+per receiver, all with the same source, number and time; the radio sends them as one frame.
 """
 
 from dataclasses import dataclass, field
@@ -52,7 +52,7 @@ class _Group:
 
     Attributes:
         packet_ids: Number of the packet of each receiver that has not received or missed it.
-        missed: Reason why each receiver missed the frame whose packet has not entered yet.
+        missed: By receiver that missed the frame before its packet entered the network: the reason.
     """
 
     packet_ids: dict[str, int] = field(default_factory=dict)

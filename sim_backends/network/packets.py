@@ -1,6 +1,6 @@
 """Packets of a co-simulation and their results; times are integer nanoseconds of simulated time.
 
-Those of which a run creates one for each packet are tuples, which are faster to create than frozen dataclasses.
+Classes with an object per packet are tuples, which are faster to create than frozen dataclasses.
 """
 
 from dataclasses import dataclass

@@ -128,7 +128,8 @@ class RadioNetwork:
         self._states = states
         for packet in packets:
             self._run(packet.enters_ns)
-            self._place(packet.enters_ns)
+            if self._place(packet.enters_ns):
+                self._run(packet.enters_ns)
             self.now_ns = packet.enters_ns
             self._pending[packet.packet_id] = packet
             self._transport(packet.protocol).send(packet)
@@ -189,7 +190,8 @@ class RadioNetwork:
     def _run(self, to_ns: int) -> None:
         """Process all events up to `to_ns` in order."""
         while (at_ns := self.next_event_ns()) is not None and at_ns <= to_ns:
-            self._place(at_ns)
+            if self._place(at_ns) and self.next_event_ns() != at_ns:
+                continue  # the end of a jammer's noise may start a transmission, and an absence may cancel one
             self.now_ns = at_ns
             if self._radio.next_event_ns() != at_ns:
                 if self._changes_ns and self._changes_ns[-1] == at_ns:
@@ -212,11 +214,15 @@ class RadioNetwork:
         else:
             call()
 
-    def _place(self, at_ns: int) -> None:
-        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed."""
+    def _place(self, at_ns: int) -> bool:
+        """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed.
+
+        Returns:
+            True if they changed. The radio may then have another next event.
+        """
         states = self._states.at(at_ns) if isinstance(self._states, DeadReckoned) else self._states
         if states is self._placed_states:
-            return
+            return False
         self._placed_states = states
         absent: frozenset[str] = frozenset()
         try:
@@ -232,6 +238,7 @@ class RadioNetwork:
                 self._disturb(at_ns)
         if self._jammers:
             self._jam()
+        return True
 
     def _collect(self) -> None:
         """Pass the packets that the radio delivers now to their hosts, until no immediate consequence is left."""

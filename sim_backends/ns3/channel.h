@@ -78,6 +78,12 @@ class Channel
         return link.cuts > 0 ? std::numeric_limits<double>::infinity() : link.mean_db;
     }
 
+    // The mean loss in dB between two positions.
+    double MeanLossDb(const Point& start, const Point& end) const
+    {
+        return OpenDb(start, end) + m_obstacles.LossDb(start, end);
+    }
+
     // Count one more or one fewer reason why two stations cannot receive each other.
     void Cut(size_t a, size_t b, int change)
     {
@@ -163,7 +169,7 @@ class Channel
 
     void DrawWaves(double decorrelation_m)
     {
-        auto draws = FirstDraws(m_seed, {"shadowing"}, 3 * kWaves);
+        auto draws = RandomStream(m_seed, {"shadowing"}).First(3 * kWaves);
         for (int wave = 0; wave < kWaves; wave++)
         {
             double rest = 1 - draws[wave];
@@ -185,7 +191,7 @@ class Channel
 
     void DrawEchoes(Link& link, size_t first, size_t second) const
     {
-        auto draws = FirstDraws(m_seed, {m_names[first], m_names[second], "fading"}, 4 * kEchoes);
+        auto draws = RandomStream(m_seed, {m_names[first], m_names[second], "fading"}).First(4 * kEchoes);
         auto angle = [](int sector, double within) { return 2 * M_PI / kEchoes * (sector % kEchoes + within); };
         for (int n = 0; n < kEchoes; n++)
         {

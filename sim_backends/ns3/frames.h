@@ -126,13 +126,19 @@ class FrameTracker
     // Called with the id of a packet, one of whose frames is lost, and the reason.
     std::function<void(uint64_t, const std::string&)> on_lost;
 
-    // Follow the frames of the next station; `mobility` has its position.
-    void Add(Ptr<WifiNetDevice> device, Ptr<MobilityModel> mobility)
+    // Add the next station, whose frames are not those of Wi-Fi.
+    size_t AddStation(Ptr<MobilityModel> mobility)
     {
-        size_t station = m_mobilities.size();
         m_mobilities.push_back(mobility);
         m_last.emplace_back();
         m_busy.emplace_back();
+        return m_mobilities.size() - 1;
+    }
+
+    // Follow the frames of Wi-Fi of the next station; `mobility` has its position.
+    void Add(Ptr<WifiNetDevice> device, Ptr<MobilityModel> mobility)
+    {
+        size_t station = AddStation(mobility);
         m_stations[Mac48Address::ConvertFrom(device->GetAddress())] = station;
         using OnMpdu = Callback<void, Ptr<const WifiMpdu>>;
         auto mac = device->GetMac();
@@ -180,8 +186,14 @@ class FrameTracker
         return at_ns == NowNs() ? parts : DelayParts();
     }
 
+    // Set the parts of the delay of the frame that a station receives now.
+    void SetParts(size_t station, const DelayParts& parts)
+    {
+        m_last[station] = {NowNs(), parts};
+    }
+
     // Counters of the frames between two stations.
-    const LinkCounters& Counters(size_t from, size_t to)
+    LinkCounters& Counters(size_t from, size_t to)
     {
         return m_links[{from, to}];
     }
@@ -322,7 +334,7 @@ class FrameTracker
         {
             m_links[{frame.from, frame.to}].delivered++;
             frame.is_received = true;
-            frame.parts.queueing_ns += frame.first_ns - frame.enqueued_ns;
+            frame.parts.queuing_ns += frame.first_ns - frame.enqueued_ns;
             frame.parts.propagation_ns += frame.propagation_ns;
             frame.parts.transmission_ns += NowNs() - frame.first_ns - frame.propagation_ns;
         }

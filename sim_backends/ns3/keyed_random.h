@@ -113,45 +113,73 @@ class Blake2b
     std::array<uint64_t, 8> m_state;
 };
 
-// The draws for the numbers 0 to `count` - 1 of `RandomStream(seed, *name)`.
-inline std::vector<double>
-FirstDraws(uint64_t seed, const std::vector<std::string>& name, size_t count)
+// `RandomStream(seed, *name)`: uniform draws on [0, 1) by number.
+class RandomStream
 {
-    // The text is that of Python's json.dumps.
-    std::string text = "[" + std::to_string(seed);
-    for (const auto& word : name)
+  public:
+    RandomStream(uint64_t seed, const std::vector<std::string>& name)
     {
-        text += ", " + nlohmann::json(word).dump(-1, ' ', true);
+        // The text is that of Python's json.dumps.
+        std::string text = "[" + std::to_string(seed);
+        for (const auto& word : name)
+        {
+            text += ", " + nlohmann::json(word).dump(-1, ' ', true);
+        }
+        m_key = Blake2b::Digest128(text + "]");
     }
-    auto key = Blake2b::Digest128(text + "]");
-    std::vector<double> draws;
-    for (uint64_t step = 1; draws.size() < count; step++) // numpy increments the counter before it generates
+
+    double Draw(uint64_t number) const
     {
-        uint64_t counter[4] = {step, 0, 0, 0};
-        uint64_t k0 = key[0];
-        uint64_t k1 = key[1];
+        return Uniform(Block(number / kBlockWords)[number % kBlockWords]);
+    }
+
+    // The draws for the numbers 0 to `count` - 1.
+    std::vector<double> First(size_t count) const
+    {
+        std::vector<double> draws;
+        for (uint64_t block = 0; draws.size() < count; block++)
+        {
+            for (uint64_t word : Block(block))
+            {
+                draws.push_back(Uniform(word));
+            }
+        }
+        draws.resize(count);
+        return draws;
+    }
+
+  private:
+    static constexpr size_t kBlockWords = 4;
+
+    static double Uniform(uint64_t word)
+    {
+        return static_cast<double>(word >> 11) * 0x1p-53;
+    }
+
+    // A step of Philox-4x64.
+    std::array<uint64_t, kBlockWords> Block(uint64_t number) const
+    {
+        std::array<uint64_t, kBlockWords> counter = {number + 1, 0, 0, 0}; // numpy increments it before it generates
+        uint64_t k0 = m_key[0];
+        uint64_t k1 = m_key[1];
         for (int round = 0; round < 10; round++)
         {
             auto first = static_cast<unsigned __int128>(0xD2E7470EE14C6C93) * counter[0];
             auto second = static_cast<unsigned __int128>(0xCA5A826395121157) * counter[2];
-            uint64_t next[4] = {
+            counter = {
                 static_cast<uint64_t>(second >> 64) ^ counter[1] ^ k0,
                 static_cast<uint64_t>(second),
                 static_cast<uint64_t>(first >> 64) ^ counter[3] ^ k1,
                 static_cast<uint64_t>(first),
             };
-            std::memcpy(counter, next, sizeof counter);
             k0 += 0x9E3779B97F4A7C15;
             k1 += 0xBB67AE8584CAA73B;
         }
-        for (uint64_t word : counter)
-        {
-            draws.push_back(static_cast<double>(word >> 11) * 0x1p-53);
-        }
+        return counter;
     }
-    draws.resize(count);
-    return draws;
-}
+
+    std::array<uint64_t, 2> m_key;
+};
 
 } // namespace fieldkit
 

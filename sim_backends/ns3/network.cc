@@ -8,12 +8,15 @@
 #include "fieldkit/links.h"
 #include "fieldkit/packets.h"
 #include "captures.h"
+#include "fixed_links.h"
+#include "jammers.h"
 #include "transports.h"
 
 #include "ns3/rng-seed-manager.h"
 
 #include <fstream>
 #include <iostream>
+#include <set>
 
 namespace fieldkit
 {
@@ -38,11 +41,15 @@ class Network
 
     bool IsReady() const
     {
-        return m_channel != nullptr;
+        return m_udp != nullptr;
     }
 
     std::string Hello(const std::string& body)
     {
+        if (IsReady())
+        {
+            throw Refusal("hello was sent twice");
+        }
         protocol::Hello hello = protocol::ReadHello(body, protocol::kNetwork);
         g_heartbeat.SetInterval(hello.heartbeat_ms);
         try
@@ -68,10 +75,8 @@ class Network
         {
             welcome.transports.push_back("topic");
         }
-        if (m_setup.relay >= 0)
-        {
-            welcome.transmitters = {m_stations[m_setup.relay].agent};
-        }
+        welcome.transmitters.assign(m_transmitters.begin(), m_transmitters.end());
+        welcome.emitters_m = m_emitters_m;
         return protocol::WelcomeBody(welcome);
     }
 
@@ -107,20 +112,16 @@ class Network
         int64_t since_ns = request.since_ns;
         int64_t reckoning_ns = request.reckoning_ns;
         m_toNs = request.to_ns;
-        std::vector<bool> present(m_stations.size());
+        std::vector<bool> present(m_agents.size());
         for (const protocol::State& state : request.states)
         {
             uint32_t agent = state.agent;
-            if (agent >= m_stationOf.size())
+            if (agent >= m_agents.size())
             {
                 throw Refusal("agent " + std::to_string(agent) + " was not announced");
             }
-            if (m_stationOf[agent] < 0)
-            {
-                continue; // it has no radio
-            }
-            present[m_stationOf[agent]] = true;
-            auto mobility = m_stations[m_stationOf[agent]].mobility;
+            present[agent] = true;
+            auto mobility = m_agents[agent].mobility;
             Vector position = VectorOf(state.position_m);
             Vector velocity = VectorOf(state.velocity_m_s);
             if (is_ahead && from_ns > NowNs())
@@ -134,21 +135,26 @@ class Network
                 mobility->Move(position, velocity, since_ns, reckoning_ns);
             }
         }
-        for (size_t number = 0; number < m_stations.size(); number++)
+        for (uint32_t agent = 0; agent < m_agents.size(); agent++)
         {
-            if (present[number] == m_stations[number].is_present)
+            if (present[agent] == m_agents[agent].is_present)
             {
                 continue;
             }
-            m_stations[number].is_present = present[number];
-            int by = present[number] ? -1 : 1;
+            m_agents[agent].is_present = present[agent];
+            int station = m_agents[agent].station;
+            int by = present[agent] ? -1 : 1;
+            if (station < 0)
+            {
+                continue; // it has no radio
+            }
             if (is_ahead && from_ns > NowNs())
             {
-                Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [this, number, by] { SwitchOff(number, by); });
+                Simulator::Schedule(NanoSeconds(from_ns - NowNs()), [this, station, by] { SwitchOff(station, by); });
             }
             else
             {
-                SwitchOff(number, by);
+                SwitchOff(station, by);
             }
         }
         for (const protocol::Packet& packet : request.packets)
@@ -165,8 +171,15 @@ class Network
         std::vector<protocol::LinkSample> links;
         for (size_t number = 0; number < m_stations.size(); number++)
         {
-            radios.push_back({m_stations[number].agent, m_setup.noise_dbm, NowNs(), m_tracker.BusyNs(number)});
-            bool is_client = m_setup.relay >= 0 && static_cast<size_t>(m_setup.relay) != number;
+            if (m_links != nullptr)
+            {
+                radios.push_back({m_stations[number].agent});
+            }
+            else
+            {
+                radios.push_back({m_stations[number].agent, m_setup.noise_dbm, NowNs(), m_tracker.BusyNs(number)});
+            }
+            bool is_client = m_links == nullptr && m_setup.relay >= 0 && static_cast<size_t>(m_setup.relay) != number;
             for (size_t peer = 0; peer < m_stations.size(); peer++)
             {
                 if (peer != number && (!is_client || static_cast<size_t>(m_setup.relay) == peer))
@@ -195,52 +208,39 @@ class Network
     }
 
   private:
+    struct AgentEntry
+    {
+        std::string name;
+        int station = -1; // -1 if it has no radio
+        Ptr<AgentMobility> mobility;
+        bool is_present = true; // in the last states
+    };
+
     void Configure(uint64_t seed, const std::vector<protocol::Agent>& agents, const Json& configuration)
     {
         const Json& scenario = configuration.at("scenario");
         const Json& radio = scenario.at("radio");
         ReadOptions(seed, configuration.at("options"), scenario);
-        for (const char* key : {"loss", "delay", "rate", "jitter"})
-        {
-            if (radio.contains(key))
-            {
-                throw Refusal(std::string("fixed links are not Wi-Fi: remove ") + key + " of the radio");
-            }
-        }
         RngSeedManager::SetSeed(1);
         RngSeedManager::SetRun(seed);
         AddStations(agents, configuration.at("robots"));
-        if (!m_setup.pcap.empty() && !m_stations.empty())
-        {
-            std::ofstream first; // ns-3 aborts if it cannot open a file
-            OpenNew(first, m_setup.pcap + m_stations[0].name + ".pcap", "pcap");
-        }
-        m_setup.mode = radio.value("mode", "");
-        if (m_setup.mode.substr(0, 1) == "n" && m_setup.standard != "802.11n")
-        {
-            throw Refusal("the mode " + m_setup.mode + " needs the standard 802.11n in all radios");
-        }
-        m_setup.noise_dbm = Number(radio.at("noise_floor_dbm"));
+        PeekScheduler::Use();
+        TcpTransport::SetDefaults(scenario.at("tcp").at("congestion"));
+        m_tracker.on_lost = [this](uint64_t id, const std::string& reason) { Drop(id, reason); };
         m_setup.queue_packets = radio.at("queue_packets");
         if (scenario.at("topology") == "master")
         {
             m_setup.relay = static_cast<int>(StationNamed(scenario.at("relay")));
-            g_start_ns = kAssociationNs;
-            if (m_setup.ampdu_bytes == 0)
-            {
-                m_tracker.relay = m_setup.relay;
-            }
+            m_transmitters.insert(m_stations[m_setup.relay].agent);
         }
-        std::vector<std::string> names;
-        for (const Station& station : m_stations)
+        if (configuration.contains("link"))
         {
-            names.push_back(station.name);
+            AddFixedLinks(seed, configuration["link"]);
         }
-        m_channel = std::make_unique<Channel>(seed, radio, configuration.at("world"), names);
-        PeekScheduler::Use();
-        TcpTransport::SetDefaults(scenario.at("tcp").at("congestion"));
-        m_tracker.on_lost = [this](uint64_t id, const std::string& reason) { Drop(id, reason); };
-        Install(m_stations, m_setup, *m_channel, m_tracker);
+        else
+        {
+            AddWifi(seed, radio, configuration.at("world"));
+        }
         Fates fates{[this](uint64_t id) { Arrive(id); },
                     [this](uint64_t id, const std::string& reason) { Drop(id, reason); }};
         m_udp = std::make_unique<UdpTransport>(m_stations, fates);
@@ -252,9 +252,18 @@ class Network
                 m_captures->Connect(source, port, flow);
             };
         }
-        for (const Json& fault : scenario.at("faults"))
+        const Json& faults = scenario.at("faults");
+        for (size_t number = 0; number < faults.size(); number++)
         {
-            AddFault(fault);
+            std::string kind = faults[number].at("kind");
+            if (kind == "jammer")
+            {
+                AddJammer(faults[number], configuration.at("jammers").at(number));
+            }
+            else
+            {
+                AddFault(kind, faults[number]);
+            }
         }
         for (size_t number = 0; number < m_stations.size(); number++)
         {
@@ -263,12 +272,101 @@ class Network
         RunUntil(-1);
     }
 
+    // Links with the parameters of the configuration, which Python has computed.
+    void AddFixedLinks(uint64_t seed, const Json& link)
+    {
+        m_links = CreateObject<FixedLinks>();
+        m_links->seed = seed;
+        m_links->relay = m_setup.relay;
+        m_links->parameters.rate_bit_s = link.at("rate_bit_s").is_null() ? 0 : link["rate_bit_s"].get<int64_t>();
+        m_links->parameters.delay_ns = link.at("delay_ns");
+        m_links->parameters.jitter_ns = link.at("jitter_ns");
+        m_links->parameters.loss = link.at("loss");
+        m_links->parameters.queue_packets = m_setup.queue_packets;
+        m_links->tracker = &m_tracker;
+        m_links->identity_of = [this](uint64_t id) {
+            auto packet = m_pending.find(id);
+            return packet == m_pending.end() ? PacketIdentity("decided", id)
+                                             : PacketIdentity(packet->second.flow, packet->second.number);
+        };
+        InstallFixedLinks(m_stations, m_links, m_tracker);
+    }
+
+    void AddWifi(uint64_t seed, const Json& radio, const Json& world)
+    {
+        if (!m_setup.pcap.empty() && !m_stations.empty())
+        {
+            std::ofstream first; // ns-3 aborts if it cannot open a file
+            OpenNew(first, m_setup.pcap + m_stations[0].name + ".pcap", "pcap");
+        }
+        m_setup.mode = radio.value("mode", "");
+        if (m_setup.mode.substr(0, 1) == "n" && m_setup.standard != "802.11n")
+        {
+            throw Refusal("the mode " + m_setup.mode + " needs the standard 802.11n in all radios");
+        }
+        m_setup.noise_dbm = Number(radio.at("noise_floor_dbm"));
+        if (m_setup.relay >= 0)
+        {
+            g_start_ns = kAssociationNs;
+            if (m_setup.ampdu_bytes == 0)
+            {
+                m_tracker.relay = m_setup.relay;
+            }
+        }
+        std::vector<std::string> names;
+        for (const Station& station : m_stations)
+        {
+            names.push_back(station.name);
+        }
+        m_channel = std::make_unique<Channel>(seed, radio, world, names);
+        Install(m_stations, m_setup, *m_channel, m_tracker);
+        m_jammers = std::make_unique<Jammers>(m_stations, *m_channel, m_setup.noise_dbm);
+    }
+
+    // A jammer at a place, or carried by an agent, if there is none.
+    void AddJammer(const Json& fault, const Json& place_m)
+    {
+        std::function<bool(Point&)> place;
+        if (place_m.is_null())
+        {
+            auto carrier = AgentNamed(fault.at("agent"));
+            m_transmitters.insert(carrier);
+            place = [this, carrier](Point& at) {
+                Vector here = m_agents[carrier].mobility->GetPosition();
+                at = {here.x, here.y, here.z};
+                return m_agents[carrier].is_present;
+            };
+        }
+        else
+        {
+            Point fixed = place_m.get<Point>();
+            m_emitters_m.push_back(fixed);
+            place = [fixed](Point& at) {
+                at = fixed;
+                return true;
+            };
+        }
+        Time until = fault.contains("to") ? At(fault["to"]) : Time::Max();
+        m_jammers->Add(Number(fault.at("power_dbm")), At(fault.at("from")), until, place);
+    }
+
     protocol::LinkSample SampleLink(size_t number, size_t peer)
     {
         const Station& station = m_stations[number];
         const Station& other = m_stations[peer];
         const LinkCounters& sent = m_tracker.Counters(number, peer);
         const LinkCounters& reverse = m_tracker.Counters(peer, number);
+        protocol::LinkSample sample{station.agent, other.agent};
+        sample.tx_rate_bit_s = sent.rate_bit_s;
+        sample.rx_rate_bit_s = reverse.rate_bit_s;
+        sample.tx_packets = sent.frames;
+        sample.rx_packets = reverse.delivered;
+        sample.tx_retries = sent.retries;
+        sample.tx_failures = sent.failures;
+        if (m_channel == nullptr)
+        {
+            return sample;
+        }
         Vector here = station.mobility->GetPosition();
         Vector there = other.mobility->GetPosition();
         double loss_db =
@@ -276,28 +374,37 @@ class Network
         double mean_db = m_channel->MeanLossDb(peer, number);
         bool is_in_range = other.tx_power_dbm - mean_db >= station.sensitivity_dbm &&
                            station.tx_power_dbm - mean_db >= other.sensitivity_dbm;
-        protocol::LinkSample sample{station.agent, other.agent};
         sample.signal_dbm = is_in_range ? other.tx_power_dbm - loss_db : NAN;
-        sample.tx_rate_bit_s = sent.rate_bit_s;
-        sample.rx_rate_bit_s = reverse.rate_bit_s;
-        sample.tx_packets = sent.frames;
-        sample.rx_packets = reverse.delivered;
-        sample.tx_retries = sent.retries;
-        sample.tx_failures = sent.failures;
         return sample;
     }
 
     // Switch the radio of a station off (1), or on again (-1).
     void SwitchOff(size_t station, int by)
     {
-        for (size_t other = 0; other < m_stations.size(); other++)
+        m_stations[station].off += by;
+        if (m_links != nullptr && by > 0 && m_stations[station].off == 1)
+        {
+            m_links->SwitchOff(station);
+        }
+        for (size_t other = 0; m_channel != nullptr && other < m_stations.size(); other++)
         {
             if (other != station)
             {
                 m_channel->Cut(station, other, by);
             }
         }
-        m_stations[station].off += by;
+    }
+
+    void Cut(size_t first, size_t second, int by)
+    {
+        if (m_links != nullptr)
+        {
+            m_links->Cut(first, second, by);
+        }
+        else
+        {
+            m_channel->Cut(first, second, by);
+        }
     }
 
     static Time At(const Json& seconds)
@@ -373,18 +480,19 @@ class Network
         for (const protocol::Agent& agent : agents)
         {
             const Json radio = robots.at(agent.name).at("radio");
-            m_stationOf.push_back(radio.is_null() ? -1 : static_cast<int>(m_stations.size()));
+            auto mobility = CreateObject<AgentMobility>();
+            mobility->SetPosition(VectorOf(agent.start.position_m));
+            m_agents.push_back({agent.name, radio.is_null() ? -1 : static_cast<int>(m_stations.size()), mobility});
             if (radio.is_null())
             {
                 continue;
             }
             Station station;
             station.name = agent.name;
-            station.agent = static_cast<uint32_t>(m_stationOf.size() - 1);
+            station.agent = static_cast<uint32_t>(m_agents.size() - 1);
             station.tx_power_dbm = Number(radio.at("tx_power_dbm"));
             station.sensitivity_dbm = Number(radio.at("sensitivity_dbm"));
-            station.mobility = CreateObject<AgentMobility>();
-            station.mobility->SetPosition(VectorOf(agent.start.position_m));
+            station.mobility = mobility;
             m_stations.push_back(station);
             is_ht = is_ht && radio.at("standard") == "802.11n";
         }
@@ -406,18 +514,25 @@ class Network
         throw Refusal("there is no station " + name);
     }
 
-    void AddFault(const Json& fault)
+    uint32_t AgentNamed(const std::string& name) const
     {
-        std::string kind = fault.at("kind");
-        if (kind == "jammer")
+        for (uint32_t agent = 0; agent < m_agents.size(); agent++)
         {
-            throw Refusal("ns-3 has no jammers: remove the fault");
+            if (m_agents[agent].name == name)
+            {
+                return agent;
+            }
         }
+        throw Refusal("there is no agent " + name);
+    }
+
+    void AddFault(const std::string& kind, const Json& fault)
+    {
         std::function<void(int)> change;
         if (kind == "link-cut")
         {
             size_t first = StationNamed(fault.at("between")[0]), second = StationNamed(fault.at("between")[1]);
-            change = [this, first, second](int by) { m_channel->Cut(first, second, by); };
+            change = [this, first, second](int by) { Cut(first, second, by); };
         }
         else if (kind == "node-loss")
         {
@@ -464,11 +579,11 @@ class Network
 
     size_t StationOf(uint32_t agent) const
     {
-        if (agent >= m_stationOf.size() || m_stationOf[agent] < 0)
+        if (agent >= m_agents.size() || m_agents[agent].station < 0)
         {
             throw Refusal("agent " + std::to_string(agent) + " has no radio");
         }
-        return m_stationOf[agent];
+        return m_agents[agent].station;
     }
 
     void Enter(const CoordinatorPacket& packet)
@@ -535,20 +650,20 @@ class Network
     {
         parts.propagation_ns = std::min(parts.propagation_ns, delay_ns);
         parts.transmission_ns = std::min(parts.transmission_ns, delay_ns - parts.propagation_ns);
-        parts.queueing_ns = std::min(parts.queueing_ns, delay_ns - parts.propagation_ns - parts.transmission_ns);
+        parts.queuing_ns = std::min(parts.queuing_ns, delay_ns - parts.propagation_ns - parts.transmission_ns);
         return parts;
     }
 
     void WriteParts(const CoordinatorPacket& packet, int64_t delay_ns, const DelayParts& parts)
     {
-        int64_t processing_ns = delay_ns - parts.propagation_ns - parts.transmission_ns - parts.queueing_ns;
+        int64_t processing_ns = delay_ns - parts.propagation_ns - parts.transmission_ns - parts.queuing_ns;
         std::string flow = packet.flow;
         for (size_t place = 0; (place = flow.find('"', place)) != std::string::npos; place += 2)
         {
             flow.insert(place, 1, '"');
         }
         m_parts << '"' << flow << "\"," << packet.number << ',' << delay_ns << ',' << processing_ns << ','
-                << parts.queueing_ns << ',' << parts.transmission_ns << ',' << parts.propagation_ns << '\n';
+                << parts.queuing_ns << ',' << parts.transmission_ns << ',' << parts.propagation_ns << '\n';
     }
 
     void Drop(uint64_t id, const std::string& reason)
@@ -576,8 +691,12 @@ class Network
     bool m_carriesTopics = false;
     std::ofstream m_parts;
     std::vector<Station> m_stations;
-    std::vector<int> m_stationOf; // by agent; -1 if it has no radio
-    std::unique_ptr<Channel> m_channel;
+    std::vector<AgentEntry> m_agents;
+    std::set<uint32_t> m_transmitters; // agents that forward or interfere
+    std::vector<Point> m_emitters_m;   // of jammers that no agent carries
+    std::unique_ptr<Channel> m_channel; // null with fixed links
+    std::unique_ptr<Jammers> m_jammers; // as the channel
+    Ptr<FixedLinks> m_links;            // null with Wi-Fi
     FrameTracker m_tracker;
     std::unique_ptr<UdpTransport> m_udp;
     std::unique_ptr<TcpTransport> m_tcp;
@@ -643,7 +762,8 @@ RunAlone(Network& network, const char* path)
     return stream == nullptr;
 }
 
-// Print the loss in dB of each link of a JSON text: seed, radio, world, names, and rows of time, two indices and positions.
+// Print losses in dB for a JSON text with seed, radio, world and names: of each row of `links`, which has a time, two
+// indices and positions, and then of each row of `places`, which has two positions.
 int
 PrintLosses()
 {
@@ -653,6 +773,10 @@ PrintLosses()
     for (const Json& row : request.at("links"))
     {
         losses_db.push_back(channel.LossDb(row[0], row[1], row[2], row[3], row[4]));
+    }
+    for (const Json& row : request.at("places"))
+    {
+        losses_db.push_back(channel.MeanLossDb(row[0].get<Point>(), row[1].get<Point>()));
     }
     std::cout << losses_db << "\n";
     return 0;

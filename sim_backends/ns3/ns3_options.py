@@ -1,12 +1,17 @@
 """Options of ns-3: `network.options` of a scenario. `network.cc` reads them."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Literal
 
 from typing_extensions import override
 
 from fieldkit.config.schema import Field, Int, Location
+from fieldkit.core.model import Vector
+from fieldkit.core.units import parse_offset_m
 from sim_backends.federates.simulator_options import SimulatorOptions
+from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.world import World
 
 
 class Ns3Options(SimulatorOptions):
@@ -16,7 +21,7 @@ class Ns3Options(SimulatorOptions):
         standard: Standard of all radios; if omitted, 802.11n if all radios have it, otherwise 802.11g.
         ampdu_bytes: Largest aggregate of frames in 802.11n; 0 sends frames singly, as the built-in network does.
         topics: With `udp`, topics with `reliability: best_effort` are sent as UDP datagrams with the headers of RTPS,
-            without discovery; if omitted, a scenario with topics is refused.
+            without discovery.
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
         pcap: Beginning of the names of captures of 802.11 frames with radiotap, one per radio, for example
@@ -31,25 +36,46 @@ class Ns3Options(SimulatorOptions):
 
     @override
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        for key in ("loss", "delay", "rate", "jitter"):
-            if key in scenario["radio"]:
-                yield f"ns-3 simulates Wi-Fi, not fixed links; remove {key}", ("radio", key)
-        for number, fault in enumerate(scenario["faults"]):
-            if fault["kind"] == "jammer":
-                yield "ns-3 has no jammers; remove the fault", ("faults", number, "kind")
+        if RadioOptions.model_validate(scenario["radio"]).fixed:
+            for key in ("standard", "ampdu_bytes", "pcap"):
+                if getattr(self, key):
+                    yield f"fixed links have no Wi-Fi; remove {key}", ("network", "options", key)
+        if scenario["network"]["transports"] == "builtin":
+            if self.topics is not None:
+                yield "transports: builtin carries all topics; remove topics", ("network", "options", "topics")
+            return
         for number, traffic in enumerate(scenario["traffic"]):
             yield from ((text, ("traffic", number, key)) for text, key in self._unsupported_traffic(traffic))
 
     def _unsupported_traffic(self, traffic: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Yield why traffic is not supported, with its key."""
-        if traffic["protocol"] == "ros1":
-            yield "ns-3 does not carry topics of ROS 1; use udp or tcp", "protocol"
+        """Yield why traffic is not supported by ns-3's transports, with its key."""
+        if traffic["protocol"] in {"ros1", "ros1-udp"}:
+            yield "ns-3 has no ROS 1; set network.transports: builtin", "protocol"
         elif traffic["protocol"] == "topic":
             if self.topics is None:
                 yield (
-                    "ns-3 carries topics only with network.options.topics: udp; set it, or use udp or tcp",
+                    "ns-3 has no topics; set network.transports: builtin, or network.options.topics: udp",
                     "protocol",
                 )
             elif traffic.get("qos", {}).get("reliability", "reliable") == "reliable":
                 key = "qos" if "qos" in traffic else "protocol"
-                yield "with topics: udp, ns-3 carries no reliable topics; set reliability: best_effort", key
+                remedy = "set reliability: best_effort, or network.transports: builtin instead of topics"
+                yield f"topics: udp carries no reliable topics; {remedy}", key
+
+    @override
+    def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `link`, the parameters of fixed links; or `jammers`, the position of each that no agent carries."""
+        scenario = configuration["scenario"]
+        radio = RadioOptions.model_validate(scenario["radio"])
+        if radio.fixed:
+            return {"link": dataclasses.asdict(radio.link())}
+        world = World.model_validate(configuration["world"])
+        return {"jammers": [_jammer_m(fault, world) for fault in scenario["faults"]]}
+
+
+def _jammer_m(fault: Mapping[str, Any], world: World) -> Vector | None:
+    """Return the position of a jammer; None if an agent carries it, and for other faults."""
+    if fault["kind"] != "jammer" or "at_m" not in fault:
+        return None
+    east_m, north_m = fault["at_m"]
+    return east_m, north_m, world.ground_m((east_m, north_m)) + parse_offset_m(fault["height"])

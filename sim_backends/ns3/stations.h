@@ -14,6 +14,7 @@
 #include "ns3/ipv4-address-helper.h"
 #include "ns3/ipv4-interface.h"
 #include "ns3/ipv4-l3-protocol.h"
+#include "ns3/net-device-queue-interface.h"
 #include "ns3/propagation-loss-model.h"
 #include "ns3/queue-size.h"
 #include "ns3/ssid.h"
@@ -120,10 +121,9 @@ struct Station
     double tx_power_dbm = 0;
     double sensitivity_dbm = 0;
     int off = 0; // number of faults and absences that have switched it off
-    bool is_present = true; // in the last states
     Ptr<Node> node;
     Ptr<AgentMobility> mobility;
-    Ptr<WifiNetDevice> device;
+    Ptr<NetDevice> device;
     Ipv4Address address;
 };
 
@@ -163,6 +163,46 @@ FillArpCache(const Station& station, const std::vector<Station>& stations)
     }
 }
 
+// Give the stations, which have devices, IP addresses; callbacks of ns-3 keep references to `stations`.
+inline void
+InstallIp(std::vector<Station>& stations, FrameTracker& tracker)
+{
+    InternetStackHelper internet;
+    internet.SetIpv6StackInstall(false);
+    Ipv4AddressHelper addresses("10.0.0.0", "255.255.0.0");
+    for (Station& station : stations)
+    {
+        NetDeviceContainer devices(station.device);
+        station.device->SetMtu(1500);
+        internet.Install(station.node);
+        station.address = addresses.Assign(devices).GetAddress(0);
+        if (station.device->GetObject<NetDeviceQueueInterface>() != nullptr)
+        {
+            TrafficControlHelper::Default().Uninstall(devices);
+        }
+    }
+    for (Station& station : stations)
+    {
+        auto ipv4 = station.node->GetObject<Ipv4L3Protocol>();
+        ipv4->TraceConnectWithoutContext(
+            "Drop", Callback<void, const Ipv4Header&, Ptr<const Packet>, Ipv4L3Protocol::DropReason, Ptr<Ipv4>, uint32_t>(
+                        [&tracker](const Ipv4Header&, Ptr<const Packet> packet, Ipv4L3Protocol::DropReason reason,
+                                   Ptr<Ipv4>, uint32_t) {
+                            tracker.Lost(packet, reason == Ipv4L3Protocol::DROP_FRAGMENT_TIMEOUT
+                                                     ? "reassembly timed out"
+                                                     : "no route");
+                        }));
+        // A full queue of the MAC stops the device.
+        station.node->GetObject<TrafficControlLayer>()->TraceConnectWithoutContext(
+            "TcDrop",
+            Callback<void, Ptr<const Packet>>([&tracker](Ptr<const Packet> packet) { tracker.Lost(packet, "queue full"); }));
+        FillArpCache(station, stations);
+        // A change of the link, for example an association, empties the cache.
+        station.device->AddLinkChangeCallback(
+            Callback<void>([&station, &stations] { FillArpCache(station, stations); }));
+    }
+}
+
 // Give the stations Wi-Fi, IP addresses and positions; callbacks of ns-3 keep references to `stations`.
 inline void
 Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel, FrameTracker& tracker)
@@ -196,9 +236,6 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
     {
         wifi.SetRemoteStationManager(is_ht ? "ns3::MinstrelHtWifiManager" : "ns3::MinstrelWifiManager");
     }
-    InternetStackHelper internet;
-    internet.SetIpv6StackInstall(false);
-    Ipv4AddressHelper addresses("10.0.0.0", "255.255.0.0");
     auto ssid = SsidValue(Ssid("fieldkit"));
     for (size_t number = 0; number < stations.size(); number++)
     {
@@ -231,36 +268,14 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
             phy.EnablePcap(setup.pcap + station.name + ".pcap", devices.Get(0), true, true);
         }
         wifi.AssignStreams(devices, 1000 * static_cast<int64_t>(number));
-        station.device = DynamicCast<WifiNetDevice>(devices.Get(0));
-        station.device->SetMtu(1500);
+        station.device = devices.Get(0);
+        auto device = DynamicCast<WifiNetDevice>(station.device);
         // There are no stations of 802.11b, for which ns-3 uses a long slot.
-        station.device->GetPhy()->SetAttribute("Slot", TimeValue(MicroSeconds(9)));
-        internet.Install(station.node);
-        station.address = addresses.Assign(devices).GetAddress(0);
-        TrafficControlHelper::Default().Uninstall(devices);
-        tracker.Add(station.device, station.mobility);
+        device->GetPhy()->SetAttribute("Slot", TimeValue(MicroSeconds(9)));
+        tracker.Add(device, station.mobility);
         g_heartbeat.Check(NowNs());
     }
-    for (Station& station : stations)
-    {
-        auto ipv4 = station.node->GetObject<Ipv4L3Protocol>();
-        ipv4->TraceConnectWithoutContext(
-            "Drop", Callback<void, const Ipv4Header&, Ptr<const Packet>, Ipv4L3Protocol::DropReason, Ptr<Ipv4>, uint32_t>(
-                        [&tracker](const Ipv4Header&, Ptr<const Packet> packet, Ipv4L3Protocol::DropReason reason,
-                                   Ptr<Ipv4>, uint32_t) {
-                            tracker.Lost(packet, reason == Ipv4L3Protocol::DROP_FRAGMENT_TIMEOUT
-                                                     ? "reassembly timed out"
-                                                     : "no route");
-                        }));
-        // A full queue of the MAC stops the device.
-        station.node->GetObject<TrafficControlLayer>()->TraceConnectWithoutContext(
-            "TcDrop",
-            Callback<void, Ptr<const Packet>>([&tracker](Ptr<const Packet> packet) { tracker.Lost(packet, "queue full"); }));
-        FillArpCache(station, stations);
-        // A change of the link, for example an association, empties the cache.
-        station.device->AddLinkChangeCallback(
-            Callback<void>([&station, &stations] { FillArpCache(station, stations); }));
-    }
+    InstallIp(stations, tracker);
 }
 
 } // namespace fieldkit

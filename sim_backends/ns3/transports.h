@@ -63,7 +63,7 @@ class UdpTransport
         }
     }
 
-    // Send a packet as a datagram, which has `more_bytes` in addition, or less if they are negative.
+    // Send a packet as a datagram of its size plus `more_bytes`, which may be negative.
     void Send(const CoordinatorPacket& packet, int64_t more_bytes)
     {
         auto datagram = Datagram(packet, more_bytes);
@@ -77,8 +77,8 @@ class UdpTransport
         }
     }
 
-    // Send a broadcast, of which the coordinator has a packet per receiver, all of one source and number. The first one
-    // sends the frame.
+    // Send a broadcast. The coordinator has one packet per receiver, all with the same source and number. The first
+    // of them sends the frame.
     void SendToAll(const CoordinatorPacket& packet)
     {
         auto key = std::make_pair(packet.source, packet.number);

@@ -20,9 +20,12 @@ from sim_backends.physics.collisions import Footprint, cylinder_footprint, move,
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import HORIZON_S, CellGrid, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
+from sim_backends.physics.quadrotor import FlightPose, FlightStatus
 from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
 
+_SUPPORT_M: Final = 1e-3
+"""Distance to the ground or an obstacle below which it carries a quadrotor."""
 _ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 
 
@@ -152,6 +155,32 @@ class Bodies:
         self._neighbours = Neighbours(self._bodies, self._poses(), self._grounds, self._horizon * self._step_s)
         self._list_step = self._step
         self._states = Snapshot(self._tracks, self._step)
+
+    def flight_status(self, name: str) -> FlightStatus:
+        """Return attitude and support of a quadrotor.
+
+        Raises:
+            ConfigurationError: It is not a quadrotor.
+        """
+        body, pose = self._bodies[name], self._tracks[name].pose(self._step)
+        if not isinstance(pose, FlightPose):
+            raise ConfigurationError(f"{name} is not a quadrotor", remedy="use the name of a body that flies")
+        return FlightStatus(pose.place_m, pose.roll_rad, pose.pitch_rad, self._is_supported(name, body, pose.place_m))
+
+    def _is_supported(self, name: str, body: Body[Any], place_m: Vector) -> bool:
+        candidates = self._current_neighbours().candidates.get(name)
+        if candidates is None:
+            return False
+        footprints = [
+            *candidates.footprints,
+            *(
+                cylinder_footprint(other, self._tracks[other].pose(self._step).place_m, self._bodies[other])
+                for other in candidates.bodies
+            ),
+        ]
+        east, north, up = place_m
+        stop = move(body, place_m, (east, north, up - _SUPPORT_M), footprints)
+        return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
 
     def overlap(self, name: str) -> str:
         """Return the name of an obstacle or body that a body overlaps now; empty if there is none."""
@@ -327,7 +356,7 @@ class Bodies:
         grid = CellGrid(2 * max((body.radius_m for body in self._present.values()), default=0.0))
         for number, name in enumerate(names):
             place_m = places_m[name]
-            others = [names[other] for other in grid.near(place_m)] if name in new else []
+            others = [names[other] for other in grid.nearby_indices(place_m)] if name in new else []
             footprints = [cylinder_footprint(other, places_m[other], self._bodies[other]) for other in others]
             self._check_free(name, place_m, footprints)
             grid.add(number, place_m)

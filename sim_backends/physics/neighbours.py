@@ -33,7 +33,7 @@ class CellGrid:
         """Add a number at a position, in finite metres."""
         self._cells[self._cell(place_m)].append(number)
 
-    def near(self, place_m: Vector) -> list[int]:
+    def nearby_indices(self, place_m: Vector) -> list[int]:
         """Return, in order, all numbers within the distance of a position, and some that are farther away."""
         east, north = self._cell(place_m)
         cells = [(east + e, north + n) for e in (-1, 0, 1) for n in (-1, 0, 1)]
@@ -103,7 +103,7 @@ class Neighbours:
         grid = CellGrid(2 * reach_m)
         for number, mover in enumerate(bodies_now):
             self._add_ground_candidates(mover, grounds[mover.name])
-            for other in grid.near(mover.place_m):
+            for other in grid.nearby_indices(mover.place_m):
                 self._add_pair_candidates(mover, bodies_now[other])
             grid.add(number, mover.place_m)
 

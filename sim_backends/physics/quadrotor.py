@@ -11,7 +11,7 @@ axes of its yaw (forward, left, up),
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
@@ -130,6 +130,52 @@ DUCKIEDRONE: Final = QuadrotorLimits(
 estimates, from the mass of its parts and twice its weight in thrust, with low speeds, as it is flown indoors by a
 camera.
 """
+
+
+@dataclass(frozen=True, slots=True)
+class FlightTarget:
+    """Command of an autopilot that limits velocity and acceleration itself, and switches the rotors.
+
+    Attributes:
+        velocity: Its target.
+        acceleration_m_s2: Maximum commanded horizontal acceleration.
+        climb_m_s2: Maximum commanded accelerations downwards and upwards.
+        powered: False if the rotors are off; then the quadrotor falls.
+    """
+
+    velocity: Velocity
+    acceleration_m_s2: float
+    climb_m_s2: tuple[float, float]
+    powered: bool = True
+
+    def limits_within(self, limits: QuadrotorLimits) -> QuadrotorLimits:
+        """Return the limits of a quadrotor with the accelerations of this command; without power it has no thrust."""
+        return replace(
+            limits,
+            acceleration_m_s2=self.acceleration_m_s2,
+            climb_m_s2=self.climb_m_s2,
+            thrust_n=limits.thrust_n if self.powered else (0.0, 0.0),
+        )
+
+
+ROTORS_OFF: Final = FlightTarget(Velocity(), 0.0, (0.0, 0.0), powered=False)
+"""Command that switches the rotors off."""
+
+
+class FlightStatus(NamedTuple):
+    """State of a quadrotor beyond `State`, as its sensors measure it.
+
+    Attributes:
+        place_m: Position of its lowest point, metres east, north, up.
+        roll_rad: See `FlightPose`.
+        pitch_rad: See `FlightPose`.
+        is_supported: True if something below it carries it.
+    """
+
+    place_m: Vector
+    roll_rad: float
+    pitch_rad: float
+    is_supported: bool
 
 
 class FlightPose(NamedTuple):
@@ -283,7 +329,7 @@ def _limited(first: float, second: float, limit: float) -> tuple[float, float]:
 
 
 class Quadrotor:
-    """A quadrotor that follows `Velocity` commands; without a command it hovers.
+    """A quadrotor that follows `Velocity` and `FlightTarget` commands; without a command it hovers.
 
     Args:
         limits: Its limits and size.
@@ -320,13 +366,22 @@ class Quadrotor:
 
     def course(self, pose: FlightPose, command: object, step_s: float) -> Glide | Flight:
         """Implement `Body.course`."""
-        target = self.target(command)
-        if self._is_steady(pose, target):
+        if isinstance(command, FlightTarget):
+            autopilot, target = VelocityController(command.limits_within(self._limits)), command.velocity
+        else:
+            autopilot, target = self._autopilot, self.target(command)
+        if _is_steady(autopilot, pose, target):
             return Glide(pose, target.velocity_m_s, step_s)
-        return Flight(pose, self._autopilot, target, step_s)
+        return Flight(pose, autopilot, target, step_s)
 
-    def stopped(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:  # noqa: ARG002 (see Body)
-        """Implement `Body.stopped`: it keeps the component of its velocity along the obstacle."""
+    def stopped(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:
+        """Implement `Body.stopped`: it keeps the component of its velocity along the obstacle.
+
+        Without power it comes to rest, level, on what carries it.
+        """
+        is_off = isinstance(command, FlightTarget) and not command.powered
+        if is_off and any(contact.normal[2] > 0 for contact in stop.contacts):
+            return FlightPose(stop.place_m, heading_rad=pose.heading_rad)
         return pose._replace(place_m=stop.place_m, velocity_m_s=stop.sliding_velocity(pose.velocity_m_s))
 
     def limit_m_s2(self, pose: FlightPose) -> float:
@@ -357,10 +412,11 @@ class Quadrotor:
             (*_limited(east, north, limits.speed_m_s), _clip_range(up, limits.climb_m_s)), command.yaw_rad
         )
 
-    def _is_steady(self, pose: FlightPose, target: Velocity) -> bool:
-        """Return True if it will keep the target velocity permanently, except for rounding."""
-        if math.dist(pose.velocity_m_s, target.velocity_m_s) > _REACHED:
-            return False
-        later = self._autopilot.fly(pose, target, 1.0)
-        changes = (abs(first - second) for first, second in zip(later[2:], pose[2:], strict=True))
-        return max(changes) <= _REACHED and math.dist(later.velocity_m_s, pose.velocity_m_s) <= _REACHED
+
+def _is_steady(autopilot: VelocityController, pose: FlightPose, target: Velocity) -> bool:
+    """Return True if a quadrotor will keep the target velocity permanently, except for rounding."""
+    if math.dist(pose.velocity_m_s, target.velocity_m_s) > _REACHED:
+        return False
+    later = autopilot.fly(pose, target, 1.0)
+    changes = (abs(first - second) for first, second in zip(later[2:], pose[2:], strict=True))
+    return max(changes) <= _REACHED and math.dist(later.velocity_m_s, pose.velocity_m_s) <= _REACHED

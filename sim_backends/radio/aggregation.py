@@ -82,11 +82,16 @@ class BlockAckSession(Generic[Payload]):
         self._next_sequence = 0
         # The recipient's next sequence number to pass up; frames after it; numbers that were given up.
         self._expected = 0
-        self._held: dict[int, Frame[Payload]] = {}
+        self._frames_waiting: dict[int, Frame[Payload]] = {}
         self._skipped: set[int] = set()
 
-    def build_aggregate(self, queue: deque[Frame[Payload]], mode: WifiMode) -> Aggregate[Payload]:
-        """Return the aggregate of the first frame of a queue and of later ones to its receiver, as many as fit."""
+    def build_aggregate(
+        self, queue: deque[Frame[Payload]], mode: WifiMode, *, is_single: bool = False
+    ) -> Aggregate[Payload]:
+        """Return the aggregate of a queue's first frame and later frames to its receiver, up to the size limits.
+
+        With `is_single` it contains the first frame only.
+        """
         limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, _MAX_PPDU_NS))
         frames: list[Frame[Payload]] = []
         first, size_bytes, last_sequence = queue[0], 0, 0
@@ -105,6 +110,8 @@ class BlockAckSession(Generic[Payload]):
                 self._next_sequence += 1
             frames.append(frame)
             size_bytes = new_bytes
+            if is_single:
+                break
         if len(frames) > 1:
             return Aggregate(frames, size_bytes, self._limits.block_ack_bytes)
         # Frames of VHT and HE always have a delimiter: 9.7.1.
@@ -115,7 +122,7 @@ class BlockAckSession(Generic[Payload]):
         for frame in frames:
             if not frame.is_received:
                 frame.is_received = True
-                self._held[frame.sequence] = frame
+                self._frames_waiting[frame.sequence] = frame
         return self._pop_in_order()
 
     def skip(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
@@ -125,8 +132,8 @@ class BlockAckSession(Generic[Payload]):
 
     def _pop_in_order(self) -> list[Frame[Payload]]:
         frames = []
-        while self._expected in self._held or self._expected in self._skipped:
-            if (frame := self._held.pop(self._expected, None)) is not None:
+        while self._expected in self._frames_waiting or self._expected in self._skipped:
+            if (frame := self._frames_waiting.pop(self._expected, None)) is not None:
                 frames.append(frame)
             self._skipped.discard(self._expected)
             self._expected += 1
@@ -135,14 +142,14 @@ class BlockAckSession(Generic[Payload]):
 
 def remove_frames(queue: deque[Frame[Payload]], done: Set[Frame[Payload]]) -> None:
     """Remove frames from a queue that contains all of them; the order of the others does not change."""
-    kept, remaining = [], len(done)
+    kept_frames, remaining = [], len(done)
     while remaining:
         frame = queue.popleft()
         if frame in done:
             remaining -= 1
         else:
-            kept.append(frame)
-    queue.extendleft(reversed(kept))
+            kept_frames.append(frame)
+    queue.extendleft(reversed(kept_frames))
 
 
 @cache

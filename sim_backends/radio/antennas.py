@@ -118,8 +118,8 @@ def fixed_mode(name: str | None, antennas: Mapping[str, Antenna]) -> WifiMode | 
     mode = mode_named(name, band)
     for station, antenna in antennas.items():
         if mode is None or not antenna.supports(mode):
-            own = MODES[antenna.standard] if antenna.phy is None else common_modes(antenna.phy, antenna.phy)
-            names = ", ".join(mode.name for mode in (*OFDM_MODES[band.name], *own))
+            antenna_modes = MODES[antenna.standard] if antenna.phy is None else common_modes(antenna.phy, antenna.phy)
+            names = ", ".join(mode.name for mode in (*OFDM_MODES[band.name], *antenna_modes))
             raise ConfigurationError(
                 f"radio.mode {name} is not a mode of the radio of {station}",
                 remedy=f"use a mode that all stations support; {station} has: {names}",

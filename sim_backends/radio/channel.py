@@ -45,6 +45,10 @@ class RadioChannel(Protocol):
         """Return the inter-frame space of a station before its backoff: DIFS, or the AIFS of a station with QoS."""
         return self.band.difs_ns
 
+    def rts_threshold_bytes(self, station: int) -> int | None:  # noqa: ARG002 (a default)
+        """Return the size of the largest frame or aggregate that a station sends without RTS; None for all."""
+        return None
+
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)
         """Return the limits of aggregates on a link; None if its frames are not aggregated."""
         return None

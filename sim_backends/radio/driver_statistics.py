@@ -66,6 +66,13 @@ class RadioMeter:
         link.retries += len(frames) - new
         link.rate_bit_s = transmission.mode.rate_bit_s
 
+    def on_failed_rts(self, transmitter: int, receiver: int, frames: Sequence[Frame[Any]]) -> None:
+        """Record an attempt that ended without CTS, for frames whose data was not sent."""
+        link = self.link(transmitter, receiver)
+        new = sum(frame.attempts == 1 for frame in frames)
+        link.frames += new
+        link.retries += len(frames) - new
+
     def on_failures(self, transmitter: int, receiver: int, packets: int) -> None:
         """Record that packets were given up."""
         self.link(transmitter, receiver).failures += packets

@@ -121,7 +121,7 @@ class FixedLink:
         self._lost += 1
 
     def _compute_size(self, size_bytes: int) -> tuple[int, Delay]:
-        """Return the transmission time in ns and the delay without queueing for a packet size; cache them."""
+        """Return the transmission time in ns and the delay without queuing for a packet size; cache them."""
         parameters = self._parameters
         transmission_ns = parameters.serialization_ns(size_bytes)
         delay_sum = PACKET + transmission_ns * TRANSMISSION_NS + parameters.delay_ns * PROPAGATION_NS

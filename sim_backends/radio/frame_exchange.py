@@ -1,6 +1,7 @@
 """Exchanges of frames and their acknowledgements: single frames with ACK, broadcasts, and A-MPDU with Block Ack."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final, Generic
 
 from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate, BlockAckSession, remove_frames
@@ -12,13 +13,14 @@ from sim_backends.radio.frames import (
     Frame,
     Transmission,
     TransmissionAttempt,
-    ack_record,
     attempt_record,
+    control_record,
 )
 from sim_backends.radio.links import RETRIES_EXHAUSTED, Payload
 from sim_backends.radio.modes import (
     SHORT_RETRY_LIMIT,
     SLOT_NS,
+    WifiMode,
     ack_ns,
     basic_mode,
     control_mode,
@@ -27,6 +29,7 @@ from sim_backends.radio.modes import (
 from sim_backends.radio.packet_delivery import PacketDelivery
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.reception import Reception
+from sim_backends.radio.rts_cts import NO_RTS_BYTES, ProtectedFrame, RtsCts
 from sim_backends.radio.stations import Peer, Station
 
 # 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
@@ -49,6 +52,7 @@ class FrameExchange(Generic[Payload]):
         events: Scheduled events.
         delivery: Queues of the stations, and what they have received.
         reception: The frames on the air.
+        rts_cts: RTS and CTS before the frames of stations with a threshold.
         log: Called with every transmission attempt that ends; None without a log.
         meter: Counters of the radio drivers; None without counters.
     """
@@ -60,12 +64,13 @@ class FrameExchange(Generic[Payload]):
         self._sifs_ns = band.sifs_ns
         self._ack_timeout_ns = band.sifs_ns + _ACK_TIMEOUT_AFTER_SIFS_NS
         self.stations: list[Station[Payload]] = [
-            Station(index, PacketDraws(seed, name, "backoff"), channel.ifs_ns(index))
+            Station(index, PacketDraws(seed, name, "backoff"), channel.ifs_ns(index), _rts_threshold(channel, index))
             for index, name in enumerate(channel.names)
         ]
         self.events = EventQueue(self._start)
         self.delivery: PacketDelivery[Payload] = PacketDelivery(channel, self.stations, self.events, queue_packets)
         self.reception = Reception(channel, seed, self.stations, self.events)
+        self.rts_cts = RtsCts(self._names, band, self.stations, self.events, self.reception)
         self.log: Callable[[TransmissionAttempt], None] | None = None
         self.meter: RadioMeter | None = None
 
@@ -109,15 +114,30 @@ class FrameExchange(Generic[Payload]):
         if not frame.attempts:
             frame.first_attempt_ns = now_ns
         frame.attempts += 1
-        packet, number = frame.packet, frame.attempts
         if peer is None:
             mode = self._basic
         else:
-            mode = peer.mode = peer.rate.choose(now_ns, packet, number)
+            mode = peer.mode = peer.rate.choose(now_ns, frame.packet, frame.attempts)
+            size_bytes = frame.size_bytes + HEADER_BYTES
+            if size_bytes > station.rts_threshold_bytes:
+                exchange_ns = mode.airtime_ns(size_bytes) + self._sifs_ns + ack_ns(mode)
+                send = partial(self._send_frame, station=station, peer=peer, frame=frame, mode=mode)
+                self._protect(now_ns, station, peer, [frame], exchange_ns=exchange_ns, send=send)
+                return
+        self._send_frame(now_ns, station, peer, frame, mode)
+
+    def _send_frame(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload] | None,
+        frame: Frame[Payload],
+        mode: WifiMode,
+    ) -> None:
         size_bytes = frame.size_bytes + HEADER_BYTES
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         reserved_ns = end_ns if peer is None else end_ns + self._sifs_ns + ack_ns(mode)
-        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, packet, number)
+        transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, frame.packet, frame.attempts)
         self.reception.start(transmission, reserved_ns)
         if self.meter is not None:
             self.meter.on_start(transmission, frame.receiver)
@@ -164,11 +184,46 @@ class FrameExchange(Generic[Payload]):
         first = station.queue[0]
         # Hardware repeats an aggregate in the next mode of the chain only if the Block Ack is missing.
         mode = peer.mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
-        aggregate = station.aggregate = session.build_aggregate(station.queue, mode)
+        aggregate = station.aggregate = session.build_aggregate(station.queue, mode, is_single=peer.rate.is_probing)
         for frame in aggregate.frames:
             if not frame.attempts:
                 frame.first_attempt_ns = now_ns
             frame.attempts += 1
+        size_bytes = aggregate.size_bytes
+        if size_bytes > station.rts_threshold_bytes:
+            exchange_ns = mode.airtime_ns(size_bytes) + self._sifs_ns + response_ns(mode, aggregate.response_bytes)
+            send = partial(self._send_aggregate, station=station, peer=peer, aggregate=aggregate)
+            self._protect(now_ns, station, peer, aggregate.frames, exchange_ns=exchange_ns, send=send)
+            return
+        self._send_aggregate(now_ns, station, peer, aggregate)
+
+    def _protect(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        frames: Sequence[Frame[Payload]],
+        *,
+        exchange_ns: int,
+        send: Callable[[int], None],
+    ) -> None:
+        """Send RTS before a frame or an aggregate, and the data by `send` after the CTS."""
+
+        def fail(at_ns: int) -> None:
+            if self.meter is not None:
+                self.meter.on_failed_rts(station.index, peer.receiver, frames)
+            self._finish_attempt(at_ns, station, peer, acknowledged=False, is_sent=False)
+
+        first = frames[0]
+        frame = ProtectedFrame(
+            station, peer.receiver, peer.mode, exchange_ns, first.packet, first.attempts, send, fail
+        )
+        self.rts_cts.start(now_ns, frame)
+
+    def _send_aggregate(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], aggregate: Aggregate[Payload]
+    ) -> None:
+        mode, first = peer.mode, aggregate.frames[0]
         size_bytes, response_bytes = aggregate.size_bytes, aggregate.response_bytes
         end_ns = now_ns + mode.airtime_ns(size_bytes)
         transmission = Transmission(station.index, now_ns, end_ns, mode, size_bytes, first.packet, first.attempts)
@@ -249,7 +304,7 @@ class FrameExchange(Generic[Payload]):
         decoded = station.receiving is ack and self.reception.decodes(station.index, ack, "ack")
         self.reception.end(now_ns, ack)
         if self.log is not None:
-            self.log(ack_record(self._names, ack, station.index, decoded=decoded))
+            self.log(control_record(self._names, ack, station.index, "ACK", decoded=decoded))
         if exchange_id == station.exchange_id:
             self._finish_attempt(now_ns, station, peer, acknowledged=decoded)
 
@@ -260,15 +315,23 @@ class FrameExchange(Generic[Payload]):
             self._finish_attempt(now_ns, station, peer, acknowledged=False)
 
     def _finish_attempt(
-        self, now_ns: int, station: Station[Payload], peer: Peer[Payload], *, acknowledged: bool
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        peer: Peer[Payload],
+        *,
+        acknowledged: bool,
+        is_sent: bool = True,
     ) -> None:
+        """End an attempt; `is_sent` is False if there was no CTS before the data, which says nothing about modes."""
         if not acknowledged:
             station.contention.set_busy_until(now_ns)
         if peer.session is not None:
-            self._finish_aggregate(now_ns, station, peer, peer.session, acknowledged=acknowledged)
+            self._finish_aggregate(now_ns, station, peer, peer.session, acknowledged=acknowledged, is_sent=is_sent)
             return
         frame = station.queue[0]
-        peer.rate.report(peer.mode, acknowledged=acknowledged)
+        if is_sent:
+            peer.rate.report(peer.mode, acknowledged=acknowledged)
         done = acknowledged or frame.attempts >= frame.max_attempts
         if done:
             is_received = peer.last_frame is frame
@@ -297,18 +360,20 @@ class FrameExchange(Generic[Payload]):
         session: BlockAckSession[Payload],
         *,
         acknowledged: bool,
+        is_sent: bool,
     ) -> None:
         aggregate = station.aggregate
         assert aggregate is not None
         station.aggregate = None
         frames, confirmed = aggregate.frames, set(aggregate.decoded if acknowledged else ())
-        peer.rate.report(peer.mode, acknowledged=len(confirmed), attempts=len(frames))
+        if is_sent:
+            peer.rate.report(peer.mode, acknowledged=len(confirmed), attempts=len(frames))
         if acknowledged:
             station.contention.on_success()
             peer.failed_exchanges = 0
         else:
             station.contention.on_failure()
-            peer.failed_exchanges += 1
+            peer.failed_exchanges += is_sent
         given_up = {frame for frame in frames if frame not in confirmed and frame.attempts >= frame.max_attempts}
         lost = [frame for frame in frames if frame in given_up and not frame.is_received]
         for frame in lost:
@@ -322,3 +387,8 @@ class FrameExchange(Generic[Payload]):
         station.exchange_id += 1
         if station.queue:
             self._contend(now_ns, station)
+
+
+def _rts_threshold(channel: RadioChannel, station: int) -> int:
+    threshold_bytes = channel.rts_threshold_bytes(station)
+    return NO_RTS_BYTES if threshold_bytes is None else threshold_bytes

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final, Generic
+from typing import Any, Final, Generic, Literal
 
 from sim_backends.radio.error_rates import log_success
 from sim_backends.radio.links import (
@@ -25,6 +25,8 @@ HEADER_BYTES: Final = 24 + 8 + 4
 """MAC header with three addresses, LLC and SNAP, FCS: IEEE 802.11-2020, 9.3.2.1; RFC 1042."""
 
 _NEVER_NS: Final = 1 << 63
+
+ControlFrame = Literal["", "ACK", "RTS", "CTS"]
 
 
 @dataclass(eq=False, slots=True)
@@ -182,9 +184,10 @@ class TransmissionAttempt:
         receiver: Name of the receiver; None for a broadcast.
         mode: Modulation and coding.
         size_bytes: Size with MAC header and FCS.
-        number: Number of the attempt for this frame, from 1; 0 for an ACK.
+        number: Number of the attempt for this frame, from 1; 0 for a control frame.
         received: Names of the addressed stations that decoded it.
-        payload: Its content; None for an ACK.
+        payload: Its content; None for a control frame.
+        control: Kind of a control frame; ACK includes Block Ack. Empty for data.
     """
 
     start_ns: int
@@ -196,6 +199,7 @@ class TransmissionAttempt:
     number: int
     received: tuple[str, ...]
     payload: Any
+    control: ControlFrame = ""
 
 
 def attempt_record(
@@ -218,10 +222,10 @@ def attempt_record(
     )
 
 
-def ack_record(
-    names: Sequence[str], transmission: Transmission, receiver: int, *, decoded: bool
+def control_record(
+    names: Sequence[str], transmission: Transmission, receiver: int, kind: ControlFrame, *, decoded: bool
 ) -> TransmissionAttempt:
-    """Return the log entry of an ACK for `receiver`."""
+    """Return the log entry of a control frame for `receiver`."""
     name = names[receiver]
     received = (name,) if decoded else ()
     return TransmissionAttempt(
@@ -234,4 +238,5 @@ def ack_record(
         0,
         received,
         None,
+        kind,
     )

@@ -11,7 +11,7 @@ from functools import cache
 from itertools import product
 from typing import Final, Literal
 
-from fieldkit.config.wifi_phy import WifiAmendment, WifiPhy
+from fieldkit.config.wifi_phy import WifiAmendment, WifiPhy, WifiRateControl
 from sim_backends.radio.modes import (
     BAND_2_4,
     BANDS,
@@ -74,6 +74,10 @@ class PhyCapability:
         width_mhz: Widest channel.
         streams: Most spatial streams.
         guard_interval_ns: Shortest guard interval.
+        rate_control: Its rate control.
+        firmware_margin_db: Margin of `firmware` below the measured signal.
+        firmware_interval_ns: Time between two selections of `firmware`.
+        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS; None for all.
     """
 
     amendment: WifiAmendment
@@ -81,6 +85,10 @@ class PhyCapability:
     width_mhz: int
     streams: int
     guard_interval_ns: int
+    rate_control: WifiRateControl = "minstrel"
+    firmware_margin_db: float = 3.0
+    firmware_interval_ns: int = 100_000_000
+    rts_threshold_bytes: int | None = None
 
     @property
     def band(self) -> Band:
@@ -104,7 +112,39 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
     if phy is None:
         return None
     amendment, band_name = phy.split_standard(standard)
-    return PhyCapability(amendment, band_name, phy.width_mhz, phy.streams, phy.guard_interval_ns)
+    return PhyCapability(
+        amendment,
+        band_name,
+        phy.width_mhz,
+        phy.streams,
+        phy.guard_interval_ns,
+        phy.rate_control,
+        float(phy.firmware_margin_db),
+        round(phy.firmware_interval * 1e9),
+        phy.rts_threshold_bytes,
+    )
+
+
+@dataclass(frozen=True)
+class _Common:
+    """What two stations of one band have in common: format, width, number of streams, shortest guard interval."""
+
+    phy_format: HighThroughput
+    width_mhz: int
+    streams: int
+    guard_ns: int
+
+
+def _common(first: PhyCapability, second: PhyCapability) -> _Common:
+    amendment = min(first.amendment, second.amendment, key=_ORDER.index)
+    if amendment == "ac" and first.band_name == "2.4 GHz":
+        amendment = "n"
+    phy_format = _FORMATS[amendment]
+    width_mhz = min(first.width_mhz, second.width_mhz, max(_SUBCARRIERS[phy_format]))
+    guard_ns = max(first.guard_interval_ns, second.guard_interval_ns)
+    if amendment != "ax":
+        guard_ns = min(guard_ns, 800)
+    return _Common(phy_format, width_mhz, min(first.streams, second.streams), guard_ns)
 
 
 def common_modes(first: PhyCapability, second: PhyCapability) -> tuple[WifiMode, ...]:
@@ -113,19 +153,28 @@ def common_modes(first: PhyCapability, second: PhyCapability) -> tuple[WifiMode,
     They use the latest amendment, the widest channel and the shortest guard interval that both support, and all
     numbers of streams up to the largest. A station of 802.11ax uses 800 ns with one of an earlier amendment.
     """
-    amendment = min(first.amendment, second.amendment, key=_ORDER.index)
-    if amendment == "ac" and first.band_name == "2.4 GHz":
-        amendment = "n"
-    phy_format = _FORMATS[amendment]
-    widths = (first.width_mhz, second.width_mhz, max(_SUBCARRIERS[phy_format]))
-    guard_ns = max(first.guard_interval_ns, second.guard_interval_ns)
-    if amendment != "ax":
-        guard_ns = min(guard_ns, 800)
-    streams = range(1, min(first.streams, second.streams) + 1)
+    common = _common(first, second)
     modes = [
-        mode for count in streams for mode in format_modes(phy_format, first.band_name, min(widths), count, guard_ns)
+        mode
+        for count in range(1, common.streams + 1)
+        for mode in format_modes(common.phy_format, first.band_name, common.width_mhz, count, common.guard_ns)
     ]
     return tuple(sorted(modes, key=lambda mode: (mode.rate_bit_s, mode.streams)))
+
+
+def mode_groups(first: PhyCapability, second: PhyCapability) -> tuple[tuple[WifiMode, ...], ...]:
+    """Return the modes that two stations of one band support in their common format, also in narrower channels.
+
+    There is a group for each width, guard interval (longest first) and number of streams, in this order; the modes of
+    a group are slowest first.
+    """
+    common = _common(first, second)
+    widths = [width_mhz for width_mhz in _SUBCARRIERS[common.phy_format] if width_mhz <= common.width_mhz]
+    intervals = [guard_ns for guard_ns in guard_intervals_ns(common.phy_format) if guard_ns >= common.guard_ns]
+    return tuple(
+        format_modes(common.phy_format, first.band_name, width_mhz, streams, guard_ns)
+        for width_mhz, guard_ns, streams in product(widths, reversed(intervals), range(1, common.streams + 1))
+    )
 
 
 @cache

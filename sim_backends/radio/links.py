@@ -22,7 +22,7 @@ class LinkParameters:
 
     Attributes:
         rate_bit_s: Serialization rate in bit/s; None means unlimited.
-        delay_ns: Delay in addition to queueing and serialization, in ns.
+        delay_ns: Delay in addition to queuing and serialization, in ns.
         jitter_ns: Width of the uniform extra delay, in ns.
         loss: Share of packets lost, independent of their length.
         queue_packets: Maximum number of queued packets, without the one on the air.

@@ -81,7 +81,7 @@ class RadioOptions(Strict):
             Linux's default.
         loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted
             and one of the next three is given.
-        delay: Fixed links: delay of a link in addition to queueing and serialization. The default is 0.2 ms, about
+        delay: Fixed links: delay of a link in addition to queuing and serialization. The default is 0.2 ms, about
             DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's
             interrupt.
         rate: Fixed links: bit rate of every link, `20Mbit/s`, or `unlimited`; 54 Mbit/s if omitted.

@@ -10,7 +10,13 @@ from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 
 
 class RateControl(Protocol):
-    """Selects the mode of each attempt on one directed link."""
+    """Selects the mode of each attempt on one directed link.
+
+    Attributes:
+        is_probing: True if the frame of the last first attempt must not be aggregated, because it tries a mode.
+    """
+
+    is_probing: bool = False
 
     def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
         """Return the mode of an attempt that starts at `now_ns`.
@@ -27,7 +33,7 @@ class RateControl(Protocol):
         ...
 
 
-class FixedRate:
+class FixedRate(RateControl):
     """Always uses one mode.
 
     Args:
@@ -57,7 +63,7 @@ _STALE_UPDATES: Final = 20
 _FAILING_ATTEMPTS, _FAILING_SHARE = 30, 0.2
 
 
-class Minstrel:
+class Minstrel(RateControl):
     """Sends in the mode with the highest throughput, falls back to others, and samples other modes occasionally.
 
     Each mode has an exponentially weighted mean of the share of acknowledged attempts: weight 75 % for the old value,

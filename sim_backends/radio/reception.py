@@ -114,6 +114,16 @@ class Reception(Generic[Payload]):
                         self._events.schedule_start(neighbour.contention.earliest_start_ns(now_ns), index)
             transmission.interferers.clear()
 
+    def reserve(self, now_ns: int, transmission: Transmission, until_ns: int) -> None:
+        """Let the stations that have received a transmission, which ends now, wait until `until_ns`; before `end`."""
+        if transmission.interferers:
+            return
+        for index in transmission.receivers:
+            contention = self._stations[index].contention
+            contention.set_busy_until(until_ns)
+            if index in self._events.starts:
+                self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
+
     def abort(self, index: int, now_ns: int) -> None:
         """Abort the transmission of a station, so that no station decodes it, and its reception."""
         station = self._stations[index]

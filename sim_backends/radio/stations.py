@@ -19,6 +19,7 @@ class Station(Generic[Payload]):
         index: Its index in the channel's list of stations.
         draws: Random draws of its backoff.
         ifs_ns: Inter-frame space before its backoff.
+        rts_threshold_bytes: Attribute of the same name.
 
     Attributes:
         contention: Its carrier sense and backoff.
@@ -29,6 +30,7 @@ class Station(Generic[Payload]):
             during an exchange.
         offered: Number of packets that were passed to it for sending.
         aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
+        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
     """
 
     __slots__ = (
@@ -42,10 +44,11 @@ class Station(Generic[Payload]):
         "offered",
         "queue",
         "receiving",
+        "rts_threshold_bytes",
         "sending_until_ns",
     )
 
-    def __init__(self, index: int, draws: PacketDraws, ifs_ns: int) -> None:
+    def __init__(self, index: int, draws: PacketDraws, ifs_ns: int, rts_threshold_bytes: int) -> None:
         self.index = index
         self._draws = draws
         self._redraws_of: tuple[PacketIdentity, int] | None = None
@@ -55,6 +58,7 @@ class Station(Generic[Payload]):
         self.receiving: Transmission | None = None
         self.aggregate: Aggregate[Payload] | None = None
         self.sending_until_ns = 0
+        self.rts_threshold_bytes = rts_threshold_bytes
         self.exchange_id = self.offered = 0
 
     def _backoff(self) -> float:

@@ -39,7 +39,7 @@ class Wifi(Generic[Payload]):
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """Pass every transmission attempt that ends from now on to `log`; None stops logging."""
-        self._exchange.log = log
+        self._exchange.log = self._exchange.rts_cts.log = log
 
     def log_losses(self, log: LossLog | None) -> None:
         """Pass every loss from now on to `log`; None stops logging."""
@@ -47,7 +47,7 @@ class Wifi(Generic[Payload]):
 
     def use_meter(self) -> None:
         """Start the counters of the radio drivers, for `sample`."""
-        self._exchange.meter = RadioMeter(len(self._stations))
+        self._exchange.meter = self._exchange.rts_cts.meter = RadioMeter(len(self._stations))
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
         """Implement `RadioModel.sample`."""

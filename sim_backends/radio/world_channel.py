@@ -15,8 +15,10 @@ from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLi
 from sim_backends.radio.antennas import Antenna, band_of, fixed_mode, modes_between
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.firmware_rate import FirmwareRate
 from sim_backends.radio.frames import decibel
-from sim_backends.radio.high_throughput import common_modes
+from sim_backends.radio.high_throughput import common_modes, mode_groups
+from sim_backends.radio.minstrel_ht import MinstrelHt
 from sim_backends.radio.modes import OFDM_MODES
 from sim_backends.radio.propagation import Echoes, Fades, Fading, Shadowing
 from sim_backends.radio.radio_options import RadioOptions
@@ -206,12 +208,12 @@ class WorldChannel(RadioChannel):
                 given_db[index[transmitter], index[receiver]] = loss_db
         if before_db is None:
             before_db = np.full((count, count), np.nan)
-        same = (given_db == before_db) | (np.isnan(given_db) & np.isnan(before_db))
-        if same.all():
+        unchanged = (given_db == before_db) | (np.isnan(given_db) & np.isnan(before_db))
+        if unchanged.all():
             return
         self._given_db = given_db
         self._revision += 1
-        self._stale |= ~(same & same.T)[tuple(self._ends)]
+        self._stale |= ~(unchanged & unchanged.T)[tuple(self._ends)]
 
     def received_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
         """Return the mean received power at each station, by index, of another transmitter at a position."""
@@ -351,6 +353,11 @@ class WorldChannel(RadioChannel):
         return self.band.difs_ns if self._antennas[station].phy is None else self.band.best_effort_aifs_ns
 
     @override
+    def rts_threshold_bytes(self, station: int) -> int | None:
+        phy = self._antennas[station].phy
+        return None if phy is None else phy.rts_threshold_bytes
+
+    @override
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:
         first, second = self._antennas[transmitter], self._antennas[receiver]
         if first.phy is None or second.phy is None or (self._fixed_mode is not None and not self._fixed_mode.ht):
@@ -363,10 +370,24 @@ class WorldChannel(RadioChannel):
         if self._fixed_mode is not None:
             return FixedRate(self._fixed_mode)
         names = self.names[transmitter], self.names[receiver]
+        draws = PacketDraws(self._seed, *names, "rate")
+        first, second = self._antennas[transmitter], self._antennas[receiver]
+        if first.phy is not None and second.phy is not None:
+            if first.phy.rate_control == "minstrel_ht":
+                return MinstrelHt(mode_groups(first.phy, second.phy), draws)
+            if first.phy.rate_control == "firmware":
+                return FirmwareRate(
+                    common_modes(first.phy, second.phy),
+                    lambda now_ns: decibel(
+                        self.powers_mw(receiver, now_ns)[transmitter] / self.noise_mw[transmitter]
+                    ),
+                    margin_db=first.phy.firmware_margin_db,
+                    interval_ns=first.phy.firmware_interval_ns,
+                )
         return Minstrel(
-            modes_between(self._antennas[transmitter], self._antennas[receiver]),
+            modes_between(first, second),
             self.snr_db(transmitter, receiver),
-            PacketDraws(self._seed, *names, "rate"),
+            draws,
             frames_per_exchange=1 if self.ampdu_limits(transmitter, receiver) is None else TYPICAL_FRAMES,
         )
 

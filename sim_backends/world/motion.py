@@ -180,7 +180,7 @@ class _Extrapolated(Mapping[str, State]):
 
 
 class DeadReckoned(Mapping[str, State]):
-    """States at a reference time, and extrapolated to later times; as a mapping, those of the reference time.
+    """States at a reference time, and extrapolated to later times. The mapping has the states at the reference time.
 
     Args:
         states: The states.

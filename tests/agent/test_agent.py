@@ -42,10 +42,10 @@ def test_agent_needs_only_python_3_8_and_its_middleware(path: Path) -> None:
         "ros1.py": {"rospy", "rosgraph"},
         "ros2.py": {"rclpy"},
     }
-    own = of.get(path.name, set())
+    expected = of.get(path.name, set())
     for name in names:
         root = name.split(".")[0]
-        assert name.startswith("fieldkit.agent") or root in sys.stdlib_module_names | own, name
+        assert name.startswith("fieldkit.agent") or root in sys.stdlib_module_names | expected, name
 
 
 def test_same_modules_give_the_same_file() -> None:
@@ -93,12 +93,12 @@ def cable(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cable]:
 
 def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: object) -> None:
     """Stream from one host to the other, and check that all samples arrive unchanged."""
-    near, far = cable.hosts
+    first_host, second_host = cable.hosts
     sent, received = tmp_path / "sent", tmp_path / "came"
-    subscriber_arguments = cable.arguments(middleware_name, far, peers=(near.address,), **network)
-    with cable.running(far, "subscribe", subscriber_arguments, str(received)) as subscriber:
-        publisher_arguments = cable.arguments(middleware_name, near, peers=(far.address,), **network)
-        with cable.running(near, "publish", publisher_arguments, str(sent)) as publisher:
+    subscriber_arguments = cable.arguments(middleware_name, second_host, peers=(first_host.address,), **network)
+    with cable.running(second_host, "subscribe", subscriber_arguments, str(received)) as subscriber:
+        publisher_arguments = cable.arguments(middleware_name, first_host, peers=(second_host.address,), **network)
+        with cable.running(first_host, "publish", publisher_arguments, str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
     assert subscriber.returncode == 0
     left, arrived = topic_logs.rows(sent), topic_logs.rows(received)
@@ -125,27 +125,27 @@ def test_samples_arrive_over_udp(cable: Cable, tmp_path: Path) -> None:
 
 @pytest.mark.emulated
 def test_samples_arrive_through_a_router(cable: Cable, tmp_path: Path) -> None:
-    near, _ = cable.hosts
-    routes = {"network": {"address": near.address, "discovery": "router", "server": near.address}}
-    with cable.running(near, "route", routes):
-        exchanged(cable, tmp_path, "zenoh", discovery="router", server=near.address)
+    first_host, _ = cable.hosts
+    routes = {"network": {"address": first_host.address, "discovery": "router", "server": first_host.address}}
+    with cable.running(first_host, "route", routes):
+        exchanged(cable, tmp_path, "zenoh", discovery="router", server=first_host.address)
 
 
 @pytest.mark.emulated
 def test_samples_arrive_with_a_ros_1_master(cable: Cable, tmp_path: Path) -> None:
-    near, _ = cable.hosts
+    first_host, _ = cable.hosts
     with ExitStack() as stack:
-        master = stack.enter_context(near.start(("rosmaster", "--core", "-p", "11311")))
+        master = stack.enter_context(first_host.start(("rosmaster", "--core", "-p", "11311")))
         stack.callback(master.terminate)
-        exchanged(cable, tmp_path, "ros1", discovery="master", server=near.address)
+        exchanged(cable, tmp_path, "ros1", discovery="master", server=first_host.address)
 
 
 @pytest.mark.emulated
 def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path) -> None:
-    near, far = cable.hosts
+    first_host, second_host = cable.hosts
     sent, received = tmp_path / "sent", tmp_path / "came"
-    with cable.running(far, "subscribe", cable.arguments("dds", far), str(received)) as subscriber:
-        with cable.running(near, "publish", cable.arguments("dds", near), str(sent)) as publisher:
+    with cable.running(second_host, "subscribe", cable.arguments("dds", second_host), str(received)) as subscriber:
+        with cable.running(first_host, "publish", cable.arguments("dds", first_host), str(sent)) as publisher:
             assert publisher.wait(timeout=60) == 0
         subscriber.kill()
     arrived = [row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE]
@@ -155,12 +155,12 @@ def test_killed_subscriber_leaves_received_samples(cable: Cable, tmp_path: Path)
 
 @pytest.mark.emulated
 def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) -> None:
-    near, far = cable.hosts
+    first_host, second_host = cable.hosts
     sent, received = tmp_path / "sent", tmp_path / "came"
-    with cable.running(far, "subscribe", cable.arguments("dds", far), str(received)) as subscriber:
-        publisher_arguments = cable.arguments("dds", near)
+    with cable.running(second_host, "subscribe", cable.arguments("dds", second_host), str(received)) as subscriber:
+        publisher_arguments = cable.arguments("dds", first_host)
         publisher_arguments["stream"]["duration_s"] = 3.0  # stopped before it has received all samples
-        with cable.running(near, "publish", publisher_arguments, str(sent)) as publisher:
+        with cable.running(first_host, "publish", publisher_arguments, str(sent)) as publisher:
             wait_until(lambda: any(row[0] == records.SAMPLE for row in topic_logs.rows(sent)), Deadline.after(60))
             subscriber.send_signal(signal.SIGSTOP)
             try:
@@ -173,9 +173,11 @@ def test_publisher_stops_without_acknowledgements(cable: Cable, tmp_path: Path) 
 
 @pytest.mark.emulated
 def test_missing_master_is_reported(cable: Cable, tmp_path: Path) -> None:
-    near, _ = cable.hosts
-    arguments = cable.arguments("ros1", near, discovery="master", server="127.0.0.1", settings={"patience_s": "0.1"})
-    with near.start(
+    first_host, _ = cable.hosts
+    arguments = cable.arguments(
+        "ros1", first_host, discovery="master", server="127.0.0.1", settings={"patience_s": "0.1"}
+    )
+    with first_host.start(
         (sys.executable, str(cable.program), "publish", json.dumps(arguments), str(tmp_path / "log"))
     ) as process:
         _, output_text = process.communicate(timeout=60)
@@ -226,13 +228,13 @@ def unharmed(cable: Cable, tmp_path: Path, middleware_name: str, **network: obje
 
     Yields the log of the received samples.
     """
-    near, far = cable.hosts
+    first_host, second_host = cable.hosts
     received, sent = tmp_path / "came", tmp_path / "sent"
-    subscriber_arguments = cable.arguments(middleware_name, near, peers=(far.address,), **network)
-    publisher_arguments = cable.arguments(middleware_name, far, peers=(near.address,), **network)
+    subscriber_arguments = cable.arguments(middleware_name, first_host, peers=(second_host.address,), **network)
+    publisher_arguments = cable.arguments(middleware_name, second_host, peers=(first_host.address,), **network)
     endless = {**publisher_arguments, "stream": {**publisher_arguments["stream"], "duration_s": 600.0}}
-    with cable.running(near, "subscribe", subscriber_arguments, str(received)) as subscriber:
-        with cable.running(far, "publish", endless, str(sent)) as publisher:
+    with cable.running(first_host, "subscribe", subscriber_arguments, str(received)) as subscriber:
+        with cable.running(second_host, "publish", endless, str(sent)) as publisher:
             yield received
             assert publisher.poll() is None
         assert subscriber.poll() is None
@@ -266,13 +268,19 @@ def newest(log: Path) -> int:
 
 @pytest.mark.emulated
 def test_invalid_tcpros_data_stop_neither_program(cable: Cable, tmp_path: Path) -> None:
-    near, far = cable.hosts
-    network = {"discovery": "master", "server": near.address, "settings": {"tcpros_port": "40001"}}
+    first_host, second_host = cable.hosts
+    network = {"discovery": "master", "server": first_host.address, "settings": {"tcpros_port": "40001"}}
     with ExitStack() as stack:
-        process = stack.enter_context(near.start(("rosmaster", "--core", "-p", "11311")))
+        process = stack.enter_context(first_host.start(("rosmaster", "--core", "-p", "11311")))
         stack.callback(process.terminate)
         with unharmed(cable, tmp_path, "ros1", **network) as received:
-            attacked(far, "tcpros", f"http://{near.address}:11311", f"{near.address}:40001", f"{far.address}:40001")
+            attacked(
+                second_host,
+                "tcpros",
+                f"http://{first_host.address}:11311",
+                f"{first_host.address}:40001",
+                f"{second_host.address}:40001",
+            )
             sequences = {row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE}
             deadline_s = time.monotonic() + 60
             while {row[3] for row in topic_logs.rows(received) if row[0] == records.SAMPLE} <= sequences:

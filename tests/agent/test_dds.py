@@ -14,7 +14,9 @@ from fieldkit.ros.interfaces.qos import PROFILES
 from fieldkit.ros.interfaces.types import MessageTypes, shipped
 from fieldkit.ros.middlewares import tuning
 
-OWN = "float32[4] level\nstring name\nuint8[] raw\nint16[<=3] few\nbool good\nbyte one\nfloat64 wide\nint64[2] big\n"
+CUSTOM_TYPE = (
+    "float32[4] level\nstring name\nuint8[] raw\nint16[<=3] few\nbool good\nbyte one\nfloat64 wide\nint64[2] big\n"
+)
 
 
 def topic(name: str, types: MessageTypes | None = None) -> Topic:
@@ -53,7 +55,7 @@ def test_all_types_of_robots_can_be_built(name: str) -> None:
 
 
 def test_custom_type_can_be_built() -> None:
-    types = MessageTypes(definitions={"lab_msgs/Radio": OWN})
+    types = MessageTypes(definitions={"lab_msgs/Radio": CUSTOM_TYPE})
     kind = types.ros2.types["lab_msgs/msg/Radio"]
     level, raw = np.array([1, 2, 3, 4], np.float32), np.array([9, 8], np.uint8)
     message = kind(

@@ -31,9 +31,9 @@ def plan(folder: Path, port: int) -> FlightPlan:
 
 
 def order(folder: Path, number: int, command: str) -> None:
-    beside = folder / "orders.new"
-    beside.write_text(f"{number} {command} 60\n", encoding="ascii")
-    beside.replace(folder / "orders")
+    new_file = folder / "orders.new"
+    new_file.write_text(f"{number} {command} 60\n", encoding="ascii")
+    new_file.replace(folder / "orders")
 
 
 def wait_until_up(autopilot: Autopilot) -> None:
@@ -96,11 +96,11 @@ def test_autopilot_without_reports_is_commanded_to_land(
 ) -> None:
     """It may receive commands although its answers are lost."""
     monkeypatch.setattr(loop, "_POSITION_TIMEOUT_S" if lost else "_FLIGHT_HEARTBEAT_TIMEOUT_S", 2.0)
-    silent, codes = threading.Event(), list[int]()
+    is_silent, codes = threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
 
     def damage(frame: bytes) -> list[bytes]:
-        return [] if silent.is_set() and lost in {None, parse_frame(frame).kind} else [frame]
+        return [] if is_silent.is_set() and lost in {None, parse_frame(frame).kind} else [frame]
 
     with drones.autopilot_at_udp(damage) as (port, autopilot):
         flight_plan, finished = plan(tmp_path, port), threading.Event()
@@ -108,9 +108,9 @@ def test_autopilot_without_reports_is_commanded_to_land(
         pilot.start()
         try:
             wait_until_up(autopilot)
-            silent.set()
+            is_silent.set()
             wait_until_down(autopilot)
-            silent.clear()
+            is_silent.clear()
             pilot.join(60)
         finally:
             finished.set()
@@ -125,15 +125,15 @@ def test_silent_autopilot_ends_the_flight_with_an_alarm(
     """As behind a stopped router: the alarm is logged first, and the program exits some time later."""
     monkeypatch.setattr(loop, "_FLIGHT_HEARTBEAT_TIMEOUT_S", 5.0)
     monkeypatch.setattr(landing, "NO_HEARTBEAT_S", 1.0)
-    silent, finished, codes = threading.Event(), threading.Event(), list[int]()
+    is_silent, finished, codes = threading.Event(), threading.Event(), list[int]()
     order(tmp_path, 1, CLIMB)
-    with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame]) as (port, autopilot):
+    with drones.autopilot_at_udp(lambda frame: [] if is_silent.is_set() else [frame]) as (port, autopilot):
         flight_plan = plan(tmp_path, port)
         pilot = threading.Thread(target=lambda: codes.append(flight.fly(flight_plan, finished)))
         pilot.start()
         try:
             wait_until_up(autopilot)
-            silent.set()
+            is_silent.set()
             pilot.join(60)
         finally:
             finished.set()
@@ -183,12 +183,15 @@ def patient_agent(flight_plan: FlightPlan) -> Iterator["subprocess.Popen[bytes]"
 def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(tmp_path: Path) -> None:
     """The guard observes the suspended pilot before the heartbeat that reports the new mode."""
     order(tmp_path, 1, CLIMB)
-    silent, life = threading.Event(), tmp_path / "life"
+    is_silent, life = threading.Event(), tmp_path / "life"
 
     def guard_iterations() -> int:
         return liveness.entries(life.read_bytes())[liveness.GUARD].iterations
 
-    with drones.autopilot_at_udp(lambda frame: [] if silent.is_set() else [frame], ARDUCOPTER) as (port, autopilot):
+    with drones.autopilot_at_udp(lambda frame: [] if is_silent.is_set() else [frame], ARDUCOPTER) as (
+        port,
+        autopilot,
+    ):
         pilot_plan = replace(plan(tmp_path, port), liveness=str(life))
         with patient_agent(replace(pilot_plan, guards=True)) as guard:
             # The file is created first, and then allocated.
@@ -196,13 +199,13 @@ def test_guard_does_not_command_drone_taken_over_from_suspended_pilot(tmp_path: 
             wait_until(lambda: guard_iterations() > 0, Deadline.after(60))
             with patient_agent(pilot_plan) as pilot:
                 wait_until_up(autopilot)
-                silent.set()
+                is_silent.set()
                 autopilot.vehicle.change_mode(Mode.LOITER)
                 received = guard_iterations() + 2
                 wait_until(lambda: guard_iterations() >= received, Deadline.after(60))
                 pilot.send_signal(signal.SIGSTOP)
                 assert pilot.wait(60) == -signal.SIGKILL
-                silent.clear()
+                is_silent.clear()
                 assert guard.wait(60) == landing.TAKEN_OVER
         assert autopilot.vehicle.mode is Mode.LOITER
         assert not autopilot.vehicle.body.on_ground

@@ -45,15 +45,18 @@ def test_late_subscription_receives_the_last_samples(middleware_name: str, tmp_p
     published = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
     file = tmp_path / "samples"
     file.write_text("\n".join(published), encoding="ascii")
-    with two_connected_hosts() as (near, far), end(near, "say", middleware_name, file) as publisher:
-        with end(far, "hear", middleware_name, file) as ears:
-            assert ears.stdout is not None
-            for line in ears.stdout:
+    with (
+        two_connected_hosts() as (publishing, subscribing),
+        end(publishing, "say", middleware_name, file) as publisher,
+    ):
+        with end(subscribing, "hear", middleware_name, file) as early_subscriber:
+            assert early_subscriber.stdout is not None
+            for line in early_subscriber.stdout:
                 if line.strip() == published[-1]:
                     break
             assert publisher.stdout is not None
             assert publisher.stdout.readline() == "matched\n"
         # All samples were published before.
-        with end(far, "hear", middleware_name, file) as late:
-            assert late.stdout is not None
-            assert [late.stdout.readline().strip() for _ in range(DEPTH)] == published[-DEPTH:]
+        with end(subscribing, "hear", middleware_name, file) as late_subscriber:
+            assert late_subscriber.stdout is not None
+            assert [late_subscriber.stdout.readline().strip() for _ in range(DEPTH)] == published[-DEPTH:]

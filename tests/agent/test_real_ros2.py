@@ -47,12 +47,12 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
     sent, received = tmp_path / "sent", tmp_path / "came"
     command = (sys.executable, str(program))
     with (
-        two_connected_hosts() as (near, far),
-        near.start((*command, "subscribe", arguments(near, "/again", "ears"), str(received))) as subscriber,
-        near.start((*command, "publish", arguments(near, "/stream", "mouth"), str(sent))) as publisher,
+        two_connected_hosts() as (agent_ns, ros2_ns),
+        agent_ns.start((*command, "subscribe", arguments(agent_ns, "/again", "ears"), str(received))) as subscriber,
+        agent_ns.start((*command, "publish", arguments(agent_ns, "/stream", "mouth"), str(sent))) as publisher,
     ):
         environment = ("env", f"ROS_DOMAIN_ID={DOMAIN}", f"ROS_HOME={tmp_path}")
-        inside = ("nsenter", "-t", str(far.pid), "-n", *environment, str(ROS2), str(NODE), str(COUNT), TYPE)
+        inside = ("nsenter", "-t", str(ros2_ns.pid), "-n", *environment, str(ROS2), str(NODE), str(COUNT), TYPE)
         completed = subprocess.run(inside, capture_output=True, check=False, timeout=120)
         publisher.communicate(timeout=120)
         subscriber.send_signal(signal.SIGINT)

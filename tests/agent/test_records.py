@@ -46,7 +46,7 @@ def test_killed_writer_leaves_all_noted_records(tmp_path: Path) -> None:
     noted = SEVERAL_PIECES + len(rest) // 8
 
     content = topic_samples.read_log(tmp_path / "log")
-    assert not content.whole
+    assert not content.is_complete
     samples = content.samples
     assert len(samples) - noted in {0, 1}, "the last record was stored, and perhaps not yet sent"
     assert samples.sequence.tolist() == list(range(len(samples)))
@@ -62,7 +62,7 @@ def test_closed_log_contains_only_its_records(tmp_path: Path) -> None:
     size = (tmp_path / "log").stat().st_size
     assert size == len(records.MAGIC) + (SEVERAL_PIECES + 1) * records.RECORD.size
     content = topic_samples.read_log(tmp_path / "log")
-    assert content.whole
+    assert content.is_complete
     assert content.samples.sequence.tolist() == list(range(SEVERAL_PIECES))
 
 
@@ -82,7 +82,7 @@ def test_full_disk_is_reported_and_keeps_noted_records(tmp_path: Path, monkeypat
     with pytest.raises(LogError):
         log.end(6)
     content = topic_samples.read_log(tmp_path / "log")
-    assert (len(content.samples), content.whole) == (room, False)
+    assert (len(content.samples), content.is_complete) == (room, False)
 
 
 @pytest.mark.emulated

@@ -44,8 +44,8 @@ def programs(folder: Path) -> Iterator[list["subprocess.Popen[bytes]"]]:
     path = folder / "liveness"
     with ExitStack() as stack:
         pair = [
-            subprocess.Popen((sys.executable, "-c", BEATS, str(path), str(own)))
-            for own in (liveness.PILOT, liveness.GUARD)
+            subprocess.Popen((sys.executable, "-c", BEATS, str(path), str(party)))
+            for party in (liveness.PILOT, liveness.GUARD)
         ]
         for process in pair:
             stack.callback(process.wait, 60)

@@ -69,7 +69,7 @@ def read(path: Path, kind: int) -> list[tuple[int, ...]]:
 
 def exchange(program: Path, folder: Path) -> bool:
     """Stream in both directions at the same time; return True if all endpoints matched."""
-    with two_connected_hosts() as (near, far), ExitStack() as stack:
+    with two_connected_hosts() as (ros2_host, dds_host), ExitStack() as stack:
 
         def start(host: TestHost, middleware_name: str, verb: str, topic: str) -> subprocess.Popen[bytes]:
             topic_arguments = arguments(
@@ -77,8 +77,8 @@ def exchange(program: Path, folder: Path) -> bool:
             )
             return stack.enter_context(running(host, program, verb, topic_arguments, folder / f"{topic}.{verb}"))
 
-        subscribers = [start(far, "dds", "subscribe", "there"), start(near, "ros2", "subscribe", "back")]
-        publishers = [start(far, "dds", "publish", "back"), start(near, "ros2", "publish", "there")]
+        subscribers = [start(dds_host, "dds", "subscribe", "there"), start(ros2_host, "ros2", "subscribe", "back")]
+        publishers = [start(dds_host, "dds", "publish", "back"), start(ros2_host, "ros2", "publish", "there")]
         output = [publisher.communicate(timeout=LONG_S)[1] for publisher in publishers]
         for subscriber in subscribers:
             subscriber.send_signal(signal.SIGINT)
@@ -106,16 +106,16 @@ def test_ros_2_node_leaves_no_file_in_the_home_of_its_robot(program: Path, tmp_p
     home, job = tmp_path / "home", tmp_path / "job"
     home.mkdir()
     job.mkdir()
-    with two_connected_hosts() as (near, _):
+    with two_connected_hosts() as (ros2_host, _):
         for more, what, code in (
             ((), {"patience_s": 0.0}, 0),
             # rcl exits the process.
             (("RMW_IMPLEMENTATION=rmw_none_cpp",), {}, 102),
         ):
-            request = arguments("ros2", near, "none", 100)
+            request = arguments("ros2", ros2_host, "none", 100)
             request["stream"] |= what
             words = ("env", "-C", str(job), f"HOME={home}", *more, ROS2, str(program), "publish", json.dumps(request))
-            with near.start((*words, str(job / "log"))) as process:
+            with ros2_host.start((*words, str(job / "log"))) as process:
                 _, output = process.communicate(timeout=LONG_S)
             assert process.returncode == code, output
             assert (b"rmw_none_cpp" in output) == bool(code)

@@ -63,7 +63,7 @@ class FakeMiddleware:
     def __init__(self, polls: int = 1, *, accepts: Callable[[], bool] = lambda: True) -> None:
         self.written: list[bytes] = []
         self.drained = False
-        self._looks = polls
+        self._polls_left = polls
         self._takes = accepts
 
     def publisher(self, topic: Topic) -> "FakeMiddleware":
@@ -79,8 +79,8 @@ class FakeMiddleware:
         return self._takes()
 
     def matched(self) -> int:
-        self._looks -= 1
-        return int(self._looks <= 0)
+        self._polls_left -= 1
+        return int(self._polls_left <= 0)
 
     def drain(self, limit_s: float) -> None:
         self.drained = True

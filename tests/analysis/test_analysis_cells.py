@@ -109,8 +109,8 @@ def test_more_arrivals_than_sent_because_of_offload_give_no_interval() -> None:
 
 
 def test_missing_values_are_omitted_from_sums() -> None:
-    blind = replace(WORSE, ip_packets_received=None, ip_loss=None, transfer_s=None)
-    (cell,) = summarize([UDP, blind])
+    without_capture = replace(WORSE, ip_packets_received=None, ip_loss=None, transfer_s=None)
+    (cell,) = summarize([UDP, without_capture])
     assert (cell.estimates["ip_loss"].value, cell.estimates["ip_loss"].n) == (10 / 216, 1)
     assert cell.estimates["transfer_s"].value == 1.0
 

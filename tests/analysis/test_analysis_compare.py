@@ -62,8 +62,8 @@ def test_a_share_without_its_counts_is_not_in_the_effect_size() -> None:
 
 
 def test_a_condition_of_only_one_run_is_kept() -> None:
-    far, tcp = moved(UDP, distance="55ft", distance_m=16.764), moved(UDP, protocol="tcp")
-    result = compared([*UDP, *far], [*tcp, *UDP])
+    farther, tcp = moved(UDP, distance="55ft", distance_m=16.764), moved(UDP, protocol="tcp")
+    result = compared([*UDP, *farther], [*tcp, *UDP])
     assert [(pair.name, pair.missing_in) for pair in result.pairs] == [
         ("los, master, 9.144 m, udp", ""),
         ("los, master, 16.764 m, udp", "B"),
@@ -124,10 +124,10 @@ def test_a_point_within_a_threshold_is_not_enough() -> None:
 
 
 def test_a_condition_of_only_one_run_is_not_within_the_threshold() -> None:
-    far = moved(UDP, distance="55ft", distance_m=16.764)
-    assert compared([*UDP, *far], UDP, thresholds={"rtt_median_s": 1.0}).exceeds_threshold
-    assert compared(UDP, [*UDP, *far], thresholds={"rtt_median_s": 1.0}).exceeds_threshold
-    without = moved(far, rtt_median_s=None)
+    farther = moved(UDP, distance="55ft", distance_m=16.764)
+    assert compared([*UDP, *farther], UDP, thresholds={"rtt_median_s": 1.0}).exceeds_threshold
+    assert compared(UDP, [*UDP, *farther], thresholds={"rtt_median_s": 1.0}).exceeds_threshold
+    without = moved(farther, rtt_median_s=None)
     assert not compared([*UDP, *without], UDP, thresholds={"rtt_median_s": 1.0}).exceeds_threshold
 
 
@@ -181,7 +181,7 @@ def test_a_possible_difference_is_only_a_note(changes: dict[str, Any], message: 
 
 def test_attempts_in_both_runs_are_reported() -> None:
     (concern,) = compare(parsed(UDP), parsed(UDP[:7])).concerns
-    assert str(concern) == "attempts that the other run has too: A has 7, B has 7"
+    assert str(concern) == "attempts that are in both runs: A has 7, B has 7"
     assert not concern.refuses
 
 
@@ -229,9 +229,11 @@ def test_the_same_concern_of_many_conditions_is_reported_once() -> None:
 @given(st.integers(0, 50), st.integers(2, 12), st.integers(2, 12))
 def test_swapping_the_runs_changes_all_signs(seed: int, n: int, m: int) -> None:
     a, b = bursty(COMPARABLE, n, seed=seed), bursty(COMPARABLE, m, seed=seed + 1)
-    there, back = (compared(*runs, thresholds={"ip_loss": 0.1, "rtt_median_s": 0.002}) for runs in ((a, b), (b, a)))
-    assert there.exceeds_threshold == back.exceeds_threshold
-    for difference, other in zip(there.differences, back.differences, strict=True):
+    forward, reverse = (
+        compared(*runs, thresholds={"ip_loss": 0.1, "rtt_median_s": 0.002}) for runs in ((a, b), (b, a))
+    )
+    assert forward.exceeds_threshold == reverse.exceeds_threshold
+    for difference, other in zip(forward.differences, reverse.differences, strict=True):
         assert difference.value == -(other.value or 0)
         assert difference.cliffs_delta == -(other.cliffs_delta or 0)
         assert difference.p_holm == other.p_holm

@@ -38,11 +38,11 @@ def test_ranks_and_trend_equal_scipy() -> None:
     assert independence._ranks(values) + 1 == pytest.approx(scipy.stats.rankdata(values, axis=1))
     centred = independence._ranks(values)
     centred -= centred.mean(axis=1, keepdims=True)
-    theirs = [scipy.stats.spearmanr(row, np.arange(25)) for row in values]
+    by_scipy = [scipy.stats.spearmanr(row, np.arange(25)) for row in values]
     correlation, variance = independence._spearman(centred)
-    assert correlation == pytest.approx([abs(item.statistic) for item in theirs])
+    assert correlation == pytest.approx([abs(item.statistic) for item in by_scipy])
     assert 2 * independence._upper_tail(correlation, variance) == pytest.approx(
-        [item.pvalue for item in theirs], rel=0.02
+        [item.pvalue for item in by_scipy], rel=0.02
     )
 
 

@@ -61,9 +61,9 @@ def test_the_planned_number_gives_the_wanted_width(rate: float, spread: float) -
     now = cells(20)
     expected = float(np.median(now.high - now.low)) / 2 / 3
     more = int(np.median(sample_size.additional_repeats(now, 20, expected, Kind.COUNTED)))
-    then = cells(20 + more)
+    more_cells = cells(20 + more)
     assert 100 < more < 260
-    assert float(np.median(then.high - then.low)) / 2 == pytest.approx(expected, rel=0.05)
+    assert float(np.median(more_cells.high - more_cells.low)) / 2 == pytest.approx(expected, rel=0.05)
 
 
 def test_the_planned_repeats_without_losses_give_the_required_width() -> None:

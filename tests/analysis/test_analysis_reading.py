@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -31,6 +32,15 @@ def are_equal(first: Repeats, second: Repeats) -> bool:
 def test_rows_have_their_source(tmp_path: Path) -> None:
     paths = [write(tmp_path / "a", repeats(ROW, 2)), write(tmp_path, repeats(ROW, 1), "b.csv")]
     assert list(read(paths, trial_columns()).texts["source"]) == [str(tmp_path / "a")] * 2 + [str(tmp_path / "b.csv")]
+
+
+def test_a_missing_text_of_a_dataset_is_empty(tmp_path: Path) -> None:
+    identity = {"schema_version": 1, "trial": "t", "protocol": "udp", "attempt": 1, "status": "failed"}
+    rows = [
+        identity | {"repeat": number, "reason": reason} for number, reason in enumerate(["late", None, "dead"], 1)
+    ]
+    pd.DataFrame(rows).to_parquet(tmp_path / "part-0.parquet", index=False)
+    assert list(read([tmp_path], trial_columns()).texts["reason"]) == ["late", "", "dead"]
 
 
 def test_tables_of_other_versions_are_in_the_order_of_the_paths(tmp_path: Path) -> None:

@@ -27,10 +27,10 @@ def not_none(interval: Interval | None) -> Interval:
 @given(counts)
 def test_wilson_equals_scipy(count: tuple[int, int]) -> None:
     events, trials = count
-    ours = wilson(events, trials)
-    theirs = scipy.stats.binomtest(events, trials).proportion_ci(0.95, method="wilson")
-    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-9, abs=1e-12)
-    assert 0 <= ours.low <= ours.value <= ours.high <= 1
+    interval = wilson(events, trials)
+    reference = scipy.stats.binomtest(events, trials).proportion_ci(0.95, method="wilson")
+    assert (interval.low, interval.high) == pytest.approx((reference.low, reference.high), rel=1e-9, abs=1e-12)
+    assert 0 <= interval.low <= interval.value <= interval.high <= 1
 
 
 def test_nothing_lost_of_36_still_allows_ten_per_cent() -> None:
@@ -80,8 +80,8 @@ def test_bursts_make_the_interval_wider_than_wilsons() -> None:
 def test_repeats_that_agree_give_nearly_wilsons_interval() -> None:
     """Only the squared ratio of the t quantile to the normal quantile remains as a difference."""
     lost = np.random.default_rng(1).binomial(1000, 0.1, size=5000)
-    ours, theirs = not_none(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
-    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-3)
+    interval, reference = not_none(share(lost, [1000] * 5000)), wilson(int(lost.sum()), 5_000_000)
+    assert (interval.low, interval.high) == pytest.approx((reference.low, reference.high), rel=1e-3)
 
 
 @pytest.mark.parametrize("n", [2, 3, 20])
@@ -140,8 +140,8 @@ def test_shares_are_means_if_one_is_outside_of_0_to_1() -> None:
 
 def test_without_skewness_a_mean_has_students_interval() -> None:
     interval = not_none(mean([1.0, -1.0] * 10))
-    theirs = scipy.stats.t.interval(0.95, 19, 0, scipy.stats.sem([1.0, -1.0] * 10))
-    assert (interval.low, interval.high) == pytest.approx(theirs, rel=1e-4)
+    reference = scipy.stats.t.interval(0.95, 19, 0, scipy.stats.sem([1.0, -1.0] * 10))
+    assert (interval.low, interval.high) == pytest.approx(reference, rel=1e-4)
 
 
 def test_a_mean_has_the_bootstrap_t_interval() -> None:

@@ -51,7 +51,7 @@ def gaps(closed: Sequence[float], still_open: Sequence[float] = (), missing: int
     return cell
 
 
-def judged(text: str, cell: Cell, declared: Sequence[Column] = GAP) -> Judgement:
+def judge_text(text: str, cell: Cell, declared: Sequence[Column] = GAP) -> Judgement:
     (result,) = judgements.judge([expectations.parse(text, quantities(declared))], [cell])
     return result
 
@@ -80,8 +80,8 @@ def test_an_interval_contains_that_of_the_uncensored_values(drawn: list[tuple[fl
     """The oracle is the interval of the true values, of which the test observes less."""
     true = np.array([[start + more for start, more, _ in drawn]])
     is_open = np.array([[is_open for _, _, is_open in drawn]])
-    seen = np.where(is_open, [[start for start, _, _ in drawn]], true)
-    result = medians(seen, 0, upper=np.where(is_open, np.inf, true))
+    observed = np.where(is_open, [[start for start, _, _ in drawn]], true)
+    result = medians(observed, 0, upper=np.where(is_open, np.inf, true))
     oracle = medians(true, 0)
     assert result.value <= oracle.value
     if len(drawn) >= 6:
@@ -93,17 +93,17 @@ def test_an_interval_contains_that_of_the_uncensored_values(drawn: list[tuple[fl
 
 def test_censored_repeats_do_not_make_an_expectation_hold() -> None:
     """The case of issue 21: in 3 of 10 repeats the link was down when the ping ended."""
-    result = judged("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
+    result = judge_text("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
     assert result.ruling is Ruling.OPEN
     assert result.why == "in 3 of 10 repeats the timed event had not ended, so they give only lower bounds"
-    assert judged("every rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8])).ruling is Ruling.FAILS
-    assert judged("max rtt_gap_s < 2 s", gaps([0.2] * 7, [1.3])).ruling is Ruling.OPEN
-    assert judged("rtt_gap_s < 2 s", gaps([], [5.0] * 4)).ruling is Ruling.FAILS
+    assert judge_text("every rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8])).ruling is Ruling.FAILS
+    assert judge_text("max rtt_gap_s < 2 s", gaps([0.2] * 7, [1.3])).ruling is Ruling.OPEN
+    assert judge_text("rtt_gap_s < 2 s", gaps([], [5.0] * 4)).ruling is Ruling.FAILS
 
 
 def test_missing_repeats_are_counted_in_all_outputs() -> None:
     cell = gaps([0.2] * 8, missing=2)
-    result = judged("rtt_gap_s < 2 s", cell)
+    result = judge_text("rtt_gap_s < 2 s", cell)
     assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
     assert wording.judgement_texts(result)[2] == "200 ms (8 of 10)"
     quantities = [Quantity.of(column) for column in GAP]
@@ -141,7 +141,7 @@ def test_no_expectation_holds_on_missing_or_open_repeats(
 ) -> None:
     if not (closed or still_open or missing):
         return
-    result = judged(text, gaps(closed, still_open, missing))
+    result = judge_text(text, gaps(closed, still_open, missing))
     if still_open or missing:
         assert not result.holds
         assert "of" in result.why
@@ -170,17 +170,17 @@ def test_a_median_rtt_of_the_answers_is_judged_over_all_requests(
     of_sent_s: list[OptionalValue], ruling: Ruling, reason: str
 ) -> None:
     cell = rtt([0.1] * 10, of_sent_s)
-    result = judged("rtt_median_s < 200 ms", cell, RTT)
+    result = judge_text("rtt_median_s < 200 ms", cell, RTT)
     assert (result.ruling, result.why) == (ruling, reason)
     assert result.estimate is not None
     assert (result.estimate.value, result.estimate.high) == (0.1, 0.1), "the figure itself is unchanged"
-    assert judged("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS
-    every = judged("every rtt_median_s < 200 ms", cell, RTT)
+    assert judge_text("rtt_median_s < 50 ms", cell, RTT).ruling is Ruling.FAILS
+    every = judge_text("every rtt_median_s < 200 ms", cell, RTT)
     assert every.holds is (ruling is Ruling.HOLDS)
 
 
 def test_repeats_without_any_answer_are_missing() -> None:
-    result = judged("rtt_median_s < 200 ms", rtt([0.1] * 6 + [None] * 4, [0.1] * 6 + [None] * 4), RTT)
+    result = judge_text("rtt_median_s < 200 ms", rtt([0.1] * 6 + [None] * 4, [0.1] * 6 + [None] * 4), RTT)
     assert (result.ruling, result.why) == (Ruling.OPEN, "4 of 10 repeats have no value")
 
 
@@ -189,7 +189,7 @@ def test_a_table_without_the_median_of_all_requests_gives_no_decision() -> None:
     (cell,) = aggregate(
         Repeats({"rtt_median_s": repeats.numbers["rtt_median_s"]}, repeats.texts, repeats.columns), BY
     )
-    assert judged("rtt_median_s < 200 ms", cell, RTT).ruling is Ruling.OPEN
+    assert judge_text("rtt_median_s < 200 ms", cell, RTT).ruling is Ruling.OPEN
 
 
 def test_steps_with_names_have_separate_optional_columns() -> None:

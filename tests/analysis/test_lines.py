@@ -65,10 +65,10 @@ def test_tables_for_papers_have_payload_size_and_number_of_repeats(form: str) ->
 
 
 def test_a_condition_without_any_reply_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    far = replace(
+    without_reply = replace(
         PINGED, trial="far", distance="60ft", distance_m=18.288, rtt_loss=1.0, rtt_received=0, rtt_median_s=None
     )
-    assert main(["aggregate", str(write(tmp_path, [PINGED, far])), "--quantity", "rtt_median_s"]) == 0
+    assert main(["aggregate", str(write(tmp_path, [PINGED, without_reply])), "--quantity", "rtt_median_s"]) == 0
     figures = capsys.readouterr().out
     assert "RTT, 8192-byte ping (ms)" in figures
     assert [line.split() for line in figures.splitlines() if line.startswith(" 60ft")][-1] == ["60ft", "0", "of", "1"]

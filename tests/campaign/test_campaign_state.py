@@ -14,8 +14,9 @@ from fieldkit.campaign.order import walk_m
 from fieldkit.campaign.plan import CampaignPlan
 from fieldkit.campaign.runner import PLACING_S, CampaignRun
 from fieldkit.config.site import load_site
+from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.core.events import CampaignEnded, CampaignPlanned, Event
+from fieldkit.core.events import Event
 from fieldkit.core.prompts import Unattended
 from fieldkit.trial.running.stop import Stop
 from tests.helpers.paths import ROOT
@@ -119,11 +120,11 @@ def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
         started_plan = journal.folder / f"trial of {third}"
         started_plan.mkdir()
         (started_plan / "trial.yaml").touch()
-    for seen in (journal, CampaignJournal(journal.folder)):
-        assert list(seen.ended()) == [str(first)]
-        assert seen.interrupted(second) is None, "it has no folder"
-        assert seen.interrupted(third) == started_plan
-        assert seen.placing_s(99.0) == 30.0
+    for opened in (journal, CampaignJournal(journal.folder)):
+        assert list(opened.ended()) == [str(first)]
+        assert opened.interrupted(second) is None, "it has no folder"
+        assert opened.interrupted(third) == started_plan
+        assert opened.placing_s(99.0) == 30.0
     assert CampaignJournal(journal.folder / "none").placing_s(99.0) == 99.0
 
 

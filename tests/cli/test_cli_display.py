@@ -13,8 +13,10 @@ import pytest
 
 from fieldkit.cli import main
 from fieldkit.cli.commands import listings
-from fieldkit.cli.display import event_words, table
-from fieldkit.core.events import CampaignPlanned, CampaignWent, RepeatEnded
+from fieldkit.cli.display import table
+from fieldkit.cli.event_words import event_words
+from fieldkit.core.campaign_events import CampaignPlanned, CampaignWent
+from fieldkit.core.events import RepeatEnded
 from fieldkit.core.model import Status
 from tests.helpers.paths import ROOT
 from tests.helpers.stored_trials import TRIALS

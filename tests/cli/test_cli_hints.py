@@ -9,7 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from fieldkit.cli import hints, main, parser
-from fieldkit.cli.display import event_words, show_error, show_findings, showing_events
+from fieldkit.cli.display import show_error, show_findings, showing_events
+from fieldkit.cli.event_words import event_words
 from fieldkit.core.errors import shell_command
 from fieldkit.core.events import Finding, TrialStopped
 from fieldkit.core.model import Verdict
@@ -37,7 +38,7 @@ def messages() -> Iterator[tuple[str, str, bool]]:
 
 
 def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
-    top, seen = parser(), 0
+    top, n_subcommands = parser(), 0
     for path, text, to_type in messages():
         for match in COMMAND.finditer(text):
             inner = top
@@ -45,10 +46,10 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
                 inner = inner.command(word) or inner
                 inner.complete()
             assert inner is not top or not to_type, f"{path}: {text}"
-            seen += inner is not top
+            n_subcommands += inner is not top
             options = [] if inner is top else re.findall(r" (--[a-z-]+)", match["rest"])
             assert all(inner.accepts(option, "x") for option in options), f"{path}: {text}"
-    assert seen > 30
+    assert n_subcommands > 30
 
 
 @pytest.mark.parametrize(

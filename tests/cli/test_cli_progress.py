@@ -4,11 +4,11 @@ import time
 
 import pytest
 
-from fieldkit.cli.display import event_words
+from fieldkit.cli.event_words import event_words
 from fieldkit.cli.progress import ProgressBar
+from fieldkit.core.campaign_events import CampaignTrial
 from fieldkit.core.events import (
     Answered,
-    CampaignTrial,
     Event,
     PhaseStarted,
     Progress,

@@ -49,5 +49,5 @@ def test_suggested_distance_continues_the_series(
 
 
 def test_no_larger_distance_is_suggested_if_no_ping_was_answered(capsys: pytest.CaptureFixture[str]) -> None:
-    dead = replace(PINGED, rtt_received=0, rtt_loss=1.0, rtt_median_s=None)
-    assert commands(capsys, dead, every=True) == ["fieldkit report trials/0"]
+    without_reply = replace(PINGED, rtt_received=0, rtt_loss=1.0, rtt_median_s=None)
+    assert commands(capsys, without_reply, every=True) == ["fieldkit report trials/0"]

@@ -168,8 +168,8 @@ def test_the_help_names_the_installed_backends() -> None:
 
 def test_every_command_has_its_module_and_run_function() -> None:
     top = parser()
-    own = commands.COMMANDS.keys() - commands.FROM_ENTRY_POINTS
-    for name in own:
+    own_commands = commands.COMMANDS.keys() - commands.FROM_ENTRY_POINTS
+    for name in own_commands:
         command = top.command(name)
         assert command is not None
         for leaf in map(command.command, command.subcommands()) if command.subcommands() else (command,):
@@ -178,7 +178,7 @@ def test_every_command_has_its_module_and_run_function() -> None:
             assert isfunction(run), leaf.prog
             module = "listings" if name in commands.LISTINGS else name
             assert run.__module__ == f"fieldkit.cli.commands.{module}"
-    assert modules(commands) == own - set(commands.LISTINGS) | {"listings"}
+    assert modules(commands) == own_commands - set(commands.LISTINGS) | {"listings"}
 
 
 @pytest.mark.parametrize(

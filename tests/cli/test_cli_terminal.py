@@ -72,22 +72,22 @@ class Operator:
 @contextmanager
 def run_at_terminal(*words: str, lab: Path | None = None) -> Iterator[tuple[Operator, "subprocess.Popen[bytes]"]]:
     """Run `ASK`, or python with `words` in the folder `lab`, at a pseudo-terminal."""
-    near, far = pty.openpty()
+    controller, terminal = pty.openpty()
     process = subprocess.Popen(
         (sys.executable, *(words or ("-c", ASK))),
         cwd=lab,
-        stdin=far,
-        stdout=far,
-        stderr=far,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
         start_new_session=True,
     )
-    os.close(far)
+    os.close(terminal)
     try:
-        yield Operator(near), process
+        yield Operator(controller), process
     finally:
         process.kill()
         process.wait(WITHIN_S)
-        os.close(near)
+        os.close(controller)
 
 
 def test_nothing_is_drawn_during_a_question() -> None:

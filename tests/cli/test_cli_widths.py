@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.cells import cell_len
 
-from fieldkit.cli.display import event_words, table
+from fieldkit.cli.display import table
+from fieldkit.cli.event_words import event_words
 from fieldkit.cli.progress import ProgressBar
-from fieldkit.core.events import NOTHING_ARRIVED, CampaignTrial, PhaseStarted, RepeatEnded, TrialStarted
+from fieldkit.core.campaign_events import CampaignTrial
+from fieldkit.core.events import NOTHING_ARRIVED, PhaseStarted, RepeatEnded, TrialStarted
 from fieldkit.core.model import ENDED, Status
 
 WORD = st.text(st.sampled_from("abcXYZ019-_/.%[]漢é"), min_size=1, max_size=40)

@@ -251,8 +251,8 @@ def test_part_of_several_names_suggests_all(name: str, remedy: str) -> None:
 
 def test_folder_of_the_lab_takes_precedence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "robots").mkdir()
-    own = PROFILE.replace("interface: wlan0", "interface: wlan7")
-    (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(own, encoding="utf-8")
+    profile = PROFILE.replace("interface: wlan0", "interface: wlan7")
+    (tmp_path / "robots" / "turtlebot3_burger.yaml").write_text(profile, encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     assert load_profile("turtlebot3_burger").radio.interface == "wlan7"
     assert load_profile("duckiedrone").radio.interface == "wlan0"

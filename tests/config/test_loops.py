@@ -104,7 +104,7 @@ def test_file_without_loops_is_unchanged() -> None:
         ("  - for:", "  - fore:", "unknown key fore", 1, "correct this line"),
         ("  - for:", "  - ping: {}\n    for:", "for: must be the only key of its entry", 1, "- for:"),
         ('name: "p{bytes}", ', "", "a ping is defined twice; give each a name:, inside for:", 4, ""),
-        ('"p{bytes}"', "p", "a ping named p is defined twice; give one another name, inside for:", 4, ""),
+        ('"p{bytes}"', "p", "a ping named p is defined twice; rename one, inside for:", 4, ""),
         ('"{bytes}"}', '"{bytes}", cuont: 3}', "unknown key cuont; did you mean 'count'?", 4, ""),
         ("8192]", "99999]", "Input should be less than or equal to 65507", 4, ""),
     ],

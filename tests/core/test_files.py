@@ -1,4 +1,8 @@
 import os
+import signal
+import subprocess
+import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -21,6 +25,34 @@ def test_write_keeps_the_old_file_and_its_mode_on_error(tmp_path: Path, monkeypa
     assert caught.value.filename == str(path)
     assert path.read_bytes() == b"old"
     assert path.stat().st_mode & 0o7777 == 0o640
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["first ends first", "last ends first"])
+def test_each_of_two_writers_replaces_a_file_by_complete_content(tmp_path: Path, order: tuple[int, int]) -> None:
+    path = tmp_path / "report.html"
+    path.write_bytes(b"old")
+    stacks = [ExitStack() for _ in order]
+    writers = [stack.enter_context(files.replacing(path)) for stack in stacks]
+    for number, writer in enumerate(writers):
+        writer.write(b"%d begins" % number)
+        writer.flush()
+    for number in order:
+        writers[number].write(b" and ends")
+        stacks[number].close()
+        assert path.read_bytes() == b"%d begins and ends" % number
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_temporary_file_of_a_killed_process_is_removed(tmp_path: Path) -> None:
+    path = tmp_path / "report.html"
+    script = "import os, signal, sys; from pathlib import Path; from fieldkit.core import files\n"
+    script += "with files.replacing(Path(sys.argv[1])) as file: file.flush(); os.kill(os.getpid(), signal.SIGKILL)"
+    killed = subprocess.run([sys.executable, "-c", script, str(path)], check=False, timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    files.write(path, b"page")
+    assert not left.exists()
     assert list(tmp_path.iterdir()) == [path]
 
 

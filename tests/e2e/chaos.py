@@ -66,7 +66,7 @@ class InjectedFault:
 
 
 @dataclass(frozen=True)
-class Void:
+class VoidAttempt:
     """A void attempt.
 
     Attributes:
@@ -82,7 +82,7 @@ class Void:
     ended_ns: int
 
 
-def unexplained(voids: Sequence[Void], faults: Sequence[InjectedFault]) -> list[Void]:
+def unexplained(voids: Sequence[VoidAttempt], faults: Sequence[InjectedFault]) -> list[VoidAttempt]:
     """Return the void attempts that no fault during the attempt explains.
 
     Args:
@@ -106,7 +106,7 @@ def unexplained(voids: Sequence[Void], faults: Sequence[InjectedFault]) -> list[
 
 
 @dataclass
-class Tally:
+class FaultTrialResult:
     """Results of a trial with faults.
 
     Attributes:
@@ -122,7 +122,7 @@ class Tally:
     planned: int
     valid: int = 0
     starts: int = 0
-    voids: list[Void] = field(default_factory=list)
+    voids: list[VoidAttempt] = field(default_factory=list)
     faults: list[InjectedFault] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     stops: list[str] = field(default_factory=list)
@@ -159,10 +159,10 @@ class Chaos:
         self._budget = faults
         self._deck: list[str] = []
         self._repeats = repeats
-        self.tally = Tally(planned=repeats * len(Protocol))
+        self.tally = FaultTrialResult(planned=repeats * len(Protocol))
         self._process: subprocess.Popen[str] | None = None
 
-    def run(self) -> Tally:
+    def run(self) -> FaultTrialResult:
         lab = self._field_robots.folder
         name = write_procedure(lab, PROCEDURE)
         words: tuple[str, ...] = ("trial", name, "5m", "--repeats", str(self._repeats), "--yes", "--json")
@@ -207,7 +207,7 @@ class Chaos:
                 if deadline.expired or self._unexplained():
                     process.kill()
 
-    def _unexplained(self) -> list[Void]:
+    def _unexplained(self) -> list[VoidAttempt]:
         """Return the void attempts so far that no fault explains."""
         return (
             unexplained(_voids(only_trial(self._field_robots.folder)), self.tally.faults)
@@ -275,12 +275,12 @@ class Chaos:
                 tally.problems.append(f"left on {role}: {remaining}")
 
 
-def _voids(trial: Path) -> list[Void]:
+def _voids(trial: Path) -> list[VoidAttempt]:
     """Return the void attempts of a trial."""
     entries = journal.read(trial)
     ended_ns_by_attempt = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries}
     return [
-        Void(
+        VoidAttempt(
             attempt.folder,
             attempt.reason,
             attempt.started_utc_ns,
@@ -291,7 +291,7 @@ def _voids(trial: Path) -> list[Void]:
     ]
 
 
-def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = True) -> Tally:
+def chaos(folder: Path, *, seed: int, repeats: int, faults: int, debian: bool = True) -> FaultTrialResult:
     """Run one trial of `repeats` per protocol with `faults` faults, in the empty folder `folder`.
 
     The robots have Debian's ROS, or the built-in one.

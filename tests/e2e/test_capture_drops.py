@@ -62,10 +62,10 @@ def with_drops(attempt: tuple[Plan, Path, journal.Attempt], capture: str) -> tup
         re.sub(r"(?m)^0 packets dropped by kernel", "12 packets dropped by kernel", text), encoding="utf-8"
     )
     try:
-        judged = gates.judge(plan, entry.repeat, AttemptEvidence(folder))
+        verdict = gates.judge(plan, entry.repeat, AttemptEvidence(folder))
     finally:
         log.write_text(text, encoding="utf-8")
-    return judged.problems, judged.measured
+    return verdict.problems, verdict.measured
 
 
 def delayed(measured: Measured) -> Iterator[str]:
@@ -86,10 +86,10 @@ def test_a_topic_keeps_the_values_from_its_logs(attempt: tuple[Plan, Path, journ
 
 def test_without_drops_nothing_is_withheld(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
     plan, folder, entry = attempt
-    judged = gates.judge(plan, entry.repeat, AttemptEvidence(folder))
-    assert judged.problems == ()
-    assert "topic_packet_loss" in judged.measured.values
-    assert "topic_capture_withheld" not in judged.measured.values
+    verdict = gates.judge(plan, entry.repeat, AttemptEvidence(folder))
+    assert verdict.problems == ()
+    assert "topic_packet_loss" in verdict.measured.values
+    assert "topic_capture_withheld" not in verdict.measured.values
 
 
 def test_a_transfer_needs_its_whole_capture(attempt: tuple[Plan, Path, journal.Attempt]) -> None:

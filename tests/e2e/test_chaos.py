@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.e2e.chaos import RECOVERY_NS, VOIDS_PER_FAULT, InjectedFault, Void, unexplained
+from tests.e2e.chaos import RECOVERY_NS, VOIDS_PER_FAULT, InjectedFault, VoidAttempt, unexplained
 from tests.helpers.paths import ROOT
 
 IN_CI = 3
@@ -66,8 +66,8 @@ def outputs(*seeds: int) -> list[str]:
     return [text.strip() for text in printed]
 
 
-def void(began_ns: int, ended_ns: int) -> Void:
-    return Void("tcp-01.void1", "why", began_ns, ended_ns)
+def void(began_ns: int, ended_ns: int) -> VoidAttempt:
+    return VoidAttempt("tcp-01.void1", "why", began_ns, ended_ns)
 
 
 FAULTS_AT = (InjectedFault("link cut", 100, 200), InjectedFault("fieldkit killed", RECOVERY_NS * 3, RECOVERY_NS * 3))
@@ -76,13 +76,13 @@ FAULTS_AT = (InjectedFault("link cut", 100, 200), InjectedFault("fieldkit killed
 @pytest.mark.parametrize(
     "during", [void(0, 100), void(150, 160), void(200 + RECOVERY_NS, RECOVERY_NS * 2), void(0, RECOVERY_NS * 9)]
 )
-def test_a_fault_during_an_attempt_explains_its_void_result(during: Void) -> None:
+def test_a_fault_during_an_attempt_explains_its_void_result(during: VoidAttempt) -> None:
     assert unexplained([during], FAULTS_AT) == []
 
 
-@pytest.mark.parametrize("beside", [void(0, 99), void(201 + RECOVERY_NS, RECOVERY_NS * 2)])
-def test_a_void_attempt_without_a_fault_is_unexplained(beside: Void) -> None:
-    assert unexplained([beside], FAULTS_AT) == [beside]
+@pytest.mark.parametrize("attempt", [void(0, 99), void(201 + RECOVERY_NS, RECOVERY_NS * 2)])
+def test_a_void_attempt_without_a_fault_is_unexplained(attempt: VoidAttempt) -> None:
+    assert unexplained([attempt], FAULTS_AT) == [attempt]
 
 
 def test_a_fault_does_not_explain_all_later_attempts() -> None:

@@ -163,7 +163,7 @@ def test_a_full_home_directory_fails(field_robots: FieldRobots, lab: Path) -> No
     finally:
         shell.run(("sh", "-c", resize, "sh", f"{before}k"), deadline=Deadline.after(30))
     assert run.code == 3
-    assert ("turtlebot-1", "disk") in failed(run), "ROS's own recorder sees it too"
+    assert ("turtlebot-1", "disk") in failed(run), "the check for the recorder of ROS fails too"
     assert {robot for robot, _ in failed(run)} == {"turtlebot-1"}
 
 

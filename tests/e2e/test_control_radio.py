@@ -49,7 +49,7 @@ def test_no_robot_may_have_the_laptops_name(tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module", params=Topology)
-def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
+def emulation(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     cast = EmulatedBackend(None, None).cast(request.param)
     radio, ros = RadioOptions(fading=False), RosChoice.BUILTIN
     with testbed.bring_up(
@@ -60,34 +60,36 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
 
 
 @pytest.mark.emulated
-def test_ssh_crosses_the_medium_like_the_packets_of_any_station(up: EmulatedTestbed) -> None:
-    done = up.shells[Role.SENDER].run(("head", "-c", str(FETCHED_BYTES), "/dev/zero"), deadline=Deadline.after(30))
+def test_ssh_crosses_the_medium_like_the_packets_of_any_station(emulation: EmulatedTestbed) -> None:
+    done = emulation.shells[Role.SENDER].run(
+        ("head", "-c", str(FETCHED_BYTES), "/dev/zero"), deadline=Deadline.after(30)
+    )
     assert len(done.stdout) == FETCHED_BYTES
-    master = Role.RELAY in up.robots
+    master = Role.RELAY in emulation.robots
     last_hop = "duckiedrone-1" if master else "turtlebot-1"
 
-    seen: list[MediumStats] = []
+    samples: list[MediumStats] = []
 
     def at_rest() -> bool:  # no packet is in flight on a hop or to the laptop
-        seen.append(stats := up.medium.stats())
+        samples.append(stats := emulation.medium.stats())
         hop = stats.links[last_hop, "laptop"]
         return hop.sent == hop.delivered == stats.ports["laptop"].written
 
     wait_until(at_rest, Deadline.after(30))
-    stats = seen[-1]  # a later one may be taken while a packet is in flight
+    stats = samples[-1]  # a later one may be taken while a packet is in flight
     assert stats.ports["laptop"].written > FETCHED_BYTES / 1500
     assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].written)
-    assert stats.links["turtlebot-1", up.robots[Role.RECEIVER].name].sent == 0
+    assert stats.links["turtlebot-1", emulation.robots[Role.RECEIVER].name].sent == 0
 
 
 @pytest.mark.emulated
-def test_a_robot_out_of_range_is_unreachable_until_it_returns(up: EmulatedTestbed) -> None:
-    topology = Topology.MASTER if Role.RELAY in up.robots else Topology.MASTERLESS
-    up.place(at("1km", topology))
+def test_a_robot_out_of_range_is_unreachable_until_it_returns(emulation: EmulatedTestbed) -> None:
+    topology = Topology.MASTER if Role.RELAY in emulation.robots else Topology.MASTERLESS
+    emulation.place(at("1km", topology))
     with pytest.raises(LinkError):
-        up.shells[Role.SENDER].run(("true",), deadline=Deadline.after(0.5))
-    up.place(at("10m", topology))
-    assert up.shells[Role.SENDER].run(("echo", "back"), deadline=Deadline.after(30)).stdout == b"back\n"
+        emulation.shells[Role.SENDER].run(("true",), deadline=Deadline.after(0.5))
+    emulation.place(at("10m", topology))
+    assert emulation.shells[Role.SENDER].run(("echo", "back"), deadline=Deadline.after(30)).stdout == b"back\n"
 
 
 @pytest.mark.emulated

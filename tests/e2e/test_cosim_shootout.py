@@ -124,7 +124,7 @@ def test_followers_are_reported_with_their_distance_from_the_reference_path(lab:
     )
     assert exact != delayed
     figure = (lab / "c.svg").read_text(encoding="utf-8")
-    assert "Off the reference's path, 70 ms" in figure.replace("&#x27;", "'")
+    assert "Distance from the reference's path, 70 ms" in figure.replace("&#x27;", "'")
 
 
 def test_a_run_reports_the_same_followers_as_its_recording(lab: Path) -> None:

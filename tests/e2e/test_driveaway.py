@@ -96,8 +96,10 @@ def test_the_link_slows_down_and_ends_at_the_distance_of_the_model(lab: Path) ->
     received_m = [metres for metres, _, received in sent if received]
     assert end_m - 10 < max(received_m) <= end_m
     nearest_m = min(metres for metres, _, _ in sent)  # the robot already drives while the programs start
-    near, far = ([RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10))
-    assert sum(near) / len(near) > 1.2 * sum(far) / len(far)
+    near_bit_s, far_bit_s = (
+        [RATES[m] for metres, m, _ in sent if 0 <= metres - low <= 10] for low in (nearest_m, end_m - 10)
+    )
+    assert sum(near_bit_s) / len(near_bit_s) > 1.2 * sum(far_bit_s) / len(far_bit_s)
 
     assert 40 <= float(row["transfer_distance_start_m"]) <= float(row["transfer_distance_max_m"]) < 100
     assert float(row["transfer_relative_speed_m_s"]) == SPEED_M_S

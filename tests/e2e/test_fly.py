@@ -111,7 +111,7 @@ while not drone.messages.get("PARAM_VALUE") or drone.messages["PARAM_VALUE"].par
     drone.mav.param_set_send(0, 1, b"{name}", {value}, 9)
     drone.recv_match(type="PARAM_VALUE", blocking=True, timeout=0.5)
 """
-STANDS = """\
+STATIONARY_DRONE = """\
 from pymavlink import mavutil
 drone, beat = mavutil.mavlink_connection("udpout:127.0.0.1:14550", source_system=251), None
 while beat is None or beat.base_mode & 128:
@@ -220,7 +220,7 @@ def set_parameter(field_robots: FieldRobots, role: Role, name: str, value: float
 
 def flying(field_robots: FieldRobots, role: Role, *, abort: str, lease: str) -> "subprocess.Popen[str]":
     """Wait for stopped motors after a landing; start a trial, and return when its drone is in the air."""
-    field_robots.testbed.shells[role].run((sys.executable, "-c", STANDS), deadline=Deadline.after(60))
+    field_robots.testbed.shells[role].run((sys.executable, "-c", STATIONARY_DRONE), deadline=Deadline.after(60))
     (field_robots.folder / "procedures").mkdir(exist_ok=True)
     text = GIVEN_UP
     for word, value in (("ROLE", role), ("HOW", abort), ("LEASE", lease)):

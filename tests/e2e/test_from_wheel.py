@@ -76,7 +76,7 @@ def test_the_example_passes(python: Path, example: Path) -> None:
         (python, "-c", "import fieldkit; print(fieldkit.__file__)"), cwd=example, capture_output=True, check=True
     )
     assert Path(where.stdout.decode().strip()).is_relative_to(python.parents[1])
-    done = suites.run(example, python=str(python), beside=())
+    done = suites.run(example, python=str(python), import_folders=())
     assert (done.code, set(done.results.values()), len(done.results)) == (0, {"passed"}, 3), done.output
     assert not (example / "fieldkit-results").exists()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.labs import BOX, write_procedure
 from tests.helpers.runs import finish, only_trial, rows, start
 from tests.helpers.texts import procedure, site
@@ -42,7 +42,7 @@ def wait_for_all(process: "subprocess.Popen[str]", names: list[str]) -> None:
     raise AssertionError(f"never began: {left}")
 
 
-def test_ctrl_c_ends_all_simultaneous_steps(tmp_path: Path, untouched: Untouched) -> None:
+def test_ctrl_c_ends_all_simultaneous_steps(tmp_path: Path, untouched: NamespaceComparison) -> None:
     (tmp_path / "robots").mkdir()
     (tmp_path / "robots" / "box.yaml").write_text(BOX, encoding="utf-8")
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")

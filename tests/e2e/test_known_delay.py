@@ -25,8 +25,8 @@ def test_rtt_is_twice_the_delay_of_the_link(delayed: dict[str, list[dict[str, st
     """A busy machine increases the median but, with 50 pings, hardly the minimum."""
     table = delayed[str(delay_ms)]
     assert [row["rtt_payload_bytes"] for row in table] == ["502", "8192"]
-    for row, own in zip(table, delayed["0"], strict=True):
-        least_ms, baseline_ms = (1e3 * float(pings["rtt_min_s"]) for pings in (row, own))
+    for row, expected in zip(table, delayed["0"], strict=True):
+        least_ms, baseline_ms = (1e3 * float(pings["rtt_min_s"]) for pings in (row, expected))
         assert least_ms - baseline_ms == pytest.approx(2 * delay_ms, abs=0.5)
         assert 2 * delay_ms <= least_ms <= 1e3 * float(row["rtt_median_s"]) <= 2 * delay_ms + 5
 

@@ -95,9 +95,9 @@ def test_the_air_delay_is_that_of_packets_that_arrived(
 ) -> None:
     table = lossy_udp[str(percent)]
     # Occasionally a retransmitted packet of ROS comes between them.
-    others = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
-    assert min(others) >= 0
-    assert others.count(0) > len(table) // 2
+    missing = [int(row["delay_packets"]) - int(row["ip_packets_received"]) for row in table]
+    assert min(missing) >= 0
+    assert missing.count(0) > len(table) // 2
 
 
 def test_the_parts_of_the_delay_are_those_of_a_link_of_50_mbit_s(lossy_udp: dict[str, list[dict[str, str]]]) -> None:

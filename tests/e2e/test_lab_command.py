@@ -23,7 +23,7 @@ from fieldkit.lab import folder, requests
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.ros.interfaces.types import shipped
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import fieldkit, run_here, start
 
@@ -46,8 +46,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The folder of a running lab, with a name that needs quoting."""
     lab_folder = tmp_path_factory.mktemp("a 100% lab")
     (lab_folder / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    up = fieldkit(lab_folder, "lab", "up")
-    assert up.code == 0, up.err
+    started = fieldkit(lab_folder, "lab", "up")
+    assert started.code == 0, started.err
     (lab_folder / "ssh.conf").write_text(run_here(lab_folder, "lab", "ssh-config").out, encoding="utf-8")
     try:
         yield lab_folder
@@ -228,22 +228,22 @@ def test_a_command_in_a_shell_keeps_its_exit_code(lab: Path) -> None:
 
 
 def test_a_shell_has_a_terminal(lab: Path) -> None:
-    ours, theirs = pty.openpty()
+    controller, terminal = pty.openpty()
     shell = subprocess.Popen(
         (sys.executable, "-m", "fieldkit", "lab", "shell", "ground-1"),
         cwd=lab,
-        stdin=theirs,
-        stdout=theirs,
-        stderr=theirs,
+        stdin=terminal,
+        stdout=terminal,
+        stderr=terminal,
         start_new_session=True,
     )
-    os.close(theirs)
-    os.write(ours, b"tty; hostname; exit\n")
+    os.close(terminal)
+    os.write(controller, b"tty; hostname; exit\n")
     output = b""
     with contextlib.suppress(OSError):  # EIO: the other end is closed
-        while data := os.read(ours, 4096):
+        while data := os.read(controller, 4096):
             output += data
-    os.close(ours)
+    os.close(controller)
     assert shell.wait(WITHIN_S) == 0
     assert b"/dev/pts/" in output
     assert b"\nground-1" in output
@@ -279,15 +279,15 @@ def test_an_invalid_request_gets_no_response(lab: Path, request_: str) -> None:
 
 
 def test_a_silent_client_does_not_block_others_for_long(lab: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as silent:
-        silent.connect(str(folder.of_directory(lab).socket))
+    with socket.socket(socket.AF_UNIX) as unanswered:
+        unanswered.connect(str(folder.of_directory(lab).socket))
         assert "air-1" in run_here(lab, "lab", "ps").out
 
 
-def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
+def test_down_leaves_nothing(tmp_path: Path, untouched: NamespaceComparison) -> None:
     (tmp_path / "fieldkit.yaml").write_text("emulated: {ros: builtin}\nrobots: {}\nroles: {}\n", encoding="utf-8")
-    up = fieldkit(tmp_path, "lab", "up", "--robots", "2", "--profile", "duckiedrone")
-    assert up.code == 0, up.err
+    started = fieldkit(tmp_path, "lab", "up", "--robots", "2", "--profile", "duckiedrone")
+    assert started.code == 0, started.err
     process = process_of(tmp_path)
     lived = {process} | descendants(process)
     assert len(lived) > 2 * 3
@@ -300,7 +300,9 @@ def test_down_leaves_nothing(tmp_path: Path, untouched: Untouched) -> None:
     assert not folder.of_directory(tmp_path).path.exists()
 
 
-def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     process = process_of(tmp_path)
@@ -316,22 +318,22 @@ def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(tmp_path: Pat
 
 def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE, encoding="utf-8")
-    up = start(tmp_path, "lab", "up", "--foreground")
-    assert up.stdout is not None
-    assert up.stdout.readline() == "2 robots up, until Ctrl-C\n"
-    lived = descendants(up.pid)
-    up.send_signal(2)
-    assert up.wait(WITHIN_S) == 0
+    started = start(tmp_path, "lab", "up", "--foreground")
+    assert started.stdout is not None
+    assert started.stdout.readline() == "2 robots up, until Ctrl-C\n"
+    lived = descendants(started.pid)
+    started.send_signal(2)
+    assert started.wait(WITHIN_S) == 0
     wait_for_end(lived, within_s=0.0)
 
 
 @pytest.mark.parametrize("robots", mark_nightly([("--robots", "1"), ()]))
 def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str, ...]) -> None:
     (tmp_path / "fieldkit.yaml").write_text(f"control: radio\n{SITE}", encoding="utf-8")
-    up = fieldkit(tmp_path, "lab", "up", *robots)
-    assert up.code == 0, up.err
+    started = fieldkit(tmp_path, "lab", "up", *robots)
+    assert started.code == 0, started.err
     try:
-        assert "note: control: radio applies to trials; in a lab SSH bypasses the radio" in up.err
+        assert "note: control: radio applies to trials; in a lab SSH bypasses the radio" in started.err
         name = requests.state(folder.of_directory(tmp_path)).robots[0].name
         assert run_here(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
         assert fieldkit(tmp_path, "lab", "shell", name, "hostname").out == f"{name}\n"
@@ -341,7 +343,7 @@ def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str,
 
 def test_a_lab_that_cannot_start_reports_the_reason_in_the_terminal(tmp_path: Path) -> None:
     (tmp_path / "fieldkit.yaml").write_text(SITE.replace("duckiedrone", "nodrone"), encoding="utf-8")
-    up = fieldkit(tmp_path, "lab", "up")
-    assert up.code == 2
-    assert "there is no robot profile 'nodrone'" in up.err
+    started = fieldkit(tmp_path, "lab", "up")
+    assert started.code == 2
+    assert "there is no robot profile 'nodrone'" in started.err
     assert run_here(tmp_path, "lab", "down").code == 2

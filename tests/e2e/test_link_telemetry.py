@@ -41,7 +41,10 @@ def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Pat
             air = [line for line in csv.DictReader(file) if line["attempt"] != "0"]
         assert air
         for role, other in (("sender", "receiver"), ("receiver", "sender")):
-            kernel, mine = kernel_packets(folder, role), [line for line in air if line["transmitter"] == row[role]]
+            kernel, from_robot = (
+                kernel_packets(folder, role),
+                [line for line in air if line["transmitter"] == row[role]],
+            )
             driver_counts = {
                 name: int(row[f"{role}_{name}"]) for name in ("radio_tx_packets", "radio_rx_packets", "tx_retries")
             }
@@ -49,8 +52,8 @@ def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Pat
             assert driver_counts["radio_tx_packets"] + driver_counts["radio_rx_packets"] == int(
                 row[f"{role}_captured"]
             )
-            assert driver_counts["radio_tx_packets"] == sum(line["attempt"] == "1" for line in mine)
-            assert driver_counts["tx_retries"] == sum(line["attempt"] != "1" for line in mine)
+            assert driver_counts["radio_tx_packets"] == sum(line["attempt"] == "1" for line in from_robot)
+            assert driver_counts["tx_retries"] == sum(line["attempt"] != "1" for line in from_robot)
             assert driver_counts["radio_tx_packets"] - int(row[f"{other}_radio_rx_packets"]) >= 0
             assert float(row[f"{role}_signal_min_dbm"]) <= float(row[f"{role}_signal_median_dbm"]) < -40
             assert float(row[f"{role}_tx_rate_bit_s"]) == 65e6

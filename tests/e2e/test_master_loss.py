@@ -8,7 +8,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from sim_backends.emulated.backend import DEFAULT_SITE
-from tests.helpers.host import Untouched
+from tests.helpers.host import NamespaceComparison
 from tests.helpers.labs import copy_shipped
 from tests.helpers.runs import Run, only_trial, rows, run_here
 
@@ -49,7 +49,9 @@ def messages_in(bag: Path) -> tuple[set[str], list[int]]:
     return callers, [at_ns for at_ns, _ in read]
 
 
-def test_a_complete_repeat_of_los_with_the_master_and_recorder_of_ros(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_complete_repeat_of_los_with_the_master_and_recorder_of_ros(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
     words = ("trial", "los", "5m", "--repeats", "1", "--record", "2s", "--protocol", "tcp")
     run = run_here(lab_with_one_master(tmp_path), *words)
     assert run.code == 0, run.err + run.out

@@ -10,7 +10,7 @@ import pytest
 
 from tests.e2e.test_bad_inputs import Row, check, table
 from tests.helpers import ordinary_user
-from tests.helpers.host import Untouched, descendants, owners, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, owners, wait_for_end
 from tests.helpers.runs import Run, finish, wait_for_line
 
 pytestmark = pytest.mark.emulated
@@ -95,7 +95,7 @@ def run(*words: str, change: str = "") -> Run:
     return finish(start(*words, change=change))
 
 
-def test_a_complete_trial_of_an_ordinary_user(untouched: Untouched) -> None:
+def test_a_complete_trial_of_an_ordinary_user(untouched: NamespaceComparison) -> None:
     done = run("sh", "-e", "-c", WHOLE, "sh", *FIELDKIT)
     assert done.code == 0, done.err
     output, _, content = done.out.partition(BEFORE_THE_TABLE)
@@ -109,7 +109,7 @@ def test_a_complete_trial_of_an_ordinary_user(untouched: Untouched) -> None:
     untouched()
 
 
-def test_a_lab_of_an_ordinary_user(untouched: Untouched) -> None:
+def test_a_lab_of_an_ordinary_user(untouched: NamespaceComparison) -> None:
     done = run("sh", "-e", "-c", LAB, "sh", *FIELDKIT)
     assert done.code == 0, done.out + done.err
     assert "2 robots up" in done.out
@@ -118,7 +118,7 @@ def test_a_lab_of_an_ordinary_user(untouched: Untouched) -> None:
     untouched()
 
 
-def test_kill_9_of_an_ordinary_users_trial_leaves_nothing(untouched: Untouched) -> None:
+def test_kill_9_of_an_ordinary_users_trial_leaves_nothing(untouched: NamespaceComparison) -> None:
     process = start(*FIELDKIT, *TRIAL, "--json")
     wait_for_line(process, '"transfer"')
     family = descendants(process.pid)

@@ -41,9 +41,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Testbed, Sce
         procedure=load_procedure("los"), distance=parse_distance("5m"), topology=Topology.MASTERLESS
     )
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
-    with backend.open(cast, seed=1, sink=lambda event: None, operator=Unattended()) as up:
-        up.place(plan.placement)
-        yield up, plan.scene(RepeatId(Protocol.UDP, 1), "")
+    with backend.open(cast, seed=1, sink=lambda event: None, operator=Unattended()) as emulation:
+        emulation.place(plan.placement)
+        yield emulation, plan.scene(RepeatId(Protocol.UDP, 1), "")
 
 
 def watch(folder: str, interface: str, expression: str) -> Job:
@@ -62,7 +62,7 @@ def watch(folder: str, interface: str, expression: str) -> Job:
 def test_the_control_connection_is_silent_during_measurements(
     lab: tuple[Testbed, Scene], protocol: Protocol, tmp_path: Path
 ) -> None:
-    up, scene = lab
+    emulation, scene = lab
     folder = FOLDER.format(protocol)
     scene = replace(scene, protocol=protocol, folder=folder)
     watches = [
@@ -70,26 +70,26 @@ def test_the_control_connection_is_silent_during_measurements(
         watch(folder, "wlan0", "port 1234 or icmp or ip[6:2] & 0x1fff != 0"),
     ]
     for role in ENDS:
-        jobs.install(up.shells[role], Deadline.after(30))
-        evidence.begin(up.shells[role], folder, role, "wlan0")
+        jobs.install(emulation.shells[role], Deadline.after(30))
+        evidence.begin(emulation.shells[role], folder, role, "wlan0")
         for watch_job in watches:
-            jobs.start(up.shells[role], watch_job)
+            jobs.start(emulation.shells[role], watch_job)
         for _ in range(5):  # its packets show that the capture of the control connection works
-            up.shells[role].run(("true",), deadline=Deadline.after(30))
-    up.shells[Role.SENDER].run(
+            emulation.shells[role].run(("true",), deadline=Deadline.after(30))
+    emulation.shells[Role.SENDER].run(
         ("sh", "-c", f"head -c 200000 /dev/zero >{folder}/scan.bag"), deadline=Deadline.after(30)
     )
 
     procedure = load_procedure("los")
     for step in (*steps_of(procedure, TransferStep), *steps_of(procedure, PingStep)):
-        step.run(scene, up, lambda name, expected_s: None)
+        step.run(scene, emulation, lambda name, expected_s: None)
 
     for role in ENDS:
         for watch_job in watches:
-            jobs.stop(up.shells[role], watch_job, settle=f"{watch_job.name.removeprefix('watch-')}.pcap")
+            jobs.stop(emulation.shells[role], watch_job, settle=f"{watch_job.name.removeprefix('watch-')}.pcap")
         into = tmp_path / role
         into.mkdir()
-        fetching.fetch(up.shells[role], folder, role, "wlan0", into)
+        fetching.fetch(emulation.shells[role], folder, role, "wlan0", into)
         control, radio = (pcap.read(into / name).packets for name in ("lo.pcap", "wlan0.pcap"))
         spoken_ns = control.time_ns[control.tcp_payload_bytes > 0]
         assert len(spoken_ns) > 10, "the capture of the control connection works"

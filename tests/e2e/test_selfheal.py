@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.config import locations
 from fieldkit.core.deadline import Deadline
-from tests.helpers.host import Untouched
+from tests.helpers.host import NamespaceComparison
 from tests.helpers.labs import built_in_ros, write_procedure
 from tests.helpers.runs import Run, only_trial, rows, run_here
 from tests.helpers.texts import procedure
@@ -104,7 +104,9 @@ def run_procedure(lab: Path, text: str) -> Run:
     return run_here(lab, "trial", write_procedure(lab, text), "5m")
 
 
-def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
     run = run_here(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "ping recovery after link-down, median" in run.out
@@ -117,7 +119,7 @@ def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(tmp_path: Pat
     assert 2.0 <= float(row["reboot_outage_s"]) < LONG_S, "the boot time, and what its network takes"
     assert row["reboot_recovery_s"] == row["reboot_outage_s"]
     assert row["kill_recovered"] == row["kill_outage_s"] == "", "there was none"
-    assert 0.2 < float(row["rtt_loss"]) < 0.8, "the steps inside met the fault: 2 s of 6 s"
+    assert 0.2 < float(row["rtt_loss"]) < 0.8, "the fault lasts 2 s of the 6 s of pings"
     assert summary(trial)["reboot_recovered"]["value"] == "1"
     evidence = {path.name for path in (trial / "repeats" / "tcp-01").iterdir()}
     assert evidence >= {f"fault-{kind}{end}" for kind in ("link-down", "reboot") for end in (".txt", "-ping.txt")}
@@ -139,12 +141,12 @@ def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_resu
     cells = summary(only_trial(tmp_path))
     assert cells["kill_recovered"]["value"] == "0"
     recovery = cells["kill_recovery_s"]
-    assert recovery["is_lower_bound"] == "true", "only how long it was watched is known"
+    assert recovery["is_lower_bound"] == "true", "the robot did not recover while it was watched"
     assert (recovery["n"], recovery["n_censored"]) == ("1", "1")
     watched = (only_trial(tmp_path) / "repeats" / "tcp-01" / "fault-kill-watch.txt").read_text(encoding="ascii")
-    looks = [line.split() for line in watched.splitlines()[1:]]
-    last_up_s = max(float(look[0]) for look in looks if len(look) > 1)
-    assert float(recovery["value"]) == pytest.approx(float(looks[-1][0]) - last_up_s, abs=1e-6)
+    polls = [line.split() for line in watched.splitlines()[1:]]
+    last_up_s = max(float(poll[0]) for poll in polls if len(poll) > 1)
+    assert float(recovery["value"]) == pytest.approx(float(polls[-1][0]) - last_up_s, abs=1e-6)
     assert recovery["low"] == recovery["high"] == ""
     assert cells["reboot_recovery_s"]["is_lower_bound"] == "false"
 
@@ -155,7 +157,7 @@ def test_flows_stall_for_the_time_out_of_range_and_tcp_longer(tmp_path: Path) ->
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
     assert row["status"] == "valid", row["reason"]
-    assert run.code == 1, "no stall above 300 ms was demanded"
+    assert run.code == 1, "the procedure demands stalls of at most 300 ms"
     assert row["out_of_range_recovered"] == "true"
     assert float(row["out_of_range_outage_s"]) >= CUT_S - 0.2
     noted = (trial / "repeats" / "tcp-01" / "fault-out-of-range-times.txt").read_text(encoding="ascii")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import finish, only_trial, rows, run_here, start, wait_for_line
 
@@ -37,7 +37,7 @@ def process_of(family: set[int], module: str) -> int:
 
 @pytest.mark.parametrize("victim", ["emulated.medium.process", "emulated.robot.init"])
 def test_a_part_that_dies_stops_the_trial_and_resume_completes_it(
-    tmp_path: Path, untouched: Untouched, victim: str
+    tmp_path: Path, untouched: NamespaceComparison, victim: str
 ) -> None:
     built_in_ros(tmp_path)
     process = start(tmp_path, *TRIAL)

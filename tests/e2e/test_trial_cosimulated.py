@@ -1,20 +1,22 @@
-"""Trials and labs on the co-simulation: their numbers, real `cmd_vel` at a wall, and nothing that remains."""
+"""Campaigns, trials and labs on the co-simulation: their numbers, and real ROS at a wall; nothing remains."""
 
 import json
 import os
+import re
 import signal
+from base64 import b64decode
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from fieldkit.core.deadline import Deadline
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.simulator_choice import resolve
-from sim_backends.gazebo.sdf import SdfRobot, world_sdf
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
-from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import gazebo_server, missing_libraries
-from tests.helpers.host import Untouched, descendants
+from tests.helpers.host import NamespaceComparison, descendants
 from tests.helpers.runs import fieldkit, only_trial, rows, run_here
 from tests.helpers.sshd import wait_until
 
@@ -29,6 +31,16 @@ robots:
 roles:
   masterless: {sender: robot-1, receiver: robot-2}
 emulated: EMULATED
+"""
+CAMPAIGN = """\
+name: short
+procedures: [los]
+distances: [30ft]
+topologies: [masterless]
+protocols: [udp]
+repeats: 1
+record: 1s
+seed: 7
 """
 TWIST = "'{linear: {x: 0.2}}'"
 DRIVE = f"timeout 60 rostopic pub -r 10 /cmd_vel geometry_msgs/Twist {TWIST}"
@@ -49,15 +61,20 @@ def trial_row(folder: Path, emulated: str) -> dict[str, str]:
     return row
 
 
-def test_a_trial_on_the_built_in_network(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_campaign_on_the_built_in_network(tmp_path: Path, untouched: NamespaceComparison) -> None:
     sync = "{name: sliding_window, window: 4ms}"
-    row = trial_row(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
+    make_site(tmp_path, f"{{physics: kinematic, ros: builtin, sync: {sync}}}")
+    (tmp_path / "short.yaml").write_text(CAMPAIGN, encoding="utf-8")
+    run = run_here(tmp_path, "campaign", "short.yaml")
+    assert run.code == 0, run.err
+    (trial,) = (path.parent for path in (tmp_path / "trials").rglob("trial.yaml"))
+    (row,) = [row for row in rows(trial) if row["status"] == "valid"]
     assert 0.0005 < float(row["delay_policy_s"]) < 0.0045, "half a window on average"
     assert float(row["delay_transmission_s"]) > 0
     assert float(row["cosim_late_max_s"]) < 0.1
     simulators = "physics kinematic, network builtin, sync sliding_window, window 0.004 s, step 0.001 s"
     assert row["backend"] == f"emulated ({simulators})"
-    plan = (only_trial(tmp_path) / "trial.yaml").read_text(encoding="utf-8")
+    plan = (trial / "trial.yaml").read_text(encoding="utf-8")
     assert "simulators:\n  physics: kinematic\n  network: builtin\n  sync: sliding_window, window 0.004 s\n" in plan
 
 
@@ -76,29 +93,44 @@ def test_a_trial_on_ns3(tmp_path: Path) -> None:
 
 def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
     """The wall of the lawn begins at 3.9 m east, and the robot has a radius of 0.113 m."""
-    make_site(tmp_path, "{physics: kinematic, ros: debian}")
+    make_site(tmp_path, "{physics: kinematic, ros: debian, late_bound: 1us}")
     assert fieldkit(tmp_path, "lab", "up").code == 0
     try:
-        assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "3.5m", "18m").code == 0
-        result = fieldkit(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
+        assert run_here(tmp_path, "lab", "move", "robot-1", "--to", "3.5m", "18m").code == 0
+        result = run_here(tmp_path, "lab", "move", "robot-2", "--to", "4m", "18m")
         assert "robot-2 would be within wall" in result.err
         assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
 
         def east_m() -> float:
-            listed = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)
+            listed = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
             return float(listed["robots"][0]["place_m"][0])
 
         wait_until(lambda: east_m() > 3.78, Deadline.after(90))
         assert east_m() == pytest.approx(3.787, abs=0.002)
-        lab_pid = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)["pid"]
+        record = "timeout -s INT 60 rosbag record -q -l 5 -O wall.bag /odom /scan >/dev/null 2>&1; base64 wall.bag"
+        (tmp_path / "wall.bag").write_bytes(b64decode(fieldkit(tmp_path, "lab", "shell", "robot-1", record).out))
+        with AnyReader([tmp_path / "wall.bag"]) as bag:
+            last: dict[str, Any] = {
+                each.topic: bag.deserialize(data, each.msgtype) for each, _, data in bag.messages()
+            }
+        assert last["/odom"].pose.pose.position.x == pytest.approx(0.287, abs=0.003), "it began at 3.5 m"
+        assert last["/odom"].twist.twist.linear.x == 0.0
+        beams_rad = np.radians(np.arange(50, 70))
+        wall_m = np.median(last["/scan"].ranges[50:70] * np.cos(beams_rad))
+        assert wall_m == pytest.approx(3.9 - 3.787, abs=0.01)
+        listed = run_here(tmp_path, "lab", "ps")
+        late = re.search(r"late: .*windows at most [\d.]+ ms; \d{3,} windows", listed.out)
+        assert late is not None, listed.out
+        assert "windows later than 0.001 ms, so a trial would be void" in listed.err
+        lab_pid = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)["pid"]
         (cosim_pid,) = (pid for pid in descendants(lab_pid) if COSIM in Path(f"/proc/{pid}/cmdline").read_bytes())
         os.kill(cosim_pid, signal.SIGKILL)
-        wait_until(lambda: fieldkit(tmp_path, "lab", "ps").code != 0, Deadline.after(60))
-        failed = fieldkit(tmp_path, "lab", "ps")
+        wait_until(lambda: run_here(tmp_path, "lab", "ps").code != 0, Deadline.after(60))
+        failed = run_here(tmp_path, "lab", "ps")
         assert "does not answer: it was killed by SIGKILL" in failed.err
         assert "fieldkit lab down" in failed.err
     finally:
-        assert fieldkit(tmp_path, "lab", "down").code == 0
+        assert run_here(tmp_path, "lab", "down").code == 0
 
 
 @pytest.mark.parametrize(
@@ -120,15 +152,15 @@ def test_a_combination_that_cannot_work_is_refused(emulated: str, reason: str, t
 
 @pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())
 def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The world is that of the lab, with robots at other places."""
-    robots = {f"robot-{number}": SdfRobot(TURTLEBOT3_BURGER, (number, 2.0, 0.0), 0.0) for number in (1, 2)}
     make_site(tmp_path, "{physics: gazebo, ros: debian, world: lawn}")
     (tmp_path / "gazebo").mkdir()
-    with gazebo_server(tmp_path / "gazebo", world_sdf(load_world("lawn"), robots)) as server:
+    sdf = run_here(tmp_path, "lab", "sdf")
+    assert sdf.code == 0, sdf.err
+    with gazebo_server(tmp_path / "gazebo", sdf.out) as server:
         monkeypatch.setenv("IGN_PARTITION", server.options["partition"])
         monkeypatch.setenv("IGN_IP", server.options["ip"])
-        up = fieldkit(tmp_path, "lab", "up")
-        assert up.code == 0, up.err
+        started = fieldkit(tmp_path, "lab", "up")
+        assert started.code == 0, started.err
         try:
             assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "10m", "18m").code == 0
             assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0

@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from fieldkit.trial.columns import trial_columns
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros, copy_shipped
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here, start, wait_for_line
 
@@ -162,15 +162,15 @@ def test_a_masterless_trial_behind_the_wall_prints_one_json_object_per_line(tmp_
         1,
         1,
     )
-    (over,) = run.events("trial_ended")
-    assert Path(tmp_path / over["folder"]) == only_trial(tmp_path)
+    (ended,) = run.events("trial_ended")
+    assert Path(tmp_path / ended["folder"]) == only_trial(tmp_path)
     assert {event["name"] for event in run.events("phase_started")} >= {"record", "transfer", "ping"}
     assert {
         (row["scenario"], row["topology"], row["relay"], row["receiver"]) for row in rows(only_trial(tmp_path))
     } == {("nlos", "masterless", "", "duckiedrone-1")}
 
 
-def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path, untouched: Untouched) -> None:
+def test_a_dry_run_prints_every_command_and_starts_nothing(tmp_path: Path, untouched: NamespaceComparison) -> None:
     run = fieldkit(tmp_path, "trial", "los", "30ft", "--dry-run")
     assert run.code == 0, run.err
     assert "## udp: turtlebot-1 (sender, 10.42.0.1)" in run.out
@@ -212,7 +212,7 @@ def test_a_missing_tool_stops_the_trial_before_repeat_1(tmp_path: Path) -> None:
     assert "remedy" in run.err
 
 
-def test_kill_9_leaves_only_finished_repeats(tmp_path: Path, untouched: Untouched) -> None:
+def test_kill_9_leaves_only_finished_repeats(tmp_path: Path, untouched: NamespaceComparison) -> None:
     process = start(
         tmp_path, "trial", "los", "30ft", "--repeats", "5", "--record", "2s", "--protocol", "tcp", "--json"
     )

@@ -15,13 +15,13 @@ from tests.helpers.runs import only_trial, rows, run_here, start, wait_for_line
 
 pytestmark = pytest.mark.emulated
 
-QUICK = ("--repeats", "1", "--record", "1s", "--yes", "--backend", "field")
+SHORT_TRIAL = ("--repeats", "1", "--record", "1s", "--yes", "--backend", "field")
 
 
 @pytest.mark.parametrize("topology", mark_nightly(Topology, in_ci=(Topology.MASTER,)))
 def test_a_trial_of_the_field_backend_ends_valid(tmp_path: Path, topology: Topology) -> None:
     with start_field_robots(tmp_path, topology=topology, site=DEFAULT_SITE) as field_robots:
-        run = run_here(tmp_path, "trial", "los", "5m", "--topology", topology, *QUICK)
+        run = run_here(tmp_path, "trial", "los", "5m", "--topology", topology, *SHORT_TRIAL)
         assert run.code == 0, run.err
         table = rows(only_trial(tmp_path))
         assert [(row["protocol"], row["status"]) for row in table] == [("tcp", "valid"), ("udp", "valid")]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.trial import journal
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import LIMIT_S, Run, finish, only_trial, rows, run_here, start, wait_for_line
 
@@ -48,7 +48,9 @@ def check_whole(lab: Path, repeats: int) -> list[dict[str, str]]:
     return table
 
 
-def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_continues(tmp_path: Path, untouched: Untouched) -> None:
+def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_continues(
+    tmp_path: Path, untouched: NamespaceComparison
+) -> None:
     process = begin(tmp_path, "--record", "2s", until='"record"')
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)
@@ -68,7 +70,7 @@ def test_the_first_ctrl_c_lets_the_repeat_end_and_resume_continues(tmp_path: Pat
     assert len(check_whole(tmp_path, REPEATS)) == REPEATS
 
 
-def test_the_second_ctrl_c_stops_the_repeat_immediately(tmp_path: Path, untouched: Untouched) -> None:
+def test_the_second_ctrl_c_stops_the_repeat_immediately(tmp_path: Path, untouched: NamespaceComparison) -> None:
     process = begin(tmp_path, "6m", "7m", "--record", "60s", until='"record"')
     family = descendants(process.pid)
     process.send_signal(signal.SIGINT)

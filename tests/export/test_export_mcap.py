@@ -282,12 +282,12 @@ def test_a_track_replaces_the_planned_places(trial: Path) -> None:
     before = of(messages(exported(trial)), "/tf")
     folder = next(path for path in (trial / "repeats").iterdir() if path.name == "udp-01")
     began_ns = min(message.time_ns for message in before)
-    went = [
+    departures = [
         TrackPoint(began_ns - SECOND_NS, Role.SENDER, (1.0, 2.0, 0.2)),
         TrackPoint(began_ns + 10**6, Role.SENDER, (1.5, 2.0, 0.2), (2.0, 0.0, 0.0)),
         TrackPoint(began_ns + 2 * 10**6, Role.SENDER, None),
     ]
-    (folder / "track.csv").write_text(track.text(went), encoding="ascii")
+    (folder / "track.csv").write_text(track.text(departures), encoding="ascii")
     read_messages = messages(exported(trial, "tracked.mcap"))
     places = [message.content["transforms"][0]["translation"] for message in of(read_messages, "/tf")]
     assert places == [{"x": 1.0, "y": 2.0, "z": 0.2}, {"x": 1.5, "y": 2.0, "z": 0.2}]

@@ -43,17 +43,17 @@ def main(argv: list[str]) -> int:
 
 
 def _hunt(options: argparse.Namespace) -> int:
-    start_s, defects, seen = time.monotonic(), 0, set[str]()
+    start_s, defects, reported = time.monotonic(), 0, set[str]()
     end_s = start_s + 60 * options.minutes
     options.keep.mkdir(exist_ok=True)
     print(f"seed {options.seed}", flush=True)
     for result in harness.hunt(options.targets, options.seed, options.inputs, options.keep, end_s):
         if isinstance(result, int):
             print(f"{result} inputs, {(time.monotonic() - start_s) / 60:.1f} minutes, {defects} defects")
-        elif (defect_key := f"{result.target}: {result.failure.partition(': ')[0]}") in seen:
+        elif (defect_key := f"{result.target}: {result.failure.partition(': ')[0]}") in reported:
             result.input.unlink()  # one input per defect is enough
         else:
-            seen.add(defect_key)
+            reported.add(defect_key)
             defects += 1
             print(f"{result.target}: {result.failure}\n  {result.input}", flush=True)
     return int(defects > 0)

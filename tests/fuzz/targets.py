@@ -62,7 +62,7 @@ from tests.fuzz.radio_targets import radio_targets
 from tests.helpers.casts import CAST, TURTLEBOT, los_plan
 from tests.helpers.drones import flight
 from tests.helpers.paths import DATA, ROOT
-from tests.remote.test_remote_fuzz import Sender, entry
+from tests.remote.test_remote_fuzz import AnsweringRobot, entry
 from tests.ros.bags.test_measure_bag import write_bag, write_ros2_bag
 from tests.ros.bags.test_measure_battery import TOPIC, ros1
 
@@ -183,7 +183,7 @@ def _tool_seeds() -> tuple[bytes, ...]:
 
 
 def _fetch_tar(data: bytes, place: Path) -> None:
-    fetching.fetch(Sender(place, data), "x", "sender", "lo", place)
+    fetching.fetch(AnsweringRobot(place, data), "x", "sender", "lo", place)
 
 
 def _tar_seeds() -> tuple[bytes, ...]:
@@ -198,7 +198,7 @@ def _tar_seeds() -> tuple[bytes, ...]:
 
 
 def _read_replies(data: bytes, place: Path) -> None:
-    shells = [Sender(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
+    shells = [AnsweringRobot(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
     for shell in shells:
         for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
             with suppress(RobotError):
@@ -207,7 +207,7 @@ def _read_replies(data: bytes, place: Path) -> None:
     printable(data)
 
 
-def _call_script(shell: Sender) -> None:
+def _call_script(shell: AnsweringRobot) -> None:
     script.call(shell, "begin", deadline=Deadline.after(1))
 
 

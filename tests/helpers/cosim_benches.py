@@ -43,11 +43,12 @@ class Driven:
     descriptors: Sequence[int]
 
     @classmethod
-    def make(cls, folder: Path) -> "Driven":
-        """Return the files of a new robot."""
+    def make(cls, folder: Path, *inputs: str) -> "Driven":
+        """Return the files of a new robot, of which `inputs` are the last."""
         folder.mkdir()
         flags = os.O_RDWR | os.O_CREAT
-        return cls(folder, [os.open(folder / name, flags, 0o600) for name in ("steered", "motion", "commanded")])
+        names = ("steered", "motion", *(inputs or ("commanded",)))
+        return cls(folder, [os.open(folder / name, flags, 0o600) for name in names])
 
     def assign(self, place_m: Vector, facing_rad: float = 0.0) -> None:
         """Assign the robot a place, as the lab does."""
@@ -107,8 +108,10 @@ def cosim_bench(
     radio: RadioOptions | None = None,
     world: World | None = None,
     places_m: dict[str, Vector] = PLACES,
+    driven: Driven | None = None,
+    body: RobotBody = BODY,
 ) -> Iterator[CosimBench]:
-    """Yield two placed namespaces on a co-simulated medium; `a` faces east."""
+    """Yield two placed namespaces on a co-simulated medium; `a` faces east, with this body and these files."""
     sync = sync or SyncOptions()
     with ExitStack() as stack:
         medium = stack.enter_context(
@@ -116,13 +119,13 @@ def cosim_bench(
                 radio or RadioOptions(fading=False),
                 world,
                 seed=1,
-                bodies={"a": BODY, "b": BODY},
+                bodies={"a": body, "b": BODY},
                 simulators=Simulators(physics, network, sync.step_ns, network_options, physics_options),
                 policy={"name": sync.name, **sync.parameters},
             )
         )
         spaces = {name: stack.enter_context(Namespace()) for name in ADDRESSES}
-        driven = Driven.make(folder / "a")
+        driven = driven or Driven.make(folder / "a")
         for fd in driven.descriptors:
             stack.callback(os.close, fd)
         for name, space in spaces.items():

@@ -23,7 +23,7 @@ from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import run_trial
 from tests.helpers.disks import Disk, FileSystem
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.helpers.power import Cut, Witness, assert_resumable
+from tests.helpers.power import PowerCut, VersionRecorder, assert_resumable
 from tests.trial.test_trial_crash import VOID_FIRST, plan, robots_with_evidence
 
 OUT: Final = "trials"
@@ -60,7 +60,7 @@ def robots_with_much_evidence() -> Iterator[None]:
         yield
 
 
-def run(out: Path, witness: Witness) -> None:
+def run(out: Path, witness: VersionRecorder) -> None:
     """Start the trial in `out`, or resume it if a power cut left its plan; the witness receives the messages."""
     plans = list(out.glob(f"*/{PLAN_FILE}"))
     if plans:
@@ -106,7 +106,9 @@ def _sync_location() -> str:
     return f"{Path(frame.f_code.co_filename).stem}.{frame.f_code.co_name}: {line}"
 
 
-def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[list[Cut], Witness, list[str]]:
+def cuts_at_every_sync(
+    disk: Disk, place: Path, *, without: str = ""
+) -> tuple[list[PowerCut], VersionRecorder, list[str]]:
     """Run the trial on a disk and cut its power before each sync and at the end, in the worst case for durability.
 
     Only synced data reaches the disk, so these are all disk states that a cut can leave. Each is combined with the
@@ -120,16 +122,18 @@ def cuts_at_every_sync(disk: Disk, place: Path, *, without: str = "") -> tuple[l
     Returns:
         The cuts, the witness of the trial, and the locations that requested a sync.
     """
-    cuts: list[Cut] = []
+    cuts: list[PowerCut] = []
     locations: list[str] = []
     with disk.mounted(place / "disk") as mounted:
         (out := mounted / OUT).mkdir()
-        witness = Witness(out)
+        witness = VersionRecorder(out)
 
         def cut(location: str) -> bool:
             witness.record_versions()
             image = disk.image(mounted, place / f"cut-{len(cuts)}.img")
-            cuts.append(Cut(image, dict(witness.reported), witness.is_over, f"cut {len(cuts)}, before {location}"))
+            cuts.append(
+                PowerCut(image, dict(witness.reported), witness.is_over, f"cut {len(cuts)}, before {location}")
+            )
             locations.append(location)
             return location != without
 
@@ -165,7 +169,7 @@ def calls_of_a_trial(place: Path) -> int:
     """Approximate number of calls and returns in a trial; the first trial of a process has more."""
     counts = []
     for number in range(2):
-        witness = Witness(place / f"whole-{number}")
+        witness = VersionRecorder(place / f"whole-{number}")
         calls = itertools.count()
         sys.setprofile(lambda *_, calls=calls: next(calls))
         try:
@@ -176,7 +180,7 @@ def calls_of_a_trial(place: Path) -> int:
     return min(counts)
 
 
-def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tuple[Cut, Witness]:
+def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tuple[PowerCut, VersionRecorder]:
     """Run or resume the trial on a disk, and cut the power after a number of calls and returns, or at its end.
 
     The trial continues while the disk is copied, so the effective cut may be slightly later.
@@ -189,16 +193,18 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
     """
     with disk.mounted(place / "disk") as mounted, ThreadPoolExecutor() as pool:
         (out := mounted / OUT).mkdir(exist_ok=True)
-        witness = Witness(out)
+        witness = VersionRecorder(out)
         witness.record_versions()
         witness.reported = dict.fromkeys(witness.versions, 0)  # these versions are on disk and must stay there
         states: list[tuple[dict[str, int], bool]] = []
         cut_requested = threading.Event()
 
-        def image() -> Cut:
+        def image() -> PowerCut:
             cut_requested.wait()
             ((reported, is_over),) = states
-            return Cut(disk.image(mounted, file), reported, is_over, f"cut after {after_calls} calls and returns")
+            return PowerCut(
+                disk.image(mounted, file), reported, is_over, f"cut after {after_calls} calls and returns"
+            )
 
         def cut() -> None:
             # The trial may hold any lock here, including one of the thread pool, so no thread is started.

@@ -34,12 +34,12 @@ class _Clock:
 
 
 @contextmanager
-def inject_until_exit(up: EmulatedTestbed, fault: Fault) -> Iterator[None]:
+def inject_until_exit(emulation: EmulatedTestbed, fault: Fault) -> Iterator[None]:
     """Inject `fault` for the duration of the context, instead of its configured duration; it is active on entry."""
     clock = _Clock()
     with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as pool:
         patch.setattr(testbed, "time", clock)
-        injected = pool.submit(up.inject, fault)
+        injected = pool.submit(emulation.inject, fault)
         try:
             wait_until(lambda: clock.began.is_set() or injected.done(), Deadline.after(_TIMEOUT_S))
             yield

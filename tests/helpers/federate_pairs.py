@@ -82,10 +82,10 @@ class Pair:
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
         """Return a session with a fresh federate."""
-        own, other = (channel_of(side) for side in socket.socketpair())
-        other.alter = self.alter
-        threading.Thread(target=self._serve, args=(other,), daemon=True).start()
-        session = FederateSession(hello.role, "test", own, deadline_s=20.0)
+        coordinator_end, federate_end = (channel_of(side) for side in socket.socketpair())
+        federate_end.alter = self.alter
+        threading.Thread(target=self._serve, args=(federate_end,), daemon=True).start()
+        session = FederateSession(hello.role, "test", coordinator_end, deadline_s=20.0)
         welcome = session.welcome(hello)
         session._deadline_s = self.deadline_s  # later, because a busy machine may need longer for the handshake
         return session, hello, welcome

@@ -74,7 +74,7 @@ class _Link:
 
     connect: Connect
     listener: socket.socket
-    dead: bool = False
+    is_cut: bool = False
     delay_s: float = 0.0
     streams: list[tuple[_Flow, _Flow]] = field(default_factory=list)
 
@@ -158,7 +158,7 @@ class Forwarder(Generic[Key]):
         """Cut the link: no data, FIN, RST or ACK is sent any more, and new connections hang."""
         link = self._links[key]
         with self._lock:
-            link.dead = True
+            link.is_cut = True
             for end in link.client_sockets():
                 end.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, _DROP_ALL_PROGRAM)
 
@@ -166,9 +166,9 @@ class Forwarder(Generic[Key]):
         """Restore the link if it is cut; streams that are still open at both ends continue."""
         link = self._links[key]
         with self._lock:
-            if not link.dead:
+            if not link.is_cut:
                 return
-            link.dead = False
+            link.is_cut = False
             for end in link.client_sockets():
                 end.setsockopt(socket.SOL_SOCKET, _SO_DETACH_FILTER, 0)
         self._wake.send(b"x")
@@ -199,13 +199,13 @@ class Forwarder(Generic[Key]):
                 self._wake_receiver.recv(_CHUNK)
             with self._lock:
                 for link in self._links.values():
-                    if not link.dead:
+                    if not link.is_cut:
                         link.carry({*readable}, {*writable})
 
     def _select_arguments(self) -> tuple[list[socket.socket], list[socket.socket], float | None]:
         """The arguments of `select`: sockets to read, sockets to write, and the timeout."""
         with self._lock:
-            alive = [link for link in self._links.values() if not link.dead]
+            alive = [link for link in self._links.values() if not link.is_cut]
             flows = [(link.delay_s, flow) for link in alive for stream in link.streams for flow in stream]
             readers = [flow.source for delay_s, flow in flows if flow.can_read(delay_s)]
             flows_due = [(flow.due_in_s(), flow) for _, flow in flows]

@@ -1,7 +1,7 @@
 /* A server with the services and topics of Gazebo Fortress, for tests: DART moves the models of an SDF file.
  *
  * It follows the loop of Fortress (ign-gazebo6, SimulationRunner): the control service answers before anything
- * happens, the clock of a step is published before the step is made, poses are limited to a rate in wall time, a request
+ * happens, as the services that create and remove models do; the clock of a step is published before the step is made, poses are limited to a rate in wall time, a request
  * without `pause` lets the world run, and a reset sets the time to 0 without moving the models. DART clears commands
  * to joints after each step. Unlike Fortress, a world that has been paused for some time iterates less often until the
  * next request, so that an idle server uses no processor.
@@ -15,6 +15,8 @@
 #include <ignition/msgs/boolean.pb.h>
 #include <ignition/msgs/clock.pb.h>
 #include <ignition/msgs/empty.pb.h>
+#include <ignition/msgs/entity.pb.h>
+#include <ignition/msgs/entity_factory.pb.h>
 #include <ignition/msgs/pose.pb.h>
 #include <ignition/msgs/pose_v.pb.h>
 #include <ignition/msgs/twist.pb.h>
@@ -24,7 +26,9 @@
 #include <ignition/physics/FreeGroup.hh>
 #include <ignition/physics/GetEntities.hh>
 #include <ignition/physics/Joint.hh>
+#include <ignition/physics/RemoveEntities.hh>
 #include <ignition/physics/RequestEngine.hh>
+#include <ignition/physics/sdf/ConstructModel.hh>
 #include <ignition/physics/sdf/ConstructWorld.hh>
 #include <ignition/plugin/Loader.hh>
 #include <ignition/transport/Node.hh>
@@ -45,7 +49,8 @@
 namespace physics = ignition::physics;
 namespace msgs = ignition::msgs;
 namespace transport = ignition::transport;
-using Features = physics::FeatureList<physics::sdf::ConstructSdfWorld, physics::GetEntities, physics::ForwardStep,
+using Features = physics::FeatureList<physics::sdf::ConstructSdfWorld, physics::sdf::ConstructSdfModel,
+                                      physics::RemoveEntities, physics::GetEntities, physics::ForwardStep,
                                       physics::LinkFrameSemantics, physics::GetBasicJointState,
                                       physics::SetJointVelocityCommandFeature, physics::FindFreeGroupFeature,
                                       physics::SetFreeGroupWorldPose, physics::SetFreeGroupWorldVelocity>;
@@ -154,6 +159,24 @@ public:
             answer.set_data(true);
             return true;
         };
+        std::function<bool(const msgs::EntityFactory &, msgs::Boolean &)> on_create =
+            [this](const msgs::EntityFactory &request, msgs::Boolean &answer) {
+                std::lock_guard<std::mutex> guard(mutex_);
+                creations_.push_back(request);
+                requested_.notify_all();
+                answer.set_data(true);
+                return true;
+            };
+        std::function<bool(const msgs::Entity &, msgs::Boolean &)> on_remove = [this](const msgs::Entity &request,
+                                                                                      msgs::Boolean &answer) {
+            std::lock_guard<std::mutex> guard(mutex_);
+            removals_.push_back(request);
+            requested_.notify_all();
+            answer.set_data(true);
+            return true;
+        };
+        node_.Advertise(prefix_ + "/create", on_create);
+        node_.Advertise(prefix_ + "/remove", on_remove);
         node_.Advertise(prefix_ + "/control", on_control);
         node_.Advertise(prefix_ + "/set_pose", on_pose);
         clock_ = node_.Advertise<msgs::Clock>(prefix_ + "/clock");
@@ -174,7 +197,9 @@ public:
                 continue;
             }
             std::unique_lock<std::mutex> lock(mutex_);
-            requested_.wait_for(lock, IDLE_PERIOD, [this] { return !controls_.empty() || !poses_.empty(); });
+            requested_.wait_for(lock, IDLE_PERIOD, [this] {
+                return !controls_.empty() || !poses_.empty() || !creations_.empty() || !removals_.empty();
+            });
         }
     }
 
@@ -222,6 +247,7 @@ private:
     {
         plugins_.reset();
         models_.clear();
+        removed_.clear();
         dart_ = nullptr;
         engine_ = nullptr;
         engine_ = physics::RequestEngine3d<Features>::From(loader_.Instantiate("ignition::physics::dartsim::Plugin"));
@@ -287,6 +313,7 @@ private:
             time_ns_ += step_ns_;
         }
         publish_clock();
+        create_and_remove_models();
         place_models();
         if (!is_paused_) {
             for (auto &model : models_)
@@ -327,10 +354,62 @@ private:
         else if (fault_ == "step")
             pending_++, is_paused_ = false;
         else if (fault_ == "remove")
-            models_.erase(models_.begin());
+            remove(models_.front()->name);
         else if (fault_ == "exit")
             _exit(1);
         fault_.clear();
+    }
+
+    void create_and_remove_models()
+    {
+        std::vector<msgs::EntityFactory> creations;
+        std::vector<msgs::Entity> removals;
+        {
+            std::lock_guard<std::mutex> guard(mutex_);
+            creations.swap(creations_);
+            removals.swap(removals_);
+        }
+        for (const msgs::Entity &removal : removals)
+            remove(removal.name());
+        for (const msgs::EntityFactory &creation : creations)
+            create(creation);
+    }
+
+    void remove(const std::string &name)
+    {
+        for (auto model = models_.begin(); model != models_.end(); model++)
+            if ((*model)->name == name) {
+                plugins_->Unsubscribe("/model/" + name + "/cmd_vel");
+                (*model)->body->Remove();
+                removed_.push_back(std::move(*model)); /* a callback may still use it */
+                models_.erase(model);
+                return;
+            }
+        std::cerr << "there is no model " << name << std::endl;
+    }
+
+    void create(const msgs::EntityFactory &creation)
+    {
+        sdf::Root root;
+        sdf::Errors errors =
+            creation.sdf_filename().empty() ? root.LoadSdfString(creation.sdf()) : root.Load(creation.sdf_filename());
+        for (const auto &model : models_)
+            if (model->name == creation.name() && !creation.allow_renaming()) {
+                std::cerr << "there is a model " << creation.name() << " already" << std::endl;
+                return;
+            }
+        if (!errors.empty() || root.Model() == nullptr) {
+            std::cerr << "the SDF of " << creation.name() << " has no model" << std::endl;
+            return;
+        }
+        sdf::Model source = *root.Model();
+        source.SetName(creation.name());
+        dart_->ConstructModel(source);
+        add(source);
+        msgs::Pose pose = creation.pose();
+        pose.set_name(creation.name());
+        std::lock_guard<std::mutex> guard(mutex_);
+        poses_.push_back(pose);
     }
 
     void place_models()
@@ -395,12 +474,14 @@ private:
     ignition::plugin::Loader loader_;
     physics::Engine3dPtr<Features> engine_;
     physics::World3dPtr<Features> dart_;
-    std::vector<std::unique_ptr<Model>> models_;
+    std::vector<std::unique_ptr<Model>> models_, removed_;
     std::mutex mutex_; /* for the requests */
     std::condition_variable requested_;
     SteadyClock::time_point last_active_ = SteadyClock::now(); /* of the last request or step */
     std::vector<msgs::WorldControl> controls_;
     std::vector<msgs::Pose> poses_;
+    std::vector<msgs::EntityFactory> creations_;
+    std::vector<msgs::Entity> removals_;
     transport::Node::Publisher clock_, moving_, passed_;
     std::unique_ptr<transport::Node> plugins_;
     transport::Node node_;

@@ -80,7 +80,7 @@ def _checked(result: int) -> None:
         raise OSError(number, os.strerror(number))
 
 
-class Untouched:
+class NamespaceComparison:
     """Compares the namespaces of a test with their initial state."""
 
     def __init__(self) -> None:

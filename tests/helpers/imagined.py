@@ -33,7 +33,7 @@ _TCPDUMP_COUNTERS = "{0} packets captured\n{0} packets received by filter\n0 pac
 
 
 @dataclass
-class Sent:
+class TransferTruth:
     """Ground truth about one transfer."""
 
     source: str
@@ -47,7 +47,7 @@ class Sent:
 
 
 @dataclass
-class Truth:
+class AttemptTruth:
     """Ground truth about the transfers, pings and loads of an attempt, by the name of their step.
 
     Attributes:
@@ -58,7 +58,7 @@ class Truth:
         udp_to: Destination address of each UDP flow.
     """
 
-    transfers: dict[str, Sent] = field(default_factory=dict)
+    transfers: dict[str, TransferTruth] = field(default_factory=dict)
     pings: dict[str, tuple[int, int]] = field(default_factory=dict)
     loads: dict[str, tuple[int, int]] = field(default_factory=dict)
     cookies_bytes: dict[str, int] = field(default_factory=dict)
@@ -74,9 +74,9 @@ class Attempt:
     folder: Path
     loss: float
     draw: random.Random
-    truth: Truth = field(default_factory=Truth)
+    truth: AttemptTruth = field(default_factory=AttemptTruth)
 
-    def play(self) -> Truth:
+    def play(self) -> AttemptTruth:
         """Write the evidence of each step and return the ground truth."""
         self._now_ns = {_SEQUENTIAL: _START_NS}
         self._ip_ids = count(1)
@@ -168,7 +168,7 @@ class Attempt:
         assert target == self._address(listener_job.role)
         assert str(port) in listener_job.job.argv
         ports = (40_000 + len(self.truth.transfers), port)
-        sent = Sent(source, target, ports, sent_bytes=len(content))
+        sent = TransferTruth(source, target, ports, sent_bytes=len(content))
         self.truth.transfers[sender_job.job.name.rpartition(".")[0]] = sent
         self.truth.udp_to += [target] if "-u" in sender_job.job.argv else []
         transfer = self._udp if "-u" in sender_job.job.argv else self._tcp
@@ -176,7 +176,7 @@ class Attempt:
         sent.received_bytes = len(received)
         self._path(listener_job.job.stdout).write_bytes(received)
 
-    def _udp(self, sent: Sent, content: bytes, block_ids: tuple[int, ...]) -> bytes:
+    def _udp(self, sent: TransferTruth, content: bytes, block_ids: tuple[int, ...]) -> bytes:
         received = b""
         for start in range(0, len(content), 8192):
             datagram = content[start : start + 8192]
@@ -190,7 +190,7 @@ class Attempt:
             received += datagram if is_complete else b""
         return received
 
-    def _tcp(self, sent: Sent, content: bytes, block_ids: tuple[int, ...]) -> bytes:
+    def _tcp(self, sent: TransferTruth, content: bytes, block_ids: tuple[int, ...]) -> bytes:
         def send_segment(
             seq: int, size: int, flags: int = 0x10, *, is_reply: bool = False, lost: bool = False
         ) -> None:
@@ -353,7 +353,7 @@ def _segment(
     return ipv4(tcp_header, protocol=6, size=20 + size, ip_id=ip_id, src=ends[0], dst=ends[1])
 
 
-def _fragments(ip_id: int, payload_bytes: int, sent: Sent) -> list[bytes]:
+def _fragments(ip_id: int, payload_bytes: int, sent: TransferTruth) -> list[bytes]:
     """The IP packets of a UDP datagram for an MTU of 1500 bytes."""
     datagram_bytes = payload_bytes + 8
     fragments = []

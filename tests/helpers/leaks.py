@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import pytest
 
-from tests.helpers.host import Untouched, alive, descendants, separate_namespaces
+from tests.helpers.host import NamespaceComparison, alive, descendants, separate_namespaces
 
 _PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: orphans become children of this process, not of init
 _KEY: Final = "processes left behind"
@@ -112,10 +112,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture
-def untouched() -> Iterator[Untouched]:
+def untouched() -> Iterator[NamespaceComparison]:
     """Run the test in separate network and mount namespaces; a call, and the end, check that they are unchanged."""
     with separate_namespaces():
-        check = Untouched()
+        check = NamespaceComparison()
         yield check
         check()
 

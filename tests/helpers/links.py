@@ -255,12 +255,12 @@ def _segment_starts(frames: Sequence[Sequence[Segment]]) -> set[int]:
 
 
 def _reordered(joined: Sequence[tuple[int, list[tuple[int, Segment]]]], position: dict[tuple[int, int], int]) -> int:
-    seen, latest, reordered = set[int](), -1, 0
+    arrived, latest, reordered = set[int](), -1, 0
     for _, group in joined:
         for index, (number, segment) in enumerate(group):
             order = position[number, segment.start]
-            reordered += index == 0 and order not in seen and order < latest
-            if order not in seen:
+            reordered += index == 0 and order not in arrived and order < latest
+            if order not in arrived:
                 latest = max(latest, order)
-            seen.add(order)
+            arrived.add(order)
     return reordered

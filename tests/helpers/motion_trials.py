@@ -21,8 +21,8 @@ from tests.helpers.motion_lab import LONG_S, MotionLab, start_trial
 from tests.helpers.motion_outcomes import MotionOutcome, problems
 from tests.helpers.motion_parties import ON_ROBOT, Party, SlowProcesses, agents_on, pids_of, send
 from tests.helpers.motion_truth import (
-    REMAINS_S,
-    STILL_FOR_S,
+    STATIONARY_FOR_S,
+    STOPPED_FOR_S,
     MotionSampler,
     descended_s,
     grounded_s,
@@ -137,7 +137,7 @@ class MotionTrial:
 
     def _in_phase(self, sampler: MotionSampler) -> bool:
         """Return True if the robot is in the phase, by its log and by its ground-truth motion."""
-        sample, moment = sampler.now, self.cell.moment
+        sample, moment = sampler.newest, self.cell.moment
         if sample is None:
             return False
         if moment is Moment.WAITING:
@@ -268,7 +268,7 @@ class MotionTrial:
 
     @property
     def _remains_s(self) -> float:
-        return REMAINS_S if self.cell.moment in AT_REST else STILL_FOR_S
+        return STATIONARY_FOR_S if self.cell.moment in AT_REST else STOPPED_FOR_S
 
     def _undo_fault(self) -> None:
         """Undo the fault: suspended processes continue, the link is restored, and a killed router is restarted."""
@@ -280,7 +280,7 @@ class MotionTrial:
         rest_s = self._rest_s(sampler, at_s)
         ends_s = rest_s if cell.craft.flies else None
         begins_s = descended_s(samples, at_s) if cell.craft.flies else rest_s
-        again_m = 0.0 if rest_s is None else moved_again_m(samples, at_s + rest_s + STILL_FOR_S / 2)
+        again_m = 0.0 if rest_s is None else moved_again_m(samples, at_s + rest_s + STOPPED_FOR_S / 2)
         code = self._process.poll() if self._process is not None else None
         printed = self._printed()
         outcome = MotionOutcome(
@@ -289,7 +289,7 @@ class MotionTrial:
             begins_s=_rounded(begins_s),
             ends_s=_rounded(ends_s),
             again_m=round(again_m, 3),
-            farthest_m=round(max(sample.off_m for sample in samples), 3),
+            farthest_m=round(max(sample.from_start_m for sample in samples), 3),
             disarmed=self._disarmed() if cell.craft.flies else None,
             attempts=len(self._logs),
             code=code,

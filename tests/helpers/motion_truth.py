@@ -14,19 +14,19 @@ from sim_backends.emulated.ros.steered import Steered
 
 PERIOD_S: Final = 0.02
 """Interval between two samples; the base and the autopilot write at this rate while the robot moves."""
-STILL_M_S: Final = 0.02
-STILL_RAD_S: Final = 0.02
+STATIONARY_M_S: Final = 0.02
+STATIONARY_RAD_S: Final = 0.02
 """A robot whose speed and rate of turn are below these limits is stationary."""
-STILL_FOR_S: Final = 0.4
+STOPPED_FOR_S: Final = 0.4
 """A robot has stopped once it is stationary for this time; a new attempt sets it in motion after one second."""
-REMAINS_S: Final = 5.0
+STATIONARY_FOR_S: Final = 5.0
 """The same for a robot that was stationary before the fault, which may start to move late."""
 DESCENDS_M_S: Final = 0.1
 """A drone descends if its vertical speed is below the negative of this."""
 GROUND_M: Final = 0.02
 """A drone is on the ground if it is stationary and at most this high above its start position."""
-AGAIN_M: Final = 0.05
-AGAIN_RAD: Final = 0.1
+MOVED_AGAIN_M: Final = 0.05
+TURNED_AGAIN_RAD: Final = 0.1
 """A stopped robot moves again if it travels or turns farther than this."""
 
 
@@ -54,27 +54,27 @@ class MotionSample(NamedTuple):
     turn_rad_s: float
 
     @property
-    def still(self) -> bool:
+    def is_stationary(self) -> bool:
         """True if the robot is stationary."""
-        return self.speed_m_s < STILL_M_S and abs(self.turn_rad_s) < STILL_RAD_S
+        return self.speed_m_s < STATIONARY_M_S and abs(self.turn_rad_s) < STATIONARY_RAD_S
 
     @property
-    def off_m(self) -> float:
+    def from_start_m(self) -> float:
         """Horizontal distance from the start position."""
         return math.hypot(self.east_m, self.north_m)
 
     @property
     def on_ground(self) -> bool:
         """True if the robot is a drone on the ground."""
-        return self.still and self.up_m < GROUND_M
+        return self.is_stationary and self.up_m < GROUND_M
 
 
-def stopped_s(samples: Sequence[MotionSample], since_s: float, for_s: float = STILL_FOR_S) -> float | None:
+def stopped_s(samples: Sequence[MotionSample], since_s: float, for_s: float = STOPPED_FOR_S) -> float | None:
     """Time from `since_s` until a ground robot was stationary for at least `for_s`; None if it did not stop."""
-    return _start_s(samples, since_s, for_s, lambda sample: sample.still)
+    return _start_s(samples, since_s, for_s, lambda sample: sample.is_stationary)
 
 
-def grounded_s(samples: Sequence[MotionSample], since_s: float, for_s: float = STILL_FOR_S) -> float | None:
+def grounded_s(samples: Sequence[MotionSample], since_s: float, for_s: float = STOPPED_FOR_S) -> float | None:
     """Time from `since_s` until a drone was on the ground for at least `for_s`; None if it was not."""
     return _start_s(samples, since_s, for_s, lambda sample: sample.on_ground)
 
@@ -106,7 +106,9 @@ def moved_again_m(samples: Sequence[MotionSample], stopped_at_s: float) -> float
         for sample in later
     )
     turned_rad = max(abs(math.remainder(sample.heading_rad - reference.heading_rad, math.tau)) for sample in later)
-    return max(distance_m if distance_m > AGAIN_M else 0.0, turned_rad / 2 if turned_rad > AGAIN_RAD else 0.0)
+    return max(
+        distance_m if distance_m > MOVED_AGAIN_M else 0.0, turned_rad / 2 if turned_rad > TURNED_AGAIN_RAD else 0.0
+    )
 
 
 def _start_s(
@@ -152,7 +154,7 @@ class MotionSampler:
         self._thread.join()
 
     @property
-    def now(self) -> MotionSample | None:
+    def newest(self) -> MotionSample | None:
         """The newest sample; None before the first."""
         return self.samples[-1] if self.samples else None
 
@@ -168,7 +170,7 @@ class MotionSampler:
     def _sample(self, motion: Steered, now_ns: int) -> MotionSample:
         if self._heading_rad is None:
             self._heading_rad = motion.heading_rad
-        east_m, north_m, up_m = (now - then for now, then in zip(motion.place_m, self._start_m, strict=True))
+        east_m, north_m, up_m = (newest - then for newest, then in zip(motion.place_m, self._start_m, strict=True))
         return MotionSample(
             now_ns / 1e9,
             east_m,

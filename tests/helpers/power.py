@@ -20,7 +20,7 @@ _MANIFEST: Final = "MANIFEST.sha256"
 
 
 @dataclass
-class Witness:
+class VersionRecorder:
     """Records all versions of files with their final name, and the version of each at the last report to the user.
 
     Args:
@@ -48,7 +48,7 @@ class Witness:
 
 
 @dataclass(frozen=True)
-class Cut:
+class PowerCut:
     """A power cut.
 
     Attributes:
@@ -63,7 +63,7 @@ class Cut:
     is_over: bool
     at: str
 
-    def lost(self, folder: Path, witness: Witness) -> list[str]:
+    def lost(self, folder: Path, witness: VersionRecorder) -> list[str]:
         """Descriptions of lost or partial files on the disk after the cut.
 
         Args:
@@ -106,7 +106,7 @@ def _is_current(content: bytes | None, versions: list[bytes], *, grows: bool) ->
     return content.startswith(reported[: reported.rfind(b"\n") + 1]) if grows else content in versions
 
 
-def _lost_evidence(folder: Path, witness: Witness) -> Iterator[str]:
+def _lost_evidence(folder: Path, witness: VersionRecorder) -> Iterator[str]:
     """Yield differences between the evidence of ended attempts and the journal or manifest."""
     remaining = visible(folder)
     for path in folder.glob(f"*/{JOURNAL_FILE}"):

@@ -116,7 +116,7 @@ def _slow_iperf(module: ModuleType, folder: Path) -> None:
     """Limit the rate of iperf3, which would otherwise load all cores."""
     del folder
     at_full_rate = module.iperf
-    replace(module, "iperf", lambda near, seconds, *options: at_full_rate(near, seconds, *options, "-b", "5M"))
+    replace(module, "iperf", lambda client, seconds, *options: at_full_rate(client, seconds, *options, "-b", "5M"))
 
 
 def _small_swarm(module: ModuleType, folder: Path) -> None:
@@ -254,7 +254,7 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
     """Reduce `mesh_losses` to the loss of one of four robots."""
     del folder
     places = {"sender": (0, 0), "first": (60, -35), "left": (60, 35), "receiver": (120, 0)}
-    detour = module.Detour("two hops beside two", places, ("first", "left"), fading=False)
+    detour = module.Detour("paths of two and two hops", places, ("first", "left"), fading=False)
     replace(module, "DETOURS", (detour,))
     replace(module, "SETTLE_S", 2.0)
 

@@ -53,20 +53,22 @@ def write(folder: Path, *, site: str | None = SITE, **files: str) -> None:
         (folder / f"{name}.py").write_text(text, encoding="utf-8")
 
 
-def run(folder: Path, *words: str, python: str = sys.executable, beside: Sequence[Path] = (ROOT,)) -> SuiteRun:
+def run(
+    folder: Path, *words: str, python: str = sys.executable, import_folders: Sequence[Path] = (ROOT,)
+) -> SuiteRun:
     """Run the tests of a folder.
 
     Args:
         folder: The folder.
         words: Additional arguments of pytest.
         python: The interpreter.
-        beside: Folders in which the interpreter finds modules.
+        import_folders: Folders in which the interpreter finds modules.
     """
     report = folder / "junit.xml"
     completed = subprocess.run(
         command(f"--rootdir={folder}", f"--junitxml={report}", *words, python=python),
         cwd=folder,
-        env=environment() | {"PYTHONPATH": os.pathsep.join(map(str, beside))},
+        env=environment() | {"PYTHONPATH": os.pathsep.join(map(str, import_folders))},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

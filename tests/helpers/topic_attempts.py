@@ -41,8 +41,8 @@ class TopicAttempt:
     Attributes:
         sent: Rows of the publisher's log, without the end record.
         came: Rows of the subscriber's log, without the end record.
-        near: Frames of the publisher's capture.
-        far: Frames of the subscriber's capture.
+        publisher_frames: Frames of the publisher's capture.
+        subscriber_frames: Frames of the subscriber's capture.
         plan: The requested topic.
     """
 
@@ -65,12 +65,12 @@ def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PL
             for kind, row_size, number, _, sample_ns in start_rows
         ],
     )
-    near, far = [], []
+    publisher_frames, subscriber_frames = [], []
     for number in range(plan.samples):
         sample_ns = START + number * PERIOD
         sent.append((records.SAMPLE, size, number, sample_ns, sample_ns + 90 * US))
         packet = _packet(number, sample_ns, plan, tcp=tcp)
-        near.append(Frame(sample_ns + 60 * US, packet[:236], len(packet)))
+        publisher_frames.append(Frame(sample_ns + 60 * US, packet[:236], len(packet)))
         acknowledgement = _acknowledgement(number, plan, tcp=tcp)
         # An echo request and its reply limit the uncertainty of the clock offset to 30 us.
         for is_request, publisher_ns, subscriber_ns in (
@@ -78,17 +78,17 @@ def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PL
             (False, sample_ns + 12 * MS, sample_ns + 12 * MS - 20 * US),
         ):
             echo = _echo(number, is_request=is_request)
-            near.append(Frame(publisher_ns, echo))
-            far.append(Frame(subscriber_ns + AHEAD, echo))
+            publisher_frames.append(Frame(publisher_ns, echo))
+            subscriber_frames.append(Frame(subscriber_ns + AHEAD, echo))
         if number not in lost:
             subscriber_ns = sample_ns + MS + 7 * US * (number % 13) + AHEAD
-            far.append(Frame(subscriber_ns, packet[:236], len(packet)))
-            far.append(Frame(subscriber_ns + 50 * US, acknowledgement))
-            near.append(Frame(subscriber_ns - AHEAD + 70 * US, acknowledgement))
+            subscriber_frames.append(Frame(subscriber_ns, packet[:236], len(packet)))
+            subscriber_frames.append(Frame(subscriber_ns + 50 * US, acknowledgement))
+            publisher_frames.append(Frame(subscriber_ns - AHEAD + 70 * US, acknowledgement))
             received.append((records.SAMPLE, size, number, sample_ns, subscriber_ns + 200 * US))
     end_ns = START + plan.samples * PERIOD + SECOND
-    near.append(Frame(end_ns, _acknowledgement(plan.samples, plan, tcp=tcp)))
-    return TopicAttempt(tuple(sent), tuple(received), tuple(near), tuple(far), plan)
+    publisher_frames.append(Frame(end_ns, _acknowledgement(plan.samples, plan, tcp=tcp)))
+    return TopicAttempt(tuple(sent), tuple(received), tuple(publisher_frames), tuple(subscriber_frames), plan)
 
 
 def _packet(number: int, at_ns: int, plan: TopicPlan, *, tcp: bool) -> bytes:

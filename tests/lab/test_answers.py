@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, RobotError
 from fieldkit.lab import requests
-from fieldkit.lab.protocol import LabLink, Outline, Overview
+from fieldkit.lab.protocol import LabLateness, LabLink, Outline, Overview
 from fieldkit.lab.requests import LabState, RobotState
 from fieldkit.lab.robots import Destination
 
@@ -14,6 +14,7 @@ STATE = LabState(
     pid=4711,
     up_s=2.5,
     robots=(RobotState("a", "turtlebot3_burger", ("sender (master)",), "10.42.0.1", (1.0, 2.0, 0.5), ("sshd",)),),
+    lateness=LabLateness(0.1, 0.002, None, 4, 0),
 )
 OVERVIEW = Overview(
     world="lawn",

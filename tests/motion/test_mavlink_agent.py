@@ -32,7 +32,7 @@ from tests.helpers import drones
 from tests.helpers.drones import Sender
 
 ConnectionKind = Callable[[], AbstractContextManager[str]]
-WANTED = {"32": 20_000, "30": -1}
+REQUESTED = {"32": 20_000, "30": -1}
 """LOCAL_POSITION_NED at 50 Hz, no ATTITUDE; requested by the recorder."""
 
 
@@ -108,7 +108,7 @@ def test_checksums_are_those_of_pymavlink(old: bool) -> None:
 
 
 @dataclass
-class Ended:
+class RecorderResult:
     """The result of a recorder."""
 
     code: int
@@ -124,14 +124,14 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def recording(program: Path, log: Path, connection: str, **arguments: object) -> Iterator[Ended]:
+def recording(program: Path, log: Path, connection: str, **arguments: object) -> Iterator[RecorderResult]:
     """Record while the body runs, after the recorder is ready; then stop it as a job is stopped."""
     request = json.dumps({"connection": connection, "intervals_us": {}, **arguments})
     argv = (sys.executable, str(program), "mavlink", request, str(log))
     with subprocess.Popen(argv, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stderr is not None
         assert process.stderr.readline().startswith(b"waiting for the heartbeat")
-        result = Ended(-1, {}, log)
+        result = RecorderResult(-1, {}, log)
         try:
             assert process.stderr.readline() == b"up, MAVLink\n"
             yield result
@@ -227,7 +227,7 @@ def over_a_serial_line() -> Iterator[str]:
 def test_log_is_read_by_pymavlink(connection_kind: ConnectionKind, program: Path, tmp_path: Path) -> None:
     with (
         connection_kind() as connection,
-        recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as result,
+        recording(program, tmp_path / "x.tlog", connection, intervals_us=REQUESTED) as result,
     ):
         wait_until_size(result.log, 15_000)  # a PX4 sends ATTITUDE unasked before it is switched off
     assert result.code == 0
@@ -364,7 +364,7 @@ def until_there(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("connection", "complaint"),
+    ("connection", "message"),
     [
         ("tcp:127.0.0.1:1", "Connection refused"),
         ("/dev/null:115200", "Inappropriate ioctl"),
@@ -374,14 +374,14 @@ def until_there(path: Path) -> None:
     ],
 )
 def test_connection_that_cannot_be_opened_is_reported(
-    connection: str, complaint: str, program: Path, tmp_path: Path
+    connection: str, message: str, program: Path, tmp_path: Path
 ) -> None:
     arguments = json.dumps({"connection": connection, "intervals_us": {}})
     argv = (sys.executable, str(program), "mavlink", arguments, str(tmp_path / "x.tlog"))
     done = subprocess.run(argv, capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 3
     assert f"error: MAVLink over {connection}: " in done.stderr
-    assert complaint in done.stderr
+    assert message in done.stderr
 
 
 @pytest.mark.parametrize("serial", [False, True], ids=["udp", "serial"])
@@ -392,7 +392,7 @@ def test_hostile_bytes_neither_stop_the_recorder_nor_damage_the_log(
     drone = drones.at_terminal(damage) if serial else drones.at_udp(damage)
     with drone as address:
         connection = f"{address}:115200" if serial else f"udpout:127.0.0.1:{address}"
-        with recording(program, tmp_path / "x.tlog", connection, intervals_us=WANTED) as result:
+        with recording(program, tmp_path / "x.tlog", connection, intervals_us=REQUESTED) as result:
             wait_until_size(result.log, 12_000)
     assert result.code == 0
     read = tlog.read(result.log, drones.SYSTEM, result.output_text["ended_us"])

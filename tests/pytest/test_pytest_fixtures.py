@@ -251,11 +251,11 @@ def test_only_evidence_of_failures_is_kept(suite_run: SuiteRun, folder: Path) ->
 
 def test_a_failed_test_names_its_evidence(suite_run: SuiteRun, folder: Path) -> None:
     (kept_folder,) = (folder / "fieldkit-results").iterdir()
-    own = kept_folder / "test_robots.py" / "test_fails_because_of_a_program"
-    assert f"fieldkit evidence -------------------------------\n{own}\n" in part(
+    test_folder = kept_folder / "test_robots.py" / "test_fails_because_of_a_program"
+    assert f"fieldkit evidence -------------------------------\n{test_folder}\n" in part(
         suite_run.output, "test_fails_because_of_a_program"
     )
-    assert ("fieldkit_evidence", str(own)) in suite_run.properties["test_fails_because_of_a_program"]
+    assert ("fieldkit_evidence", str(test_folder)) in suite_run.properties["test_fails_because_of_a_program"]
     assert not suite_run.properties["test_files_are_copied_in_both_directions"]
 
 

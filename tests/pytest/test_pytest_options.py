@@ -13,18 +13,18 @@ from fieldkit.pytest.plugin_options import Keep, LabOptions
 from tests.helpers import suites
 from tests.helpers.sshd import free_port, make_key
 
-TEST_WITH_ROBOTS = "def test_asks(robots):\n    pass\n"
-TOLD = """
-def test_told(lab_options, pytestconfig):
+TEST_WITH_ROBOTS = "def test_uses_robots(robots):\n    pass\n"
+SHOWS_OPTIONS = """
+def test_shows_options(lab_options, pytestconfig):
     from fieldkit.pytest import plugin_options
     values = lab_options, plugin_options.output(pytestconfig), plugin_options.keep(pytestconfig)
     print(*(f"[{value}]" for value in values), sep="\\n")
 """
-OTHERS = """
+LOADED_MODULES = """
 import sys
 
 def test_other():
-    assert sorted(one for one in sys.modules if one.startswith(("fieldkit", "sim_backends"))) == [
+    assert sorted(name for name in sys.modules if name.startswith(("fieldkit", "sim_backends"))) == [
         "fieldkit", "fieldkit.pytest", "fieldkit.pytest.plugin"
     ]
     assert not {"numpy", "pydantic", "yaml", "paramiko", "rich"} & set(sys.modules)
@@ -32,7 +32,7 @@ def test_other():
 def test_own(lab, robots, trial):
     assert (lab, robots, trial) == (1, 2, 3)
 """
-OWN = """
+REPLACED_FIXTURES = """
 import pytest
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def trial(): return 3
 """
 
 
-CHOOSES = """
+CHOSEN_BACKEND = """
 import pytest
 from dataclasses import replace
 
@@ -86,15 +86,15 @@ def field(folder: Path) -> str:
     access = f"port: {free_port()}, user: pi, key: {folder / 'key'}, host_key: {host_key}"
     lines = [
         f"  {name}: {{profile: turtlebot3_burger, host: {host}, {access}}}"
-        for name, host in (("near", "127.0.0.1"), ("far", "127.0.0.2"))
+        for name, host in (("robot-1", "127.0.0.1"), ("robot-2", "127.0.0.2"))
     ]
-    roles = "roles: {masterless: {sender: near, receiver: far}}"
+    roles = "roles: {masterless: {sender: robot-1, receiver: robot-2}}"
     return "\n".join(["backend: field", "patience: 1s", "robots:", *lines, roles, ""])
 
 
 def test_tests_without_its_fixtures_import_no_other_module(tmp_path: Path) -> None:
     """Other fixtures with the same names are not affected."""
-    suites.write(tmp_path, site="robots: [", test_others=OTHERS, conftest=OWN)
+    suites.write(tmp_path, site="robots: [", test_modules=LOADED_MODULES, conftest=REPLACED_FIXTURES)
     done = suites.run(tmp_path)
     assert (done.code, set(done.results.values())) == (0, {"passed"}), done.output
     assert not (tmp_path / "fieldkit-results").exists()
@@ -106,7 +106,7 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
         "fieldkit_keep = all\nfieldkit_backend = emulated\n"
     )
     below = pytester.mkdir("below")
-    suites.write(below, site=None, test_told=TOLD)
+    suites.write(below, site=None, test_shows_options=SHOWS_OPTIONS)
     os.chdir(below)
     output_text = run(pytester, "-s", "--fieldkit-backend", "field", "--fieldkit-output", "mine").stdout.str()
     assert f"site=PosixPath('{pytester.path}/ours.yaml')" in output_text
@@ -126,18 +126,18 @@ def test_the_configuration_is_used_without_command_line_options(pytester: pytest
 def test_an_invalid_lab_is_an_error_of_set_up(
     pytester: pytest.Pytester, words: tuple[str, ...], message: str, remedy: str
 ) -> None:
-    suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
+    suites.write(pytester.path, test_uses_robots=TEST_WITH_ROBOTS)
     done = run(pytester, *words)
     assert (done.ret, done.parseoutcomes()) == (1, {"errors": 1})
     output_text = done.stdout.str()
-    assert "ERROR at setup of test_asks" in output_text
+    assert "ERROR at setup of test_uses_robots" in output_text
     assert message in output_text
     assert remedy in output_text
     assert "/fieldkit/" not in output_text, "no internals of fieldkit are shown"
 
 
 def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None:
-    suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
+    suites.write(pytester.path, test_uses_robots=TEST_WITH_ROBOTS)
     output_text = run(pytester, "--fieldkit-backend", "emulatd", "--tb=long").stdout.str()
     assert "fieldkit/backends/registry.py" in output_text
 
@@ -146,25 +146,25 @@ def test_a_full_traceback_is_shown_on_request(pytester: pytest.Pytester) -> None
     "words", [("--fieldkit-keep", "som"), ("--fieldkit-topology", "mesh"), ("-o", "fieldkit_keep=som")]
 )
 def test_an_invalid_value_is_rejected_before_any_test(pytester: pytest.Pytester, words: tuple[str, ...]) -> None:
-    suites.write(pytester.path, test_asks=TEST_WITH_ROBOTS)
+    suites.write(pytester.path, test_uses_robots=TEST_WITH_ROBOTS)
     done = run(pytester, *words)
     assert done.ret == pytest.ExitCode.USAGE_ERROR
     assert "choose from" in done.stderr.str()
 
 
 def test_a_test_module_chooses_its_lab(pytester: pytest.Pytester) -> None:
-    suites.write(pytester.path, test_asks=CHOOSES + TEST_WITH_ROBOTS)
+    suites.write(pytester.path, test_uses_robots=CHOSEN_BACKEND + TEST_WITH_ROBOTS)
     assert "there is no backend 'mars'" in run(pytester).stdout.str()
 
 
 def test_an_unreachable_robot_is_an_error_with_a_remedy(tmp_path: Path) -> None:
-    suites.write(tmp_path, site=field(tmp_path), test_asks=TEST_WITH_ROBOTS)
+    suites.write(tmp_path, site=field(tmp_path), test_uses_robots=TEST_WITH_ROBOTS)
     done = suites.run(tmp_path)
-    assert (done.code, done.results) == (1, {"test_asks": "error"}), done.output
-    assert "near: connection: 127.0.0.1 cannot be reached for SSH" in done.output
-    assert "far: connection: 127.0.0.2 cannot be reached for SSH" in done.output
+    assert (done.code, done.results) == (1, {"test_uses_robots": "error"}), done.output
+    assert "robot-1: connection: 127.0.0.1 cannot be reached for SSH" in done.output
+    assert "robot-2: connection: 127.0.0.2 cannot be reached for SSH" in done.output
     assert "start its SSH server" in done.output
-    (_, folder) = done.properties["test_asks"][0]
+    (_, folder) = done.properties["test_uses_robots"][0]
     assert "open field, masterless" in Path(folder, LOG).read_text(encoding="utf-8")
 
 

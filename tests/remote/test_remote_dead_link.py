@@ -35,10 +35,10 @@ SOON = 60.0
 class Robot:
     """An emulated robot, its control link, and the notices for the operator."""
 
-    def __init__(self, up: EmulatedTestbed, notices: list[str]) -> None:
-        self.shell = up.shells[Role.SENDER]
+    def __init__(self, emulation: EmulatedTestbed, notices: list[str]) -> None:
+        self.shell = emulation.shells[Role.SENDER]
         self.notices = notices
-        self.pid = up.robots[Role.SENDER].pid
+        self.pid = emulation.robots[Role.SENDER].pid
         self.inside = f"/proc/{min(descendants(self.pid))}"
 
     def set_link(self, state: str) -> None:
@@ -74,8 +74,8 @@ def robot(patience_s: float) -> Iterator[Robot]:
         seed=1,
         patience_s=patience_s,
         notice=notices.append,
-    ) as up:
-        robot_under_test = Robot(up, notices)
+    ) as emulation:
+        robot_under_test = Robot(emulation, notices)
         jobs.install(robot_under_test.shell, Deadline.after(30))
         evidence.begin(robot_under_test.shell, FOLDER, "sender", "wlan0")
         yield robot_under_test

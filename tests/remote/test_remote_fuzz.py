@@ -51,7 +51,7 @@ NAMES = st.sampled_from(["scan.bag", "scan/a", "scan", "../x", "/tmp/x", "scan/.
 FIELD = st.binary(min_size=12, max_size=12) | st.integers(0, 8**11 - 1).map(lambda size: b"%011o\0" % size)
 
 
-class Sender(LocalShell):
+class AnsweringRobot(LocalShell):
     """A robot that answers a fetch with these bytes, and all other calls with this result."""
 
     def __init__(self, home: Path, content: bytes = b"", *, code: int = 0, stderr: bytes = b"") -> None:
@@ -109,7 +109,7 @@ def fetched(content: bytes) -> dict[str, bytes] | None:
         into.mkdir(parents=True)
         output_text: FieldkitError | None = None
         try:
-            fetching.fetch(Sender(Path(folder), content), "x", "sender", "lo", into)
+            fetching.fetch(AnsweringRobot(Path(folder), content), "x", "sender", "lo", into)
         except FieldkitError as error:
             output_text = error
         assert output_text is None or harmless(output_text)
@@ -135,7 +135,7 @@ def test_archive_arrives_completely_or_not_at_all(files: dict[str, bytes], data:
     archive = b"".join(entry(name.encode(), content) for name, content in sent) + bytes(1024)
     if files:
         with tempfile.TemporaryDirectory() as folder:
-            fetching.fetch(Sender(Path(folder), archive), "x", "sender", "lo", Path(folder))
+            fetching.fetch(AnsweringRobot(Path(folder), archive), "x", "sender", "lo", Path(folder))
             assert {name: Path(folder, name).read_bytes() for name in files} == files
     hurt = bytearray(archive)
     place = data.draw(st.integers(0, len(archive) - 1))
@@ -174,7 +174,7 @@ def test_archives_of_another_tar_writer(kind: int, tmp_path: Path) -> None:
 )
 def test_invalid_archives_are_rejected(content: bytes, tmp_path: Path) -> None:
     with pytest.raises(EvidenceError):
-        fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
+        fetching.fetch(AnsweringRobot(tmp_path, content), "x", "sender", "lo", tmp_path)
 
 
 def test_files_of_another_robot_are_not_overwritten(tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_files_of_another_robot_are_not_overwritten(tmp_path: Path) -> None:
     sums = hashlib.sha256(b"y").hexdigest().encode() + b"  scan.bag\n"
     content = entry(b".sums-1", sums) + entry(b"scan.bag", b"y") + bytes(1024)
     with pytest.raises(EvidenceError, match="which it or another robot sent before"):
-        fetching.fetch(Sender(tmp_path, content), "x", "sender", "lo", tmp_path)
+        fetching.fetch(AnsweringRobot(tmp_path, content), "x", "sender", "lo", tmp_path)
     assert (tmp_path / "scan.bag").read_bytes() == b"x"
 
 
@@ -190,7 +190,7 @@ def test_damaged_header_is_reported(tmp_path: Path) -> None:
     content = bytearray(entry(b"scan.bag", b"y") + bytes(1024))
     content[0] ^= 1
     with pytest.raises(EvidenceError, match="arrived damaged: a header fails its checksum"):
-        fetching.fetch(Sender(tmp_path, bytes(content)), "x", "sender", "lo", tmp_path)
+        fetching.fetch(AnsweringRobot(tmp_path, bytes(content)), "x", "sender", "lo", tmp_path)
 
 
 @given(BYTES)
@@ -203,7 +203,7 @@ def test_output_of_a_robot_is_one_printable_line(data: bytes) -> None:
 @given(BYTES, st.integers(0, 255), st.sampled_from([b"", b"job.sh: ", b"job.sh: held ", b"job.sh: aborted 1 "]))
 def test_any_answer_of_the_script_raises_an_error_of_fieldkit(output_text: bytes, code: int, start: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        shell = Sender(Path(folder), output_text, code=code, stderr=start + output_text)
+        shell = AnsweringRobot(Path(folder), output_text, code=code, stderr=start + output_text)
         said_then: FieldkitError | None = None
         try:
             script.call(shell, "left", deadline=Deadline.after(1))
@@ -228,7 +228,7 @@ def test_invented_lock_of_a_robot_is_reported(
     code: int, output_text: bytes, kind: type[RobotError], tmp_path: Path
 ) -> None:
     with pytest.raises(kind) as caught:
-        script.call(Sender(tmp_path, code=code, stderr=output_text), "begin", deadline=Deadline.after(1))
+        script.call(AnsweringRobot(tmp_path, code=code, stderr=output_text), "begin", deadline=Deadline.after(1))
     assert caught.value.what.isprintable()
 
 
@@ -281,18 +281,18 @@ def test_errors_and_tables_show_markup_and_escapes_literally(
     assert not set(output) & set("\x1b\x07\u202e")
 
 
-class Endless:
+class EndlessChannel:
     """A channel whose sender never pauses."""
 
     eof_received = closed = False
-    taken = 0
+    read_bytes = 0
 
     def recv_ready(self) -> bool:
-        assert self.taken < 1 << 30, "reading does not stop"
+        assert self.read_bytes < 1 << 30, "reading does not stop"
         return True
 
     def recv(self, size: int) -> bytes:
-        self.taken += size
+        self.read_bytes += size
         return bytes(size)
 
     def send_ready(self) -> bool:
@@ -306,16 +306,16 @@ class Endless:
 
 
 def test_output_without_end_or_pause_is_limited() -> None:
-    channel, out = Endless(), io.BytesIO()
+    channel, out = EndlessChannel(), io.BytesIO()
     with pytest.raises(RobotError, match="sent more than 1000000 bytes"):
         drain(channel, out, stdin=b"x", deadline=Deadline.after(30), limit_bytes=10**6, robot="r")  # type: ignore[arg-type]
-    assert channel.taken < 1.1e6
+    assert channel.read_bytes < 1.1e6
 
 
 def test_list_of_hashes_of_any_size_needs_little_memory(tmp_path: Path) -> None:
     size = 100 << 20
 
-    class Big(LocalShell):
+    class LargeAnswer(LocalShell):
         def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
             with to.open("wb") as file:
                 file.write(header(b".sums-1", f"{size:011o}".encode() + b"\0", b"0"))
@@ -325,7 +325,7 @@ def test_list_of_hashes_of_any_size_needs_little_memory(tmp_path: Path) -> None:
     tracemalloc.start()
     try:
         with pytest.raises(EvidenceError):
-            fetching.fetch(Big(tmp_path), "f", "sender", "lo", tmp_path)
+            fetching.fetch(LargeAnswer(tmp_path), "f", "sender", "lo", tmp_path)
         assert tracemalloc.get_traced_memory()[1] < 10 << 20
     finally:
         tracemalloc.stop()

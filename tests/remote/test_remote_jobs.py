@@ -244,8 +244,8 @@ def test_repeated_start_reports_that_the_job_ended_before_it_was_ready(shell: Lo
 
 
 def test_job_that_is_not_ready_in_time_is_killed_and_its_log_reported(shell: LocalShell) -> None:
-    stubborn = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
-    job_spec = replace(stubborn, ready="log:up", ready_s=3)
+    ignoring_signals = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
+    job_spec = replace(ignoring_signals, ready="log:up", ready_s=3)
     with pytest.raises(RobotError, match="job job was not up in 3 s: still looking") as caught:
         jobs.start(shell, job_spec)
     assert FOLDER in caught.value.remedy
@@ -370,12 +370,12 @@ def test_job_that_starts_during_an_abort_does_not_run(
 
 def test_lost_caller_that_requested_the_end_is_not_awaited_forever(shell: LocalShell) -> None:
     """The link was cut while the job ran: the SSH server has not detected it, and keeps standard input open."""
-    asked = shell.home / "asked"
-    replace_program(shell, "timeout", f'echo "$1" >>"{asked}"; shift; exec {{program}} 1 "$@"')
+    query_log = shell.home / "queries"
+    replace_program(shell, "timeout", f'echo "$1" >>"{query_log}"; shift; exec {{program}} 1 "$@"')
     pending = jobs.begin(shell, job("sh", "-c", "exit 3", limit_s=20))
     assert isinstance(pending.session, LocalSession)
     assert pending.session.process.wait(30) == 3
-    (seconds,) = asked.read_text(encoding="ascii").split()
+    (seconds,) = query_log.read_text(encoding="ascii").split()
     assert 20 < int(seconds) <= 20 + jobs.READY_S + 10
 
 
@@ -703,7 +703,7 @@ def test_script_with_other_owner_or_content_is_replaced(shell: LocalShell, damag
     assert not path.is_symlink()
 
 
-class Greeting(LocalShell):
+class GreetingRobot(LocalShell):
     """A robot whose `.bashrc` prints a text before each command."""
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
@@ -714,7 +714,7 @@ class Greeting(LocalShell):
 
 def test_login_shell_with_a_greeting_is_reported(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="its login shell answers every command with 'ROS noetic'") as caught:
-        jobs.install(Greeting(tmp_path), Deadline.after(30))
+        jobs.install(GreetingRobot(tmp_path), Deadline.after(30))
     assert "case $- in" in caught.value.remedy
 
 

@@ -23,7 +23,7 @@ LARGE = random.Random(7).randbytes(2 * PIECE_BYTES + 12_345)
 SMALL = b"#ROSBAG V2.0\n" * 100
 
 
-class Flaky(LocalShell):
+class LossyRobot(LocalShell):
     """A robot whose link is lost at some pieces, and which records the requested pieces."""
 
     def __init__(self, home: Path, path: str = os.environ["PATH"]) -> None:
@@ -41,10 +41,10 @@ class Flaky(LocalShell):
 
 
 @pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
-def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Flaky]:
+def robot(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LossyRobot]:
     home = tmp_path / "home"
     home.mkdir()
-    flaky_shell = Flaky(home, userland_path(request.param, tmp_path / "bin"))
+    flaky_shell = LossyRobot(home, userland_path(request.param, tmp_path / "bin"))
     jobs.install(flaky_shell, Deadline.after(30))
     evidence.begin(flaky_shell, FOLDER, "sender", "lo", need_kib=0)
     (home / FOLDER / "scan").mkdir()
@@ -62,7 +62,7 @@ def into(tmp_path: Path) -> Path:
     return folder
 
 
-def fetch(robot: Flaky, into: Path, **options: object) -> None:
+def fetch(robot: LossyRobot, into: Path, **options: object) -> None:
     fetching.fetch(robot, FOLDER, "sender", "lo", into, **options)  # type: ignore[arg-type]
 
 
@@ -73,7 +73,7 @@ def names(folder: Path) -> set[str]:
 WHOLE = {"camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sender-after.txt"}
 
 
-def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: Flaky, into: Path) -> None:
+def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: LossyRobot, into: Path) -> None:
     output_text: list[tuple[str, float]] = []
     fetch(robot, into, progress=FetchProgress(lambda text, left_s: output_text.append((text, left_s))))
     assert names(into) == WHOLE
@@ -83,7 +83,9 @@ def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: F
     assert robot.pieces == [0, 1, 2, 0, 1, 2]
 
 
-def test_two_robots_cannot_use_the_same_file_name(robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_robots_cannot_use_the_same_file_name(
+    robot: LossyRobot, into: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     rename = Path.rename
 
     def late(self: Path, to: Path) -> Path:
@@ -115,7 +117,7 @@ def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str,
     home, into, tools = (tmp_path / name for name in ("home", "into", "bin"))
     for folder in (home, into, tools):
         folder.mkdir()
-    robot = Flaky(home, f"{tools}:{os.environ['PATH']}")
+    robot = LossyRobot(home, f"{tools}:{os.environ['PATH']}")
     jobs.install(robot, Deadline.after(30))
     evidence.begin(robot, FOLDER, "sender", "lo", need_kib=0)
     (home / FOLDER / "camera.bag").write_bytes(LARGE)
@@ -129,7 +131,7 @@ def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str,
     robot.close()
 
 
-def test_interrupted_fetch_continues_from_its_last_piece(robot: Flaky, into: Path) -> None:
+def test_interrupted_fetch_continues_from_its_last_piece(robot: LossyRobot, into: Path) -> None:
     robot.lost_at = lambda number: number == 2
     with pytest.raises(LinkError):
         fetch(robot, into)
@@ -143,7 +145,7 @@ def test_interrupted_fetch_continues_from_its_last_piece(robot: Flaky, into: Pat
     assert (into / "camera.bag").read_bytes() == LARGE[::-1]
 
 
-def test_wrong_piece_of_an_earlier_fetch_is_detected_and_fetched_again(robot: Flaky, into: Path) -> None:
+def test_wrong_piece_of_an_earlier_fetch_is_detected_and_fetched_again(robot: LossyRobot, into: Path) -> None:
     (into / ".sender.camera.bag.part").write_bytes(bytes(PIECE_BYTES + 99))
     with pytest.raises(EvidenceError, match=r"hash differs: camera\.bag"):
         fetch(robot, into)
@@ -154,7 +156,7 @@ def test_wrong_piece_of_an_earlier_fetch_is_detected_and_fetched_again(robot: Fl
 
 
 def test_more_than_expected_stays_on_the_robot_and_is_reported(
-    robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
+    robot: LossyRobot, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fetching, "ALWAYS_ALLOWED_BYTES", 1000)
     monkeypatch.setattr(fetching, "UNEXPECTED_SHARE", 0.0)
@@ -172,14 +174,14 @@ def test_more_than_expected_stays_on_the_robot_and_is_reported(
 
 
 def test_more_than_the_free_space_stays_on_the_robot_and_is_reported(
-    robot: Flaky, into: Path, monkeypatch: pytest.MonkeyPatch
+    robot: LossyRobot, into: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(files, "free_bytes", lambda _: fetching.RESERVE_BYTES + 5_000_000)
     with pytest.raises(EvidenceError, match=r"17 MB must be fetched .* but 5\.0 MB are free here"):
         fetch(robot, into)
 
 
-def test_file_that_became_smaller_is_reported(robot: Flaky, into: Path) -> None:
+def test_file_that_became_smaller_is_reported(robot: LossyRobot, into: Path) -> None:
     def cut(number: int) -> bool:
         if number == 1:
             os.truncate(robot.home / FOLDER / "camera.bag", PIECE_BYTES + 10)
@@ -190,13 +192,13 @@ def test_file_that_became_smaller_is_reported(robot: Flaky, into: Path) -> None:
         fetch(robot, into)
 
 
-def test_missing_folder_is_reported(robot: Flaky, into: Path) -> None:
+def test_missing_folder_is_reported(robot: LossyRobot, into: Path) -> None:
     evidence.discard(robot, "trial")
     with pytest.raises(NoFolderError, match=rf"it no longer has folder {FOLDER}($|: the robot booted \d+ s ago)"):
         fetch(robot, into)
 
 
-def test_unfetched_folders_are_not_deleted(robot: Flaky) -> None:
+def test_unfetched_folders_are_not_deleted(robot: LossyRobot) -> None:
     for number in (2, 3):
         evidence.begin(robot, jobs.work_folder("trial", f"udp-0{number}-1"), "sender", "lo", need_kib=0)
     evidence.discard(robot, "trial", kept_folders=[FOLDER, jobs.work_folder("trial", "udp-03-1")])

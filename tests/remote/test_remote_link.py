@@ -39,7 +39,7 @@ def soon() -> Deadline:
     return Deadline.after(SOON)
 
 
-class Clock:
+class DeadlineClock:
     """A clock of deadlines that does not advance before a test causes a hang: earlier steps have no timeout."""
 
     def __init__(self) -> None:
@@ -56,8 +56,8 @@ class Clock:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    fake_clock = Clock()
+def clock(monkeypatch: pytest.MonkeyPatch) -> DeadlineClock:
+    fake_clock = DeadlineClock()
     monkeypatch.setattr("fieldkit.core.deadline.time", fake_clock)
     return fake_clock
 
@@ -155,7 +155,13 @@ def fakes() -> Iterator[Callable[[Callable[[socket.socket], object]], FakeServer
     ],
 )
 def test_any_hang_of_a_server_is_reported(
-    server: Server, rsa: paramiko.RSAKey, fakes: Callable[..., FakeServer], clock: Clock, *, at: str, output_text: str
+    server: Server,
+    rsa: paramiko.RSAKey,
+    fakes: Callable[..., FakeServer],
+    clock: DeadlineClock,
+    *,
+    at: str,
+    output_text: str,
 ) -> None:
     def serve(stream: socket.socket) -> object:
         if at in {"banner", "keys"}:
@@ -284,7 +290,7 @@ def test_hanging_name_resolution_has_a_timeout(server: Server) -> None:
 
 
 def test_hanging_ssh_agent_has_a_timeout(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: Clock
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock: DeadlineClock
 ) -> None:
     with socket.socket(socket.AF_UNIX) as agent, ExitStack() as asked:
         agent.bind(str(tmp_path / "agent"))
@@ -629,7 +635,7 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     notices: list[str],
     *,
     pool: ThreadPoolExecutor,
-    clock: Clock,
+    clock: DeadlineClock,
     ends_by: str,
 ) -> None:
     shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
@@ -782,10 +788,10 @@ def test_close_ends_the_wait_for_a_lost_link(
 def test_close_ends_a_hanging_login(
     server: Server, fakes: Callable[..., FakeServer], pool: ThreadPoolExecutor
 ) -> None:
-    mute = fakes(lambda stream: None)
-    shell = server.shell(connect=mute.connect)
+    silent_server = fakes(lambda stream: None)
+    shell = server.shell(connect=silent_server.connect)
     done = pool.submit(shell.run, ("true",), deadline=soon())
-    wait_until(lambda: len(mute.transports) == 1, soon())
+    wait_until(lambda: len(silent_server.transports) == 1, soon())
     assert "fieldkit closed the connection" in str(ends_soon(done, shell))
 
 

@@ -37,7 +37,7 @@ def site(access: str) -> str:
     return SITE.format(access=access, same=f"{access.replace('127.0.0.1', 'localhost')}, address: 127.0.0.2")
 
 
-class Memory(KeyringBackend):
+class MemoryKeyring(KeyringBackend):
     """A keyring in memory."""
 
     priority = 1.0
@@ -54,10 +54,10 @@ class Memory(KeyringBackend):
 
 
 @pytest.fixture
-def memory() -> Iterator[Memory]:
-    before, ours = keyring.get_keyring(), Memory()
-    keyring.set_keyring(ours)
-    yield ours
+def memory() -> Iterator[MemoryKeyring]:
+    before, keyring_in_memory = keyring.get_keyring(), MemoryKeyring()
+    keyring.set_keyring(keyring_in_memory)
+    yield keyring_in_memory
     keyring.set_keyring(before)
 
 
@@ -118,14 +118,14 @@ def test_field_backend_prompts_once_per_robot_and_run(password_server: Server, t
     assert prompts == [("root", "localhost", "turtlebot-1"), ("root", "127.0.0.1", "duckiedrone-1")]
 
 
-def test_keyring_entry_is_user_at_host(memory: Memory) -> None:
+def test_keyring_entry_is_user_at_host(memory: MemoryKeyring) -> None:
     memory.set_password("fieldkit", "duckie@192.168.4.1", SECRET)
     assert passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
 
 
 @pytest.mark.parametrize("path", ["with", "without"])
 def test_missing_keyring_entry_is_reported_with_a_command(
-    memory: Memory, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    memory: MemoryKeyring, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = tmp_path / "keyring"
     if path == "with":

@@ -10,7 +10,7 @@ from fieldkit.core.model import Role
 from fieldkit.remote import evidence, jobs
 from fieldkit.trial.running.locks import Holder, locked
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, mount_workspace
-from tests.helpers.host import Untouched
+from tests.helpers.host import NamespaceComparison
 from tests.helpers.userlands import LocalShell, userland_path
 
 pytestmark = pytest.mark.emulated
@@ -21,7 +21,7 @@ FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 
 
 @pytest.fixture
-def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
+def place(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
     """A folder in memory, in separate mounts of the test."""
     with mount_workspace(tmp_path) as folder:
         yield folder

@@ -15,7 +15,7 @@ from fieldkit.measure.transfers import recoveries
 from fieldkit.remote import fetching
 from fieldkit.trial.owners import FileOwners
 from tests.helpers.casts import los_plan
-from tests.remote.test_remote_fuzz import Sender, entry
+from tests.remote.test_remote_fuzz import AnsweringRobot, entry
 
 PLAN = los_plan()
 OWNERS = FileOwners.of(PLAN.procedure, PLAN.scene(RepeatId(Protocol.UDP, 1), ""))
@@ -34,7 +34,7 @@ def archive(*names: str, large: str = "") -> bytes:
 
 
 def fetch(data: bytes, into: Path, role: Role = Role.SENDER) -> None:
-    shell = Sender(into, data)
+    shell = AnsweringRobot(into, data)
     fetching.fetch(shell, "x", role, "lo", into, foreign=lambda name: OWNERS.refusal(role, name))
 
 

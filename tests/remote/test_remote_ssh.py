@@ -150,8 +150,8 @@ def test_wait_continues_after_this_process_was_suspended(shell: SshShell, monkey
 
 
 def test_silent_server_causes_a_timeout(server: Server) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as mute:
-        port = mute.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as silent_server:
+        port = silent_server.getsockname()[1]
         shell = server.shell(connect=lambda timeout_s: socket.create_connection(("127.0.0.1", port), timeout_s))
         with pytest.raises(LinkError):
             shell.run(("true",), deadline=Deadline.after(0.5))

@@ -71,8 +71,8 @@ def give_iw(tmp_path: Path, link_file: str = "link-station") -> None:
     files["link"] = shlex.quote(str(link))
     cases = "\n".join(f"{verb}) exec cat {file} ;;" for verb, file in files.items())
     iw = tmp_path / "bin" / "iw"
-    asked = shlex.quote(str(tmp_path / "asked"))
-    iw.write_text(f'#!/bin/sh\necho "$*" >>{asked}\ncase $3 in\n{cases}\n*) exit 1 ;;\nesac\n', encoding="utf-8")
+    query_log = shlex.quote(str(tmp_path / "queries"))
+    iw.write_text(f'#!/bin/sh\necho "$*" >>{query_log}\ncase $3 in\n{cases}\n*) exit 1 ;;\nesac\n', encoding="utf-8")
     iw.chmod(0o755)
 
 
@@ -106,16 +106,16 @@ def test_link_is_sampled_until_its_folder_is_packed(shell: LocalShell, tmp_path:
     after = host.state(into / "sender-after.txt")
     assert after.endings is not None
     assert after.endings["link"].cause is Cause.STOPPED
-    asked = (tmp_path / "asked").read_text().splitlines()
-    assert "dev wlan0 station get 04:f0:21:32:3f:d2" in asked, "of its cell, which some drivers list nowhere"
+    query_log = (tmp_path / "queries").read_text().splitlines()
+    assert "dev wlan0 station get 04:f0:21:32:3f:d2" in query_log, "of its cell, which some drivers list nowhere"
 
 
 def test_all_stations_of_an_access_point_are_sampled(shell: LocalShell, tmp_path: Path) -> None:
     give_iw(tmp_path, "link-none")
     begin(shell)
-    asked = (tmp_path / "asked").read_text()
-    assert "station dump" in asked
-    assert "station get" not in asked
+    query_log = (tmp_path / "queries").read_text()
+    assert "station dump" in query_log
+    assert "station get" not in query_log
     evidence.end_jobs(shell, FOLDER)
     assert jobs.list_running(shell, Deadline.after(30)) == ()
 
@@ -163,12 +163,12 @@ def test_failed_sample_does_not_stop_the_sampler(shell: LocalShell, tmp_path: Pa
     )
     written = begin(shell)
     lost.touch()
-    looks = written.read_text().count(" link <==")
+    n_samples = written.read_text().count(" link <==")
     # The first sample may be older; a failed one was followed by another.
-    wait_until(lambda: written.read_text().count(" link <==") > looks + 1, Deadline.after(60))
+    wait_until(lambda: written.read_text().count(" link <==") > n_samples + 1, Deadline.after(60))
     lost.unlink()
-    seen = written.read_text().count("Connected to ")
-    wait_until(lambda: written.read_text().count("Connected to ") > seen, Deadline.after(60))
+    n_connected = written.read_text().count("Connected to ")
+    wait_until(lambda: written.read_text().count("Connected to ") > n_connected, Deadline.after(60))
     evidence.end_jobs(shell, FOLDER)
 
 

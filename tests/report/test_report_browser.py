@@ -28,13 +28,13 @@ def browser() -> Iterator[Browser]:
 def lawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the report of synthetic trials; return its path."""
     folder = tmp_path_factory.mktemp("lawn")
-    tables.write(folder, [*lawns.lawn(), *dead()], "all.csv")
+    tables.write(folder, [*lawns.lawn(), *rows_without_reply()], "all.csv")
     run = run_here(folder, "report", "all.csv")
     assert run.code == 0, run.err
     return folder / "report.html"
 
 
-def dead() -> list[tables.RepeatRow]:
+def rows_without_reply() -> list[tables.RepeatRow]:
     """Return repeats behind the wall in which nothing arrived."""
     lost = {"datagrams_received": 0, "datagram_loss": 1.0, "rtt_median_s": None, "transfer_s": None}
     place = {"scenario": "nlos", "procedure": "nlos", "distance": "60m", "distance_m": 60.0, "trial": "dead"}

@@ -85,14 +85,14 @@ def test_point_shows_the_number_of_repeats_with_a_value() -> None:
 
 
 def test_line_is_broken_at_missing_values_and_very_wide_intervals() -> None:
-    near = [row for metres in (10, 20, 30, 40) for row in at(metres)]
-    (series,) = panel_of(curves(parsed(near), "rtt_median_s")).series
+    measured_rows = [row for metres in (10, 20, 30, 40) for row in at(metres)]
+    (series,) = panel_of(curves(parsed(measured_rows), "rtt_median_s")).series
     assert (series.join, set(series.breaks)) == ("line", set())
-    lost = [*near, *at(25, 2, **LOST)]
+    lost = [*measured_rows, *at(25, 2, **LOST)]
     (series,) = panel_of(curves(parsed(lost), "rtt_median_s")).series
     assert set(series.breaks) == {1}
     # The interval of two very different repeats spans the whole axis.
-    wide = [*near, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
+    wide = [*measured_rows, *(replace(row, rtt_median_s=0.001 + 0.03 * n) for n, row in enumerate(at(25, 2)))]
     (series,) = panel_of(curves(parsed(wide), "rtt_median_s")).series
     assert set(series.breaks) == {1, 2}
 

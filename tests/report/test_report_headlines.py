@@ -32,10 +32,10 @@ def texts(headline: Headline) -> list[str]:
 
 
 def test_condition_without_arrivals_precedes_the_largest_loss() -> None:
-    near = [lawns.row(number) for number in (1, 2)]
+    near_rows = [lawns.row(number) for number in (1, 2)]
     middle = [lawns.row(n, distance="90m", distance_m=90.0, rtt_median_s=0.05) for n in (1, 2)]
     lost = [lawns.row(number, **FAR, **LOST) for number in (1, 2, 3)]
-    by_subject = lines([*near, *middle, *lost])
+    by_subject = lines([*near_rows, *middle, *lost])
     assert by_subject["Repeats"] == ["7 of 7 valid", "nothing arrived in 3 repeats UDP, NLOS, 60m (3 of 3)"]
     assert by_subject["UDP datagram loss"][0].startswith("most 100 % [43.")
     assert by_subject["UDP datagram loss"][0].endswith("NLOS, 60m")

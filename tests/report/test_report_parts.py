@@ -228,7 +228,7 @@ def test_warnings_of_a_page(tmp_path: Path) -> None:
 
 def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
     evidence = load_evidence(table(tmp_path, lawns.lawn(4)))
-    paragraph = summary.paragraph(aggregate(evidence.repeats), evidence).replace("\N{NO-BREAK SPACE}", " ")
+    paragraph = summary.paragraph(aggregate(evidence.repeats), evidence, {}).replace("\N{NO-BREAK SPACE}", " ")
     assert paragraph == (
         "24 trials of los and nlos on 2026-11-21 12:00 UTC: 10ft to 55ft; "
         "TCP and UDP; master and masterless; emulated and field robots. 192 attempts: 176 valid, 16 void. "
@@ -270,8 +270,8 @@ def test_report_of_topics_has_their_headlines_and_charts(tmp_path: Path) -> None
     topic = {"topic_sent": 20, "topic_received": 18, "topic_loss": 0.1, "topic_delay_median_s": 0.03}
     columns = trial_columns(topic_columns.COLUMNS)
     path = tmp_path / "trial.csv"
-    far = {"distance": "20ft", "distance_m": 6.096}
-    rows = [{**lawns.row(number), **topic, **place} for place in ({}, far) for number in (1, 2)]
+    farther = {"distance": "20ft", "distance_m": 6.096}
+    rows = [{**lawns.row(number), **topic, **place} for place in ({}, farther) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     evidence = load_evidence(read([path], columns))
     cells = aggregate(evidence.repeats)
@@ -290,8 +290,8 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
     counts = {"iperf3_datagrams_sent": 100, "iperf3_datagrams_received": 90}
     columns = trial_columns((*iperf3.COLUMNS, *iperf3_load.COLUMNS))
     path = tmp_path / "trial.csv"
-    far = {"distance": "20ft", "distance_m": 6.096}
-    rows = [{**lawns.row(number), **tested, **counts, **place} for place in ({}, far) for number in (1, 2)]
+    farther = {"distance": "20ft", "distance_m": 6.096}
+    rows = [{**lawns.row(number), **tested, **counts, **place} for place in ({}, farther) for number in (1, 2)]
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     page = build_contents(read([path], columns), title="", repeat="", command=["fieldkit"])
     titles = {section.name: [chart.title for chart in section.charts] for section in page.against_distance}
@@ -312,8 +312,10 @@ def plain_text(text: str) -> str:
 def test_pings_of_different_sizes_have_separate_charts(tmp_path: Path) -> None:
     udp = {"rtt_payload_bytes": 8192}
     tcp = {"protocol": "tcp", "rtt_payload_bytes": 502, "rtt_median_s": 0.004}
-    far = {"distance": "20ft", "distance_m": 6.096}
-    rows = [lawns.row(number, **values, **place) for values in (udp, tcp) for place in ({}, far) for number in (1, 2)]
+    farther = {"distance": "20ft", "distance_m": 6.096}
+    rows = [
+        lawns.row(number, **values, **place) for values in (udp, tcp) for place in ({}, farther) for number in (1, 2)
+    ]
     evidence = load_evidence(table(tmp_path, rows))
     cells = aggregate(evidence.repeats)
     of_rtt = list(distance.charts(cells, Identities(cells), evidence, ["rtt_median_s"]))
@@ -366,10 +368,10 @@ def test_los_and_nlos_keep_their_style_among_other_procedures(tmp_path: Path, pr
     cells = aggregate(table(tmp_path, rows))
     identities = Identities(cells)
     by_procedure = {str(cell.key["procedure"]): identities.of(cell) for cell in cells}
-    looks = {(identity.style.colour, identity.style.marker): name for name, identity in by_procedure.items()}
-    assert len(looks) == len(names)
-    assert looks.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
-    assert looks.get(("red", "s")) == ("nlos" if "nlos" in names else None)
+    names_by_style = {(identity.style.colour, identity.style.marker): name for name, identity in by_procedure.items()}
+    assert len(names_by_style) == len(names)
+    assert names_by_style.get(("blue", "o")) == next((name for name in ("los", "driveaway") if name in names), None)
+    assert names_by_style.get(("red", "s")) == ("nlos" if "nlos" in names else None)
     several = scenarios.count("los") > 1
     assert {name: identity.label for name, identity in by_procedure.items()} == {
         name: name.upper() if name in {"los", "nlos"} else f"LOS, {name}" if several else "LOS" for name in names
@@ -383,5 +385,6 @@ def test_edited_table_cannot_refer_to_other_folders(tmp_path: Path) -> None:
 
 def test_a_title_names_few_procedures(tmp_path: Path) -> None:
     rows = [tables.replace(tables.COMPARABLE, procedure=f"run {number}") for number in range(6)]
-    assert summary.title(aggregate(table(tmp_path, rows))) == "Loss and delay: run 0, run 1 and 4 others"
-    assert summary.title(aggregate(table(tmp_path / "three", rows[:3]))) == "Loss and delay: run 0, run 1 and run 2"
+    assert summary.title(aggregate(table(tmp_path, rows)), {}) == "Loss and delay: run 0, run 1 and 4 others"
+    three = aggregate(table(tmp_path / "three", rows[:3]))
+    assert summary.title(three, {}) == "Loss and delay: run 0, run 1 and run 2"

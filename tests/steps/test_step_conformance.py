@@ -298,7 +298,7 @@ def test_every_column_has_a_value_or_a_reason(valid: Valid) -> None:
 def test_size_estimate_is_within_a_factor_of_two(valid: Valid) -> None:
     """Small text files do not count."""
     step, scene = of_kind(valid.kind, valid.plan).step, valid.plan.scenes()[0]
-    estimate = sum(step.bytes_left(scene, role) for role in valid.plan.cast) if isinstance(step, UsesSpace) else 0.0
+    estimate = sum(step.stored_bytes(scene, role) for role in valid.plan.cast) if isinstance(step, UsesSpace) else 0.0
     actual = sum((valid.evidence / name).stat().st_size for name in step.files() if (valid.evidence / name).is_file())
     if max(estimate, actual) > TEXT_BYTES:
         assert estimate / 2 <= actual <= 2 * estimate

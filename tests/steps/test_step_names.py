@@ -101,7 +101,7 @@ def test_plan_lists_transfers_pings_and_captures() -> None:
         ("up", "imu.bag", "up.recv.bag", ("sender.pcap", "receiver.pcap")),
         ("bare", "scan.bag", "bare.recv.bag", (None, None)),
     ]
-    pings = [(ping.name, ping.role, ping.file) for ping in planned_evidence.pingings(plan)]
+    pings = [(ping.name, ping.role, ping.file) for ping in planned_evidence.ping_sources(plan)]
     assert pings == [("up", Role.SENDER, "up.ping.txt"), ("", Role.RECEIVER, "ping.txt")]
     assert planned_evidence.captures(plan) == {
         "sender.pcap": Role.SENDER,
@@ -140,8 +140,8 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
         log = name.replace("sender", "sender-capture.log").replace("receiver", "receiver-capture.log")
         (tmp_path / log).write_text(LOG.format(len(frames)), encoding="ascii")
     plan = plan_of()
-    judged = gates.judge(plan, REPEAT, AttemptEvidence(tmp_path))
-    values, missing = judged.measured.values, judged.measured.missing
+    verdict = gates.judge(plan, REPEAT, AttemptEvidence(tmp_path))
+    values, missing = verdict.measured.values, verdict.measured.missing
     assert (values["up.file_loss"], values["up.rtt_median_s"], values["rtt_median_s"]) == (0, 0.016, 0.004)
     assert (values["sender_captured"], values["inner.sender_captured"]) == (len(frames), len(frames))
     assert missing["inner.receiver_captured"] == "the receiver does not capture"
@@ -149,7 +149,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
     assert values["up.paper_delay_s"] == 0.016
     assert "bare.paper_delay_s" in missing
     assert {name for name in (*values, *missing) if name.startswith(("file_loss", "link_down"))} == set()
-    assert "bare: bare.recv.bag is missing" in judged.problems
+    assert "bare: bare.recv.bag is missing" in verdict.problems
     assert "cut.link_down_outage_s" in missing
     text = rows.describe(plan, values)
     assert text.startswith(
@@ -171,7 +171,7 @@ def test_gates_and_rows_prefix_columns_reasons_and_summaries(tmp_path: Path) -> 
         (
             "transfer: {name: bare",
             "transfer: {name: up",
-            "a transfer named up is defined twice; give one another name",
+            "a transfer named up is defined twice; rename one",
         ),
         ("name: imu}", "name: scan}", "a recording on sender is defined twice; give each a name:"),
         ("file: imu", "file: odom", "sends odom, but no recording of that name is made on sender before it"),

@@ -24,7 +24,7 @@ from fieldkit.trial import gates
 from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from tests.helpers.casts import CAST
-from tests.helpers.imagined import REFUSED, Attempt, Sent, Truth
+from tests.helpers.imagined import REFUSED, Attempt, AttemptTruth, TransferTruth
 from tests.helpers.nightly import mark_nightly
 
 HEAD = "name: any\nsummary: any\nscenario: los\ntopology: master\nprotocols: [tcp, udp]\nrepeats: 1\n"
@@ -181,13 +181,13 @@ def _more(draw: random.Random, inside: list[Any], source: str, target: str) -> l
     return inside
 
 
-OTHERS = {
+OTHER_STEPS = {
     "protocol": st.sampled_from(list(Protocol)),
     "loss": st.sampled_from([0.0, 0.2]),
     "seed": st.integers(0, 99),
 }
 
-SEEN: Counter[str] = Counter()
+OUTCOMES: Counter[str] = Counter()
 
 
 def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
@@ -200,7 +200,7 @@ def loaded(steps: list[Any]) -> Procedure | ConfigurationError:
 
 
 @pytest.mark.emulated  # needs tcpdump, which filters the captures
-@given(steps=ANYTHING, **OTHERS)
+@given(steps=ANYTHING, **OTHER_STEPS)
 def test_any_procedure_is_measured_correctly_or_rejected(
     steps: list[Any], protocol: Protocol, loss: float, seed: int
 ) -> None:
@@ -219,28 +219,28 @@ def judge(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
     """Load a procedure; if it is valid, simulate it, measure it, and compare the result with the truth."""
     procedure = loaded(steps)
     if isinstance(procedure, ConfigurationError):
-        SEEN["refused when loaded"] += 1
+        OUTCOMES["refused when loaded"] += 1
         assert int(procedure.where.removeprefix("any.yaml:")) > HEAD.count("\n"), "the line of a step"
         assert procedure.remedy
         return
     request = TrialRequest(procedure=procedure, distance=parse_distance("30ft"))
     plan = make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, tzinfo=UTC))
     if plan.refusals({}):
-        SEEN["refused by preflight"] += 1
+        OUTCOMES["refused by a preflight check"] += 1
         return
     with tempfile.TemporaryDirectory() as folder:
         repeat = RepeatId(protocol, 1)
         truth = Attempt(plan, repeat, Path(folder), loss, random.Random(seed)).play()
-        judged = gates.judge(plan, repeat, AttemptEvidence(Path(folder)))
-    assert judged.problems == ()
-    SEEN["valid"] += 1
-    _compare(procedure, protocol, truth, judged.measured.values, judged.measured.missing)
+        verdict = gates.judge(plan, repeat, AttemptEvidence(Path(folder)))
+    assert verdict.problems == ()
+    OUTCOMES["valid"] += 1
+    _compare(procedure, protocol, truth, verdict.measured.values, verdict.measured.missing)
 
 
 def _compare(
     procedure: Procedure,
     protocol: Protocol,
-    truth: Truth,
+    truth: AttemptTruth,
     values: Mapping[str, Value],
     missing: Mapping[str, str],
 ) -> None:
@@ -263,10 +263,10 @@ def _compare(
         loss, cookie_bytes = step_prefixed(name, "iperf3_captured_loss"), truth.cookies_bytes[name]
         sent_bytes, came_bytes = (1400 * packets + cookie_bytes for packets in (sent, received))
         assert loss in missing or values[loss] == 1 - came_bytes / sent_bytes
-        SEEN["valid, iperf3 captured"] += loss in values
-    SEEN["valid, two pings or more"] += len(truth.pings) > 1
-    SEEN["valid, two transfers or more"] += len(truth.transfers) > 1
-    SEEN["valid, at the same time"] += any(nest.parallel for placed in procedure.walk() for nest in placed.within)
+        OUTCOMES["valid, iperf3 captured"] += loss in values
+    OUTCOMES["valid, two pings or more"] += len(truth.pings) > 1
+    OUTCOMES["valid, two transfers or more"] += len(truth.transfers) > 1
+    OUTCOMES["valid, at the same time"] += any(nest.parallel for placed in procedure.walk() for nest in placed.within)
     for placed in procedure.walk():
         if isinstance(placed.step, TransferStep):
             sent_file = truth.transfers[placed.step.prefix]
@@ -274,11 +274,15 @@ def _compare(
             refused = step_prefixed(placed.step.prefix, "receiver_udp_buffer_errors")
             others = truth.udp_to.count(sent_file.target) - (protocol is Protocol.UDP)
             assert "only one counter for all of it" in missing[refused] if others else values[refused] == REFUSED
-            SEEN["valid, UDP of several to one"] += bool(others)
+            OUTCOMES["valid, UDP of several to one"] += bool(others)
 
 
 def _compare_transfer(
-    placed: PlacedStep, protocol: Protocol, sent: Sent, values: Mapping[str, Value], missing: Mapping[str, str]
+    placed: PlacedStep,
+    protocol: Protocol,
+    sent: TransferTruth,
+    values: Mapping[str, Value],
+    missing: Mapping[str, str],
 ) -> None:
     step = placed.step
     assert isinstance(step, TransferStep)
@@ -292,26 +296,27 @@ def _compare_transfer(
         assert values[packets] == -(-sent.sent_bytes // 8192)
     captured = {role for nest in placed.within for role in nest.captures()}
     if not {step.sender, step.receiver} <= captured:
-        SEEN["valid, transfer not captured at both ends"] += 1
+        OUTCOMES["valid, transfer not captured at both ends"] += 1
         assert step_prefixed(step.prefix, "byte_loss") in missing
     elif protocol is Protocol.UDP:
-        SEEN["valid, UDP captured"] += 1
+        OUTCOMES["valid, UDP captured"] += 1
         assert value("ip_packets_sent") == sent.packets_sent
         assert value("ip_loss") == 1 - (sent.packets_sent - sent.packets_lost) / sent.packets_sent
     else:
-        SEEN["valid, TCP captured"] += 1
+        OUTCOMES["valid, TCP captured"] += 1
         assert value("tcp_retransmitted_segments") == sent.retransmitted
         assert value("byte_loss") == 0
 
 
 @pytest.mark.emulated
 def test_enough_procedures_of_each_kind_were_tried(record_property: Any) -> None:  # noqa: ANN401 (of pytest)
-    if not SEEN:
+    if not OUTCOMES:
         pytest.fail("this runs behind the test above, in one process")
-    record_property("result", f"random procedures: {dict(sorted(SEEN.items()))}")
+    record_property("result", f"random procedures: {dict(sorted(OUTCOMES.items()))}")
     assert (
-        min(SEEN[outcome] for outcome in ("refused when loaded", "valid, UDP captured", "valid, TCP captured")) >= 20
+        min(OUTCOMES[outcome] for outcome in ("refused when loaded", "valid, UDP captured", "valid, TCP captured"))
+        >= 20
     )
-    assert min(SEEN[outcome] for outcome in ("valid, two pings or more", "valid, two transfers or more")) >= 8
-    assert min(SEEN[outcome] for outcome in ("valid, at the same time", "valid, iperf3 captured")) >= 10
-    assert SEEN["valid, UDP of several to one"] >= 5
+    assert min(OUTCOMES[outcome] for outcome in ("valid, two pings or more", "valid, two transfers or more")) >= 8
+    assert min(OUTCOMES[outcome] for outcome in ("valid, at the same time", "valid, iperf3 captured")) >= 10
+    assert OUTCOMES["valid, UDP of several to one"] >= 5

@@ -73,12 +73,17 @@ def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
 
 def test_finished_repeats_with_a_dead_link_are_used() -> None:
     """A campaign estimated 4 min and took 19: after its first trial with dead links, the rest can be estimated."""
-    near, far = at("10m"), at("90m")
-    before = of_trial(far, [FinishedRepeat(near, protocol, 8.0) for protocol in LOS.protocols])
+    near_plan, far_plan = at("10m"), at("90m")
+    before = of_trial(far_plan, [FinishedRepeat(near_plan, protocol, 8.0) for protocol in LOS.protocols])
     dead_s = sum(estimates.dead_link_s(LOS.procedure, protocol) for protocol in LOS.protocols) * LOS.repeats
     assert before.most_s == pytest.approx(dead_s)
     after = of_trial(
-        at("80m"), [FinishedRepeat(near, TCP, 8.0), FinishedRepeat(far, TCP, 128.0), FinishedRepeat(near, UDP, 8.0)]
+        at("80m"),
+        [
+            FinishedRepeat(near_plan, TCP, 8.0),
+            FinishedRepeat(far_plan, TCP, 128.0),
+            FinishedRepeat(near_plan, UDP, 8.0),
+        ],
     )
     assert after.likely_s >= LOS.repeats * (8.0 + 128.0) / 2
 

@@ -23,13 +23,13 @@ from fieldkit.trial.running.stop import Stop
 from tests.helpers import recorded
 from tests.helpers.casts import los_plan
 
-OURS = "ours, and of no interest to others\n"
+FOREIGN_TEXT = "ours, and of no interest to others\n"
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Path:
+def foreign_file(tmp_path: Path) -> Path:
     path = tmp_path / "ours"
-    path.write_text(OURS, encoding="utf-8")
+    path.write_text(FOREIGN_TEXT, encoding="utf-8")
     return path
 
 
@@ -81,16 +81,16 @@ COMMANDS = [
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
 def test_a_link_to_a_local_file_is_rejected_in_one_sentence(
-    trial: Path, ours: Path, place: str, command: list[str], capsys: pytest.CaptureFixture[str]
+    trial: Path, foreign_file: Path, place: str, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     (trial / place).unlink(missing_ok=True)
-    (trial / place).symlink_to(ours)
+    (trial / place).symlink_to(foreign_file)
     out = [str(trial.parent / "out.mcap") if word == "out.mcap" else word for word in command[1:]]
     assert main([command[0], str(trial), *out]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
     assert f"{place}: it is a symbolic link, not a regular file" in " ".join(output_text.split())
     assert "remedy: get a copy with plain files from" in " ".join(output_text.split())
-    assert ours.read_text(encoding="utf-8") == OURS
+    assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
 
 
 @pytest.mark.parametrize("make", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
@@ -127,10 +127,10 @@ def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
         store.read_plan(trial)
 
 
-def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) -> None:
+def test_a_journal_with_a_second_name_is_not_written(trial: Path, foreign_file: Path) -> None:
     """A hard link to a backup or another local file: writing here would change it there."""
     (trial / "journal.jsonl").unlink()
-    (trial / "journal.jsonl").hardlink_to(ours)
+    (trial / "journal.jsonl").hardlink_to(foreign_file)
     with (
         pytest.raises(ConfigurationError, match="hard link, and writing would change that file too"),
         journal.locked(trial),
@@ -138,22 +138,22 @@ def test_a_journal_with_a_second_name_is_not_written(trial: Path, ours: Path) ->
         raise AssertionError("claimed")
     with pytest.raises(OSError, match="hard link"):
         journal.append(trial, JournalEntry(1, Protocol.UDP, 1, 1, Status.RUNNING))
-    assert ours.read_text(encoding="utf-8") == OURS
+    assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
 
 
-def test_a_table_with_a_second_name_is_replaced_and_not_written(trial: Path, ours: Path) -> None:
+def test_a_table_with_a_second_name_is_replaced_and_not_written(trial: Path, foreign_file: Path) -> None:
     (trial / "trial.csv").unlink()
-    (trial / "trial.csv").hardlink_to(ours)
+    (trial / "trial.csv").hardlink_to(foreign_file)
     rebuild(trial)
-    assert ours.read_text(encoding="utf-8") == OURS
+    assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
     assert (trial / "trial.csv").read_text(encoding="utf-8").startswith("schema_version,")
 
 
 @pytest.mark.parametrize("name", ["out.csv", ".out.csv.new"])
-def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, ours: Path, name: str) -> None:
-    (tmp_path / name).symlink_to(ours)
+def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, foreign_file: Path, name: str) -> None:
+    (tmp_path / name).symlink_to(foreign_file)
     files.write(tmp_path / "out.csv", b"new")
-    assert ours.read_text(encoding="utf-8") == OURS
+    assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
     assert not (tmp_path / "out.csv").is_symlink()
     assert (tmp_path / "out.csv").read_bytes() == b"new"
 

@@ -67,8 +67,8 @@ def test_satellite_positions_have_the_tolerance_of_their_error(
 
 def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
-    lone = PositionSources({Role.RECEIVER: PositionSource(place=(300.0, 0.0, 0.0), frame=LOCAL)})
-    (tmp_path / position_sources.FILE).write_text(position_sources.text(lone), encoding="utf-8")
+    fixed_receiver = PositionSources({Role.RECEIVER: PositionSource(place=(300.0, 0.0, 0.0), frame=LOCAL)})
+    (tmp_path / position_sources.FILE).write_text(position_sources.text(fixed_receiver), encoding="utf-8")
     assert placements.contradiction(SCENE, AttemptEvidence(tmp_path)) is None
     assert placements.contradiction(replace(SCENE, placement=None), in_metres(tmp_path, 300.0)) is None
 

@@ -23,10 +23,10 @@ from tests.helpers.cut_trials import (
     robots_with_much_evidence,
 )
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, mount_workspace
-from tests.helpers.host import Untouched
+from tests.helpers.host import NamespaceComparison
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
-from tests.helpers.power import Cut, Witness, assert_resumable, read_tree
+from tests.helpers.power import PowerCut, VersionRecorder, assert_resumable, read_tree
 from tests.helpers.sshd import wait_until
 
 pytestmark = pytest.mark.emulated  # mounts need root
@@ -42,7 +42,7 @@ strictest_in_ci = pytest.mark.parametrize(
 
 
 @pytest.fixture
-def place(tmp_path: Path, untouched: Untouched) -> Iterator[Path]:
+def place(tmp_path: Path, untouched: NamespaceComparison) -> Iterator[Path]:
     """A folder in memory, in separate mounts of the test."""
     with mount_workspace(tmp_path) as folder, robots_with_much_evidence():
         yield folder
@@ -109,7 +109,7 @@ def test_consecutive_cuts_at_random_moments_lose_nothing(place: Path, file_syste
     assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
 
 
-def _describe_losses(place: Path, cut: Cut, witness: Witness) -> list[str]:
+def _describe_losses(place: Path, cut: PowerCut, witness: VersionRecorder) -> list[str]:
     with cut.disk.repair().mounted(place / "elsewhere") as mounted:
         return cut.lost(mounted / OUT, witness)
 

@@ -9,7 +9,7 @@ from tests.helpers.stored_trials import copied
 def test_many_trials_are_measured_in_processes(tmp_path: Path) -> None:
     with copied(tmp_path) as trials:
         rebuilt = run_here(tmp_path, "rebuild", "trials", "--jobs", "2")
-        one, two = (
+        first, second = (
             run_here(tmp_path, "aggregate", "trials", "--rebuild", "--format", "csv", "--jobs", jobs) for jobs in "12"
         )
     assert rebuilt.code == 0, rebuilt.err
@@ -18,4 +18,4 @@ def test_many_trials_are_measured_in_processes(tmp_path: Path) -> None:
     assert all(
         line.partition(": ")[2] in {"the same bytes as before", "changed: trial.csv, summary.csv"} for line in lines
     )
-    assert (two.code, two.out) == (0, one.out)
+    assert (second.code, second.out) == (0, first.out)

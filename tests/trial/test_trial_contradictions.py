@@ -122,11 +122,11 @@ def demand(attempt: Attempt, *reasons: str) -> None:
     assert all(any(reason in problem for problem in problems) for reason in reasons), problems
 
 
-@pytest.mark.parametrize(("role", "held"), [("sender", "sender"), ("receiver", "receiver")])
-def test_a_capture_that_ended_in_the_middle(attempt: Attempt, role: str, held: str) -> None:
+@pytest.mark.parametrize(("role", "capture_role"), [("sender", "sender"), ("receiver", "receiver")])
+def test_a_capture_that_ended_in_the_middle(attempt: Attempt, role: str, capture_role: str) -> None:
     """It looks complete: exit code 0, consistent counters."""
     attempt.capture(role, lambda packets: packets[: len(packets) // 3])
-    demand(attempt, f"the {held}'s capture")
+    demand(attempt, f"the {capture_role}'s capture")
 
 
 @pytest.mark.parametrize("role", ["sender", "receiver"])

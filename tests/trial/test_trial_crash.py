@@ -88,7 +88,7 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         monkeypatch.setattr(Robots, verb, nothing)
     monkeypatch.setattr(Robots, "fetch", fetch)
-    monkeypatch.setattr(preflight, "preflight", nothing)
+    monkeypatch.setattr(preflight, "check_before_trial", nothing)
     # A short trial spends most of its time with the same YAML, the same code and the same installed packages.
     # Processes that are forked later have the cached values of this one.
     text, versions = schema.dump(plan()), plugins.versions()

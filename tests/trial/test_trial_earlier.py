@@ -141,20 +141,21 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
             _changed(packet, 20, b"\x04\x00")
             for packet in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
         ] if protocol is Protocol.TCP else []  # fmt: skip
-        near, far = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
+        sent, received = (attempt.packets(f"{role}.pcap") for role in ("sender", "receiver"))
 
         def carried(packets: list[Packet], role: str) -> list[Packet]:
             own_packets = _own_packets(packets, role, lambda _: True)
             return [packet for packet in packets if packet in own_packets or chance.random() >= lost]
 
         cut = chance.randrange(3)
-        near = [*carried(near, "sender"), *aside[1:]]
-        far = [*strays[:2], *aside[:2], *carried(far, "receiver")]
-        replies = _own_packets(far, "receiver", _is_icmp)
+        sent = [*carried(sent, "sender"), *aside[1:]]
+        received = [*strays[:2], *aside[:2], *carried(received, "receiver")]
+        replies = _own_packets(received, "receiver", _is_icmp)
         late = replies[len(replies) - cut :]
-        attempt.capture("sender", lambda _: near)
+        attempt.capture("sender", lambda _: sent)
         attempt.capture(
-            "receiver", lambda _: [changed_packet for changed_packet in far if changed_packet not in late]
+            "receiver",
+            lambda _: [changed_packet for changed_packet in received if changed_packet not in late],
         )
         assert _reasons(attempt) == []
 

@@ -153,12 +153,12 @@ def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, mon
     (output_text,) = problems(PLAN, Protocol.UDP, folder)
     reason = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
     assert re.fullmatch(rf"{reason} \(test_trial_gates.py, line [0-9]+\)", output_text)
-    judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
-    assert judged.measured.missing["rtt_loss"] == output_text
-    (traceback,) = judged.step_errors
+    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    assert verdict.measured.missing["rtt_loss"] == output_text
+    (traceback,) = verdict.step_errors
     assert "in measure" in traceback
-    assert judged.has_failed
-    assert judged.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
+    assert verdict.has_failed
+    assert verdict.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
 
 
 @pytest.mark.parametrize("method", ["check", "output_columns", "jobs"])
@@ -169,11 +169,11 @@ def test_an_exception_of_any_method_makes_the_attempt_failed(
         raise KeyError("wlan0")
 
     monkeypatch.setattr(PingStep, method, raise_error)
-    judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
-    *_, reason = judged.problems  # the jobs of the capture around it raise too
+    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    *_, reason = verdict.problems  # the jobs of the capture around it raise too
     assert "the step ping cannot be " in reason
     assert "KeyError: 'wlan0' (test_trial_gates.py, line" in reason
-    assert judged.has_failed
+    assert verdict.has_failed
     (folder / "scan.bag").unlink()
     assert not gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder)).has_failed, "another attempt may help"
 
@@ -189,12 +189,12 @@ def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
         return Measured({**result.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, result.missing)
 
     monkeypatch.setattr(PingStep, "measure", impossible)
-    judged = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
-    assert judged.problems == (
+    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    assert verdict.problems == (
         "the evidence gives rtt_loss as -38460, not from 0 to 1",
         "the evidence gives rtt_min_s as nan, not a number",
     )
-    assert not {"rtt_loss", "rtt_min_s"} & judged.measured.values.keys()
+    assert not {"rtt_loss", "rtt_min_s"} & verdict.measured.values.keys()
 
 
 def test_a_value_missing_without_a_reason_makes_the_attempt_void(

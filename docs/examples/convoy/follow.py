@@ -53,9 +53,9 @@ class Follower(Node):
     def steer(self) -> None:
         """Publish the velocity that reduces the error of the distance; 0 without a valid state."""
         velocity = Twist()
-        leader, own = self.now("leader"), self.now("follower")
-        if leader is not None and own is not None:
-            x_m, y_m, heading_rad, speed_m_s = own
+        leader, follower = self.now("leader"), self.now("follower")
+        if leader is not None and follower is not None:
+            x_m, y_m, heading_rad, speed_m_s = follower
             gap_m = math.hypot(leader[0] - x_m, leader[1] - y_m)
             bearing_rad = math.atan2(leader[1] - y_m, leader[0] - x_m)
             closing_m_s = leader[3] * math.cos(leader[2] - bearing_rad)

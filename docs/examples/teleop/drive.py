@@ -1,4 +1,4 @@
-"""A rover's side of a teleoperation: print each command as it comes, stop when none has come for half a second."""
+"""The rover's program in a teleoperation: print each command, and stop if none arrives for half a second."""
 
 import contextlib
 import socket
@@ -12,7 +12,7 @@ with contextlib.suppress(KeyboardInterrupt):
     while True:
         commands.settimeout(STOP_AFTER_S if is_driving else None)
         try:
-            said, is_driving = commands.recv(100).decode(), True
+            command, is_driving = commands.recv(100).decode(), True
         except TimeoutError:
-            said, is_driving = "stop", False
-        print(said, flush=True)
+            command, is_driving = "stop", False
+        print(command, flush=True)

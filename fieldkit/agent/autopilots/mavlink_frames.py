@@ -120,7 +120,7 @@ class FrameWriter:
         return bytes((_MAGIC_2,)) + body + checksum(body + bytes((CRC_EXTRA[kind],))).to_bytes(2, "little")
 
     def heartbeat(self, vehicle: int = TYPE_LOG) -> bytes:
-        """Return a heartbeat. The default type is a logger, whose loss no autopilot treats as a lost pilot."""
+        """Return a heartbeat. By default from a logger: no autopilot starts a failsafe when it stops."""
         return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, vehicle, NO_AUTOPILOT, 0, _ACTIVE, _VERSION))
 
     def command(self, target: tuple[int, int], command: int, *parameters: float) -> bytes:

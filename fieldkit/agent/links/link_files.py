@@ -45,7 +45,7 @@ def name(connection: str) -> str:
 
 @contextmanager
 def address(connection: str) -> Iterator[str]:
-    """Yield the address of a connection's socket, which is short for home folders with any path."""
+    """Yield a short address of a connection's socket; the length of the home folder's path does not matter."""
     descriptor = os.open(folder(), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{descriptor}/{name(connection)}.sock"

@@ -1,4 +1,4 @@
-"""All commands with their help lines. Each has a module of its name: `add` declares its arguments, `run` runs it.
+"""All commands with their help lines. A command has a module with its name: `add` declares arguments, `run` runs it.
 
 Commands that list items share the module `listings`, with a pair of functions for each, such as `add_robots`.
 A module is imported when its command is used. Slow imports are inside of the functions that need them, so that help

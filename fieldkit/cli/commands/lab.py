@@ -22,7 +22,7 @@ from fieldkit.lab import folder
 from fieldkit.lab.folder import LabFolder
 
 if TYPE_CHECKING:
-    from fieldkit.lab.protocol import Lab, LabBackend, Overview
+    from fieldkit.lab.protocol import Lab, LabBackend, LabLateness, Overview
 
 
 def add(parser: Parser) -> None:
@@ -49,7 +49,8 @@ def add(parser: Parser) -> None:
         help="list the robots with positions and programs",
         description="List the robots: profile, roles, address on the radio, position, programs. --json prints one "
         "object: pid and up_s of the lab, and robots, each with name, profile, roles, address, place_m (metres east, "
-        "north, up) and programs, which is empty for a robot that has stopped.",
+        "north, up) and programs, which is empty for a robot that has stopped; and lateness of a co-simulation "
+        "(docs: lab-cosim).",
     )
     listing.add_argument("--json", action="store_true", help="print them as JSON")
     listing.set_defaults(run=list_robots)
@@ -63,6 +64,7 @@ def add(parser: Parser) -> None:
     action.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND", help="command for its shell")
     action.set_defaults(run=shell)
     _add_move(actions)
+    _add_sdf(actions)
     config = actions.add_parser("ssh-config", help="print a configuration for ssh -F, scp -F, rsync and Ansible")
     config.set_defaults(run=print_ssh_config)
     actions.add_parser("down", help="stop the robots").set_defaults(run=down)
@@ -78,6 +80,24 @@ def add(parser: Parser) -> None:
         "-o", "--out", type=Path, default=Path("lab.svg"), metavar="FILE", help="SVG, PDF or PNG (default lab.svg)"
     )
     action.set_defaults(run=plot)
+
+
+def _add_sdf(actions: Commands) -> None:
+    parser: Parser = actions.add_parser(
+        "sdf",
+        help="print the world of the robots for Gazebo",
+        description="Print the world of the site file and its robots as SDF, for `physics: gazebo` of labs and "
+        "trials. Robots that Gazebo does not move are not in it.",
+        epilog="example: fieldkit lab sdf > lab.sdf",
+    )
+    parser.add_choice(
+        "--gazebo",
+        ("fortress", "garden"),
+        default="fortress",
+        help="names of the plugins: fortress (default), or garden for it and later versions",
+    )
+    shared.add_robots(parser)
+    parser.set_defaults(run=print_sdf)
 
 
 def _add_move(actions: Commands) -> None:
@@ -163,7 +183,22 @@ def list_robots(arguments: argparse.Namespace) -> int:
     ]
     table(("robot", "profile", "roles", "address", "east, north, up (m)", "runs"), rows)
     print_text(f"up for {format_duration(state.up_s)}, pid {state.pid}")
+    if state.lateness is not None:
+        _show_lateness(state.lateness)
     return 0
+
+
+def _show_lateness(lateness: "LabLateness") -> None:
+    """Print the lateness of a co-simulation, and a note if it was above its bound."""
+    parts = (("packets", lateness.packet_max_s), ("windows", lateness.window_max_s))
+    texts = [f"{name} at most {late_s * 1e3:.3g} ms" for name, late_s in parts if late_s is not None]
+    print_text(f"late: {', '.join(texts) or 'nothing'}; {format_count(lateness.windows, 'window')}")
+    if lateness.late:
+        show_note(
+            f"the co-simulation could not keep up: {format_count(lateness.late, 'packet or window')} later than "
+            f"{lateness.bound_s * 1e3:g} ms, so a trial would be void; reduce the load of this machine, or set a "
+            "longer window in emulated.sync"
+        )
 
 
 def move(arguments: argparse.Namespace) -> int:
@@ -205,6 +240,19 @@ def print_ssh_config(_: argparse.Namespace) -> int:
     lab_folder = _lab_folder()
     requests.state(lab_folder)
     print_text(lab_folder.ssh_config.read_text(encoding="utf-8"), end="")
+    return 0
+
+
+def print_sdf(arguments: argparse.Namespace) -> int:
+    """Print the world for Gazebo."""
+    from fieldkit.lab.protocol import GazeboWorlds
+
+    backend = _backend(arguments)
+    if not isinstance(backend, GazeboWorlds):
+        raise ConfigurationError(
+            "Gazebo does not move the robots of this backend", remedy="fieldkit lab sdf --backend emulated"
+        )
+    print_text(backend.gazebo_world(arguments.gazebo), end="")
     return 0
 
 

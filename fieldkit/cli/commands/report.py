@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
         paths=list(map(str, arguments.paths)),
         quantities=selected_names,
         unmeasured=list(unmeasured(arguments.paths, with_attempts, show_note)),
-        sweep_condition=data.sweep_condition,
+        sweep=data.sweep_columns,
     )
     with _explain_os_errors(out, "-o"):
         files.write(out, page.render(report_contents, out).encode())

@@ -328,17 +328,17 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints)
 
     inside = np.flatnonzero(_IS_EXTENSION[protocol] & (payload_at + 8 <= end))
     while len(inside):
-        here, kind = payload_at[inside], protocol[inside]
-        units = integers.u8(here + 1)
+        header_at, kind = payload_at[inside], protocol[inside]
+        units = integers.u8(header_at + 1)
         size = np.where(kind == _AUTHENTICATION, (units + 2) * 4, (units + 1) * 8)
         fragmented = kind == _FRAGMENT
         size[fragmented] = 8
-        fragment[inside[fragmented]] = integers.u16(here[fragmented] + 2)
-        ip_id[inside[fragmented]] = integers.u32(here[fragmented] + 4)
-        protocol[inside] = integers.u8(here)
-        payload_at[inside] = here + size
+        fragment[inside[fragmented]] = integers.u16(header_at[fragmented] + 2)
+        ip_id[inside[fragmented]] = integers.u32(header_at[fragmented] + 4)
+        protocol[inside] = integers.u8(header_at)
+        payload_at[inside] = header_at + size
         # In a fragment other than the first, the data after the fragment header is payload.
-        continues = _IS_EXTENSION[protocol[inside]] & (here + size + 8 <= end[inside]) & (fragment[inside] < 8)
+        continues = _IS_EXTENSION[protocol[inside]] & (header_at + size + 8 <= end[inside]) & (fragment[inside] < 8)
         inside = inside[continues]
     return Headers(
         frame=frame,

@@ -161,7 +161,7 @@ def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) 
     if client.start.cookie != server.start.cookie:
         yield "client and server have different cookies, so they are different tests"
         return
-    if set(client.ports) != {(own, other) for other, own in server.ports}:
+    if set(client.ports) != {(local, remote) for remote, local in server.ports}:
         yield "client and server report different ports"
     for name, test in (("client", client), ("server", server)):
         yield from (f"the {name} {why}" for why in _differences(test, settings))

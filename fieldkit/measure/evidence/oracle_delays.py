@@ -184,7 +184,7 @@ POLICY_COLUMNS: Final = columns(
         "delay_policy_s",
         "s",
         (
-            "Mean time that the sync policy of a co-simulation added to the way of the transfer's packets, which is "
+            "Mean time that the sync policy of a co-simulation added to the path of the transfer's packets, which is "
             "not in delay_s. Empty without a co-simulation."
         ),
         Figure("policy delay", Kind.MEDIAN, rank=34),

@@ -95,12 +95,12 @@ def match(sent: Packets, received: Packets) -> Match:
     if not sent.tcp_payload_bytes.any() and not received.tcp_payload_bytes.any():
         return frames
     payload = _match_pieces(sent, received, frames)
-    for near, far, index, piece_index in (
+    for from_pieces, to_pieces, index, piece_index in (
         (payload.sent, payload.received, frames.received_index, payload.match.received_index),
         (payload.received, payload.sent, frames.sent_index, payload.match.sent_index),
     ):
-        frame, first = np.unique(near.frame, return_index=True)
-        index[frame] = np.append(far.frame, NONE)[piece_index[first]]
+        frame, first = np.unique(from_pieces.frame, return_index=True)
+        index[frame] = np.append(to_pieces.frame, NONE)[piece_index[first]]
     frames.ambiguous[payload.sent.frame[payload.match.ambiguous]] = True
     frames.duplicates[payload.received.frame] = True
     frames.duplicates[payload.received.frame[~payload.match.duplicates]] = False

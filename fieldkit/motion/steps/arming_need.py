@@ -1,4 +1,4 @@
-"""Preflight check: can the autopilot of a drone be armed for a flight?"""
+"""Preflight check that the autopilot of a drone can be armed for a flight."""
 
 import json
 from dataclasses import asdict

@@ -96,7 +96,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     take-off its autopilot, PX4 or ArduCopter, must report [that it can be
     armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
     flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
-    [MAVLink](mavlink.md#evidence-of-a-flight)). Leaves `fly.jsonl`, `fly.log` and `fly.orders`.
+    [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, `fly.log` and `fly.orders`.
 
     Attributes:
         robot: Role that flies.
@@ -253,7 +253,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
             yield Refusal(self.robot, why, remedy)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         """Return the size of the log, which covers the time from before the take-off until the motors are off."""
         lasts_s = self.expected_s(scene.protocol) + _AT_REST_S
         return _LOG_BYTES_PER_S * lasts_s if role == self.robot else 0.0

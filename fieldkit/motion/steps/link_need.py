@@ -1,4 +1,4 @@
-"""Preflight check: does the connection of a drone's computer to its autopilot work, and which programs use it?"""
+"""Preflight check of the connection between a drone's computer and its autopilot, and of the programs that use it."""
 
 import json
 from collections.abc import Sequence

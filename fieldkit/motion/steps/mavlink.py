@@ -75,7 +75,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     """Records the telemetry of a robot's autopilot while the steps in `during` run.
 
     That is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
-    the columns. The profile of the robot needs `mavlink`. Leaves `mavlink.tlog`, `mavlink.json` (counters of the
+    the columns. The profile of the robot needs `mavlink`. Writes `mavlink.tlog`, `mavlink.json` (counters of the
     recorder) and `ROLE-mavlink.log`; with `positions` also `positions.json` and the columns of a `track`.
 
     Attributes:
@@ -238,7 +238,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return (_FRAME_BYTES + _STAMP_BYTES) * self._messages(scene) if role == self.recorder else 0.0
 
     def _messages(self, scene: Scene) -> float:

@@ -188,7 +188,7 @@ class MoveStep(
             yield from driving.refusals(scene, self.motion)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         """Return the size of the log of a driving robot, which covers path, steps inside and the return."""
         robot = scene.robot(role)
         if role != self.robot or not drives(robot) or drive_of(robot.profile) is None:

@@ -55,7 +55,7 @@ class Binding:
     remedy: str
 
 
-_LAB_NOTE: Final = "; for a robot of a lab, into the Python that runs fieldkit"
+_LAB_NOTE: Final = "; the robots of a lab use the Python that runs fieldkit"
 BINDINGS: Final = MappingProxyType(
     {
         MiddlewareName.DDS: Binding(

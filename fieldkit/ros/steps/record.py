@@ -223,7 +223,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         return self.topics if role is self.robot else ()
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return sum(file.size_bytes for file in self.recorded(scene.cast) if file.role is role)
 
     @override
@@ -245,9 +245,9 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         except EvidenceError as error:
             yield f"{name}: {error.what}"
             return
-        silent = [topic for topic in self.topics if not content.messages_by_topic.get(topic)]
-        if silent:
-            yield f"{name}: no message of {', '.join(silent)}"
+        topics_without_messages = [topic for topic in self.topics if not content.messages_by_topic.get(topic)]
+        if topics_without_messages:
+            yield f"{name}: no message of {', '.join(topics_without_messages)}"
         if content.duration_s + SUBSCRIBE_S < MIN_RECORDED_SHARE * self.duration:
             yield f"{name}: spans only {content.duration_s:.1f} s of {self.duration:g} s"
 

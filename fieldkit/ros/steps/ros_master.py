@@ -1,4 +1,4 @@
-"""Preflight check of a shared ROS master: does it answer the robots that use it?"""
+"""Preflight check that a shared ROS master answers the robots that use it."""
 
 from collections.abc import Iterator
 from typing import Final

@@ -69,7 +69,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     The program is part of fieldkit; both robots need the middleware for Python. See [topics](topics.md), also for the
     columns. Inside a `capture` its traffic is counted, and delays are measured if there are packets in both
-    directions. Leaves `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
+    directions. Writes `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
     """
 
     cross_checks = (*topic_checks.CROSS_CHECKS, *stalls.cross_checks("topic"))
@@ -152,9 +152,9 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         self, scene: Scene, testbed: Testbed, other_jobs: list[Planned], publish: Planned, announce: Announce
     ) -> None:
         announce("topics", self.expected_s(scene.protocol))
-        with ExitStack() as silent:
+        with ExitStack() as silence_contexts:
             for role in self.participants:
-                silent.enter_context(testbed.shells[role].silence(publish.job.limit_s))
+                silence_contexts.enter_context(testbed.shells[role].silence(publish.job.limit_s))
             code = jobs.run(testbed.shells[publish.role], publish.job)
         stopped = [
             (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
@@ -223,7 +223,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         return self.rate * self.duration
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return _RECORD_BYTES * self._samples if role in {self.sender, self.receiver} else 0.0
 
     @override

@@ -125,7 +125,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     The distance and speed columns of the transfers and pings inside use these positions
     ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to be where they were
     placed, unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
-    columns `positions_from` and `positions_clock_error_s`. Leaves `track_ROLE.bag` (ROS 2: a folder) and
+    columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
     `positions.json`, which records the source of each position and how far the robots' clocks were ahead of the
     laptop's.
 
@@ -244,9 +244,9 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         return recorder.topics if recorder else ()
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         recorder = self._recorders(self.expected_s(scene.protocol)).get(role)
-        return recorder.bytes_left(scene, role) if recorder else 0.0
+        return recorder.stored_bytes(scene, role) if recorder else 0.0
 
     @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:

@@ -66,7 +66,7 @@ def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, 
     """Return the time at which each sample and all earlier ones had arrived, by number; None if it is unknown."""
     if subscriber.is_tcp:
         return _contiguous_ns(subscriber, heads.end)
-    if heads.whole.all():
+    if heads.is_complete.all():
         delivered_ns: Ints = np.maximum.accumulate(heads.at_ns) if reliable else heads.at_ns
         return delivered_ns
     return _before_next_ns(subscriber, heads) if complete else None

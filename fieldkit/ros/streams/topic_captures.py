@@ -268,7 +268,7 @@ def _is_received(
     """Return a mask of the samples, by number, that the subscriber's middleware must have delivered."""
     if subscriber.is_tcp:
         return _is_acknowledged(heads, subscriber)
-    has_all_bytes = heads.whole | complete
+    has_all_bytes = heads.is_complete | complete
     if plan.reliable:
         # No sample is delivered after a gap; a sample that arrives before a later one is delivered precedes it.
         gapless = np.logical_and.accumulate(heads.sequence == np.arange(len(heads)))

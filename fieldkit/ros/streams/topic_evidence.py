@@ -122,7 +122,7 @@ def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[di
         except EvidenceError as error:
             errors.append(f"{name}: {error.what}")
             continue
-        if not log.whole:
+        if not log.is_complete:
             errors.append(f"{name} is incomplete: the agent was stopped")
         else:
             logs[role] = log

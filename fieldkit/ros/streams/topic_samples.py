@@ -71,7 +71,7 @@ class TopicLog:
         refused: Number of samples that the middleware did not accept.
         skipped: Number of samples whose time passed while an earlier one was being written.
         foreign: Number of received messages that are not samples of the stream.
-        whole: True if the log has its end record.
+        is_complete: True if the log has its end record.
         kinds: Number of records of each kind.
         times_ns: Time of every record in the order of the log, by the writer's clock.
         numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
@@ -85,7 +85,7 @@ class TopicLog:
     refused: int
     skipped: int
     foreign: int
-    whole: bool
+    is_complete: bool
     kinds: Mapping[int, int] = field(default_factory=dict)
     times_ns: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     numbers: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -127,7 +127,7 @@ def read_log(path: Path) -> TopicLog:
         refused=len(by_kind[REFUSED]),
         skipped=int(by_kind[SKIPPED]["sequence"].sum()),
         foreign=len(by_kind[FOREIGN]),
-        whole=bool(len(ends)),
+        is_complete=bool(len(ends)),
         kinds={kind: len(records_of_kind) for kind, records_of_kind in by_kind.items()},
         times_ns=records["at_ns"].astype(np.int64),
         numbers=offered["sequence"].astype(np.int64),
@@ -222,7 +222,7 @@ class SampleHeads(Table):
         sequence: Sequence number of the sample.
         sent_ns: Time of sending stored in the sample, by the publisher's clock.
         at_ns: Time of capture of the packet.
-        whole: True if the packet contains the whole sample.
+        is_complete: True if the packet contains the whole sample.
         end: TCP sequence number after the sample, modulo 2**32; 0 for UDP.
         sport: Source port of the packet.
         dport: Destination port of the packet.
@@ -231,7 +231,7 @@ class SampleHeads(Table):
     sequence: Ints
     sent_ns: Ints
     at_ns: Ints
-    whole: Mask
+    is_complete: Mask
     end: Ints
     sport: Ints
     dport: Ints
@@ -311,7 +311,7 @@ def sample_flow(
         sequence=occurrences.first,
         sent_ns=occurrences.second,
         at_ns=carrier.time_ns,
-        whole=np.where(is_tcp, carrier.tcp_payload_bytes, carrier.ip_payload_bytes - UDP_HEADER_BYTES) >= ends,
+        is_complete=np.where(is_tcp, carrier.tcp_payload_bytes, carrier.ip_payload_bytes - UDP_HEADER_BYTES) >= ends,
         end=np.where(is_tcp, (carrier.tcp_seq + ends) % (1 << 32), 0),
         sport=carrier.sport,
         dport=carrier.dport,

@@ -45,7 +45,7 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
     """Asks the operator for a number or for one of several words, which becomes a column.
 
     The answer `-` means unknown: the column is then empty. It is also empty if no operator is asked (`--yes`) and
-    there is no `usual` answer. Leaves `answer-COLUMN.txt`.
+    there is no `usual` answer. Writes `answer-COLUMN.txt`.
 
     Attributes:
         column: Name of the column.

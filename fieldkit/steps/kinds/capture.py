@@ -65,7 +65,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
     filter matches first fragments only). Losses and delays of a transfer need a capture on both of its ends around
     it; otherwise these columns are empty. With a `ping` inside, after the transfer, the captures give the offset
     between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP transfer has no
-    answer, and the offset needs packets in both directions. Leaves `ROLE.pcap` and `ROLE-capture.log`.
+    answer, and the offset needs packets in both directions. Writes `ROLE.pcap` and `ROLE-capture.log`.
 
     Attributes:
         robots: Roles that capture.
@@ -174,7 +174,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
             yield Need(role, "right to capture", argv, partial(_judge, profile), required_program=names.capture)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         if role not in self.robots:
             return 0.0
         return (self._snap_bytes + _RECORD_BYTES) * sum(flow.frames for flow in flows_inside(self, scene))

@@ -58,7 +58,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     An observer records when the robot answers, from before the fault until it has answered for a second again: a ping
     every 100 ms from the other end of the pair (200 ms if an old iputils requires it), or for `kill` a poll of the
-    robot's processes. Leaves `fault-KIND-ping.txt` or `fault-kill-watch.txt`, `fault-KIND.txt` (duration of the cause
+    robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`, `fault-KIND.txt` (duration of the cause
     and its interval) and `fault-KIND-times.txt` (its start and end, see [recovery](method-delay.md#recovery)).
 
     Attributes:

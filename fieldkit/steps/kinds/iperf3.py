@@ -48,7 +48,7 @@ _STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
 class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Measures with iperf3, 3.1 or later, which both robots need: `sudo apt-get install iperf3`.
 
-    The server ends with the test. Leaves `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
+    The server ends with the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
     `capture` there are also the captures' figures of the same packets: [columns](method-loss.md#iperf3),
     [stalls](method-delay.md#stalls-of-a-flow).
 
@@ -141,9 +141,9 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         server, client = self.jobs(scene)
         server_shell, client_shell = (testbed.shells[planned.role] for planned in (server, client))
         announce("iperf3", self.expected_s(scene.protocol))
-        with ExitStack() as silent:
+        with ExitStack() as silence_contexts:
             for shell in (server_shell, client_shell):
-                silent.enter_context(shell.silence(self.limit))
+                silence_contexts.enter_context(shell.silence(self.limit))
             code = jobs.run(client_shell, client.job)
         # With --json some versions exit with 0 after any error; `check` evaluates their output.
         server_code = jobs.begin_wait(server_shell, server.job, _SERVER_EXIT_S).end(_SERVER_EXIT_S + jobs.REPLY_S)
@@ -184,7 +184,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         yield replace(self.flow(scene.protocol, size_bytes), source=self.source, destination=self.destination)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         intervals = self.expected_s(scene.protocol) * (self.streams + 1)
         return intervals * _INTERVAL_BYTES if role in self.roles() else 0.0
 

@@ -26,14 +26,14 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
 from fieldkit.steps.capabilities import HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
-from fieldkit.steps.scene import Announce, Flow, Need, Pinging, Planned, Refusal, Scene, fragments
+from fieldkit.steps.scene import Announce, Flow, Need, PingSource, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 from fieldkit.steps.view import View
 
 LAST_REPLY_S: Final = 2
 _HEADER_BYTES: Final = 8
 OLD_INTERVAL_S: Final = 0.2
-MOST: Final = 1_000_000
+MAX_COUNT: Final = 1_000_000
 _ROUNDING: Final = 1e-6
 
 Payload = Annotated[Int, Field(ge=0, le=65507)]
@@ -65,18 +65,18 @@ class Payloads(Strict):
 
 
 class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
-    """Measures round-trip times with ping. Leaves `ping.txt`.
+    """Measures round-trip times with ping. Writes `ping.txt`.
 
     Attributes:
         sender: Role that sends the requests.
         receiver: Role that answers.
         count: Echo requests.
-        interval: Time between them; below `200ms` iputils before 20210722 needs root.
+        interval: Time between requests; below `200ms` iputils before 20210722 needs root.
         payload_bytes: ICMP payload per protocol; one number sets both.
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
             `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds
             (`rtt_gap_at_least_s`).
-        forwarded: Whether robots forward for each other; the checks then include a routing daemon on all of them.
+        forwarded: Whether robots forward packets for each other; the checks then require a routing daemon on each.
     """
 
     columns = (*ping.COLUMNS, *ping.SENT_COLUMNS, *ping.MOTION_COLUMNS)
@@ -86,7 +86,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
     sender: Role = Field(alias="from")
     receiver: Role = Field(alias="to")
-    count: Annotated[Int, Field(gt=0, le=MOST)] = 10
+    count: Annotated[Int, Field(gt=0, le=MAX_COUNT)] = 10
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
     gap: Bool = Field(default=False, exclude_if=schema.is_empty)
@@ -101,7 +101,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
     @override
     def with_duration(self, seconds: float) -> Self:
         count = math.ceil(seconds / self.interval - _ROUNDING)
-        return self.model_copy(update={"count": min(max(count, 1), MOST)})
+        return self.model_copy(update={"count": min(max(count, 1), MAX_COUNT)})
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
@@ -168,8 +168,8 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         yield Flow(self.sender, self.receiver, frames=frame_count)
 
     @override
-    def pinging(self) -> Pinging:
-        return Pinging(self.sender, self._file, self.prefix)
+    def ping_source(self) -> PingSource:
+        return PingSource(self.sender, self._file, self.prefix)
 
     @override
     def check(self, view: View) -> Iterator[str]:

@@ -139,7 +139,7 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     The program is found in the PATH of a session without a terminal, or by its absolute path; it runs in the folder
     of the attempt. No shell is involved: for one, write `sh -c '...'`. At most 1 MiB each of output and of errors is
-    kept; a program that prints more is stopped. Leaves `run.txt` and `ROLE-run.log`.
+    kept; a program that prints more is stopped. Writes `run.txt` and `ROLE-run.log`.
 
     Variables in `command` and `argv`: `{address.ROLE}` is the address of a robot on the radio, `{distance}` the
     distance as typed (`30ft`), `{repeat}` the number of the repeat of its protocol, from 1, and `{put}` the path of
@@ -260,7 +260,7 @@ class RunStep(Step, UsesSpace, Summarizes):
             output_limit_bytes=program_output.MAX_OUTPUT_BYTES,
         )
         remedy = f"install {argv[0]}, or correct the command of this run in the procedure"
-        # Preflight searches for the program; a copied program does not exist on the robot yet.
+        # The preflight checks search for the program; a copied program does not exist on the robot yet.
         program = "sh" if self.words[0] == f"{{{arguments.PUT}}}" else argv[0]
         yield Planned(self.robot, job, program=program, remedy=remedy, put=put)
 
@@ -309,7 +309,7 @@ class RunStep(Step, UsesSpace, Summarizes):
         return (self._output, self._log)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return self.prints if role == self.robot else 0.0
 
     @property

@@ -29,10 +29,10 @@ MAX_PARALLEL: Final = 8
 class TogetherStep(Nest, Prepares, DescribesActions):
     """Runs its steps at the same time: all listeners are up before the first step begins.
 
-    It ends when the last of them ends. The first that fails ends the others, a `wait` too. For a sequence within it,
-    use a step that has `during`, for example a `capture`. A step that may ask the operator (`fault`, `move`, `ask`,
-    `wait` with `until`) must be around or before it, not inside. Commands on the control link of one step then affect
-    the measurement of another, as far as SSH uses the radio under test.
+    It ends when the last of them ends. If one fails, all others are stopped, also a `wait`. For a sequence inside it,
+    use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`, `move`,
+    `ask`, `wait` with `until`) must contain or precede it. If SSH uses the radio under test, the commands of one step
+    affect the measurement of another.
 
     Attributes:
         during: Two steps or more; at most 8 run at the same time.
@@ -45,7 +45,7 @@ class TogetherStep(Nest, Prepares, DescribesActions):
     @schema.model_validator(mode="after")
     def _can_run_in_parallel(self) -> "TogetherStep":
         if (count := _max_parallel(self)) > MAX_PARALLEL:
-            why = f"{count} steps at the same time are more than {MAX_PARALLEL}: leave some out"
+            why = f"{count} steps at the same time are more than {MAX_PARALLEL}: remove some"
             raise schema.validation_error(why, "during")
         for kind, location in _operator_steps(self):
             raise schema.validation_error(

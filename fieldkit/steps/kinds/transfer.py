@@ -225,9 +225,9 @@ class TransferStep(
         before = None if oracle is None else oracle.delays(*flow)
         _, send = self._netcats(scene)
         announce("transfer", self.expected_s(scene.protocol))
-        with ExitStack() as silent:
+        with ExitStack() as silence_contexts:
             for role in (self.receiver, self.sender):
-                silent.enter_context(testbed.shells[role].silence(self.limit))
+                silence_contexts.enter_context(testbed.shells[role].silence(self.limit))
             sending = jobs.begin(testbed.shells[self.sender], send.job)
             waited_s = time.monotonic() - started_s
             if scene.protocol is Protocol.UDP and waited_s >= self.idle:
@@ -283,7 +283,7 @@ class TransferStep(
         yield Flow(self.sender, self.receiver, self.port, frame_count)
 
     @override
-    def bytes_left(self, scene: Scene, role: Role) -> float:
+    def stored_bytes(self, scene: Scene, role: Role) -> float:
         return self._size_bytes(scene) if role == self.receiver else 0.0
 
     def _size_bytes(self, scene: Scene) -> float:
@@ -371,7 +371,7 @@ class TransferStep(
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        for name, layer in (("ip_loss", "IP"), ("datagram_loss", "datagram"), ("file_loss", "file")):
+        for name, layer in (("ip_loss", "IP packet"), ("datagram_loss", "datagram"), ("file_loss", "file")):
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
         if values.get("ip_packets_doubtful"):

@@ -96,7 +96,7 @@ def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
     elif words[2] != robot.address:
         report.ok("control", f"SSH does not use the radio under test: it arrives at {words[2]}")
     elif robot.control is Control.RADIO:
-        report.ok("control", "SSH shares the radio under test, as the site file says")
+        report.ok("control", "SSH shares the radio under test, as the site file states")
     else:
         report.warn(
             "control",

@@ -142,7 +142,7 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
     except RobotError as error:
         report.fail(_TOOLS, error.what, error.remedy)
         return variants.expected(profile)
-    # The versions that netcats print are too different to be shown, or missing.
+    # A netcat is shown by its variant: some print no version, and the formats of the others differ.
     words = [
         f"{detected.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in detected.versions.items()
     ]

@@ -1,1 +1,1 @@
-"""Run a trial on robots: open and lock them, run preflight and every attempt, resume an interrupted trial."""
+"""Run a trial on robots: open and lock them, run preflight checks and attempts, resume an interrupted trial."""

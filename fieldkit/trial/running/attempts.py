@@ -74,7 +74,7 @@ class Attempts:
         Raises:
             ConfigurationError: This machine has no space for its evidence.
             FieldkitError: The trial cannot continue; the attempt is stored as one that does not count.
-            KeyboardInterrupt: As for `FieldkitError`, but an attempt whose steps are done is left to `recover`.
+            KeyboardInterrupt: As for `FieldkitError`, but `recover` completes an attempt whose steps have ended.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
@@ -151,7 +151,7 @@ class Attempts:
 
         try:
             self._robots.measure(scene, announce)
-            self._motions.stop_notes = ()  # the remaining work may be completed after a request to stop
+            self._motions.stop_notes = ()  # a request to stop does not prevent the remaining work
         except (RobotError, LinkError, EvidenceError) as error:
             if error.ends_trial:
                 raise

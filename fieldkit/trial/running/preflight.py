@@ -1,4 +1,4 @@
-"""Preflight: the checks of robots and laptop before a trial's first repeat; `fieldkit check` runs all of them."""
+"""Preflight checks of robots and laptop, before the first repeat of a trial; `fieldkit check` runs all of them."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -91,8 +91,8 @@ def check(plan: Plan, shells: Shells, out: Path, *, all_checks: bool) -> Checked
     return Checked(_all_findings([*reports.values(), laptop]), variants_by_role)
 
 
-def preflight(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
-    """Run the preflight of a trial, store the findings in its folder and report those that are not ok.
+def check_before_trial(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
+    """Run the preflight checks, store the findings in the folder of the trial and report those that are not ok.
 
     Returns:
         The tools of each robot.

@@ -86,7 +86,7 @@ def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
 
 
 def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, report_resume: bool = True) -> Outcome:
-    """Run preflight on robots at their places, and run every repeat.
+    """Run the preflight checks on robots at their places, then every repeat.
 
     If the trial ends early, its folder contains the plan, the journal, every attempt that ended, their rows and a
     manifest, and `resumption.continue_trial` resumes it. If fieldkit was killed, the summary is missing; `rebuild`
@@ -103,7 +103,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
     Raises:
         ConfigurationError: The folder cannot be created.
         LinkError: A robot did not answer at the start of a repeat.
-        RobotError: Preflight found a problem.
+        RobotError: A preflight check failed.
         KeyboardInterrupt: A stop was requested.
     """
     folder = store.create(out, plan)
@@ -128,7 +128,7 @@ def run_repeats(
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.stop_leftover_jobs()
         sink(PhaseStarted("check"))
-        variants = preflight.preflight(plan, robots.shells, folder, sink)
+        variants = preflight.check_before_trial(plan, robots.shells, folder, sink)
         permission = motion_control.permission(plan, testbed, folder)
         attempts = Attempts(
             plan,

@@ -16,7 +16,7 @@ _TABLES: Final = ("1", "2", "3", "emane", "claims")
 def add(parser: Parser) -> None:
     """Declare the commands of `fieldkit cosim`."""
     parser.description = (
-        "Simulate robots that move and communicate; measure the error and the cost of each synchronization method."
+        "Simulate robots that move and communicate; measure the error and the cost of each sync policy."
     )
     parser.epilog = "example: fieldkit cosim run baylands --policy sliding_window"
     commands = parser.add_commands(title="commands", metavar="COMMAND")

@@ -86,7 +86,7 @@ def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
     """Return the traffic without topics, which a network may not support; its checks send packets of their own."""
     entries = [traffic.model_dump(mode="json", by_alias=True, exclude_none=True) for traffic in scenario.traffic]
     for entry in entries:
-        if entry["protocol"] in {"topic", "ros1"}:
+        if entry["protocol"] in {"topic", "ros1", "ros1-udp"}:
             entry["protocol"] = "udp"
             entry.pop("qos", None)
     return entries

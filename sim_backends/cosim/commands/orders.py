@@ -111,7 +111,7 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
     def make(policy: SyncPolicy) -> Coordinator:
         return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 
-    def method(window_s: float) -> SyncPolicy:
+    def policy_for(window_s: float) -> SyncPolicy:
         # The windows of error_bounded are as long as those of other policies unless its bound requires shorter ones.
         longest_s = window_s if task.policy == ErrorBounded.name else max(window_s, scenario.policy.longest)
         return make_policy(task.policy, **scenario.policy.parameters | {"window_s": window_s, "longest_s": longest_s})
@@ -120,7 +120,7 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
     step_ns = scenario.physics.step_ns
     starts_ns = low_discrepancy_times_ns(0, max(until_ns, step_ns), START_TIMES, step_ns)
     try:
-        return local_errors(make, {task.policy: method}, windows_s, starts_ns)[task.policy]
+        return local_errors(make, {task.policy: policy_for}, windows_s, starts_ns)[task.policy]
     except PolicyError as error:
         return error
 

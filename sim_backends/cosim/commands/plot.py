@@ -105,7 +105,9 @@ def growth(rows: Iterable[Row], title: str) -> LogPanel | None:
             curves.append(Curve(row.policy, times_s[first:].tolist(), (distances_m[first:] * 1e3).tolist()))
     if not curves:
         return None
-    return LogPanel(f"Off the reference's path, {title}", "time (s)", "largest (mm)", curves, over_time=True)
+    return LogPanel(
+        f"Distance from the reference's path, {title}", "time (s)", "largest (mm)", curves, over_time=True
+    )
 
 
 def error_against_window(by_policy: Mapping[str, LocalErrors]) -> Callable[[Format], bytes]:

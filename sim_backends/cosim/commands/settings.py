@@ -236,7 +236,7 @@ def note_commensurate_events(
         instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
         show_note(
             f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}; errors and added "
-            "delays are those of these phases of the window, which the seed draws, and not of the method: use "
+            "delays are those of these phases of the window, which the seed draws, and not of the policy: use "
             f"{instead}" + ("" if other_s is None else f", or --seeds {ENOUGH_SEEDS}")
         )
 

@@ -102,8 +102,16 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
 
 
 def _values(cell: PaperCell) -> tuple[Value, ...]:
-    ours = cell.ours
-    return (cell.printed.value, ours.value, ours.low, ours.high, cell.seeds, str(cell.agreement), cell.off)
+    simulated = cell.ours
+    return (
+        cell.printed.value,
+        simulated.value,
+        simulated.low,
+        simulated.high,
+        cell.seeds,
+        str(cell.agreement),
+        cell.off,
+    )
 
 
 def summary(rows: Sequence[PaperRow]) -> str:

@@ -1,1 +1,1 @@
-"""Synchronization policies: the time for which physics and network run independently, and the assumed states."""
+"""Sync policies: the time for which physics and network run independently, and the assumed states."""

@@ -127,7 +127,7 @@ class FollowAtHeadway(NeverSends):
         return Action(command=self._command(own_state, leaders[0]) if leaders else Twist())
 
     def _command(self, own_state: State, leader: State) -> Twist:
-        e, n = (there - here for here, there in zip(own_state.position_m[:2], leader.position_m[:2], strict=True))
+        e, n = (goal - own for own, goal in zip(own_state.position_m[:2], leader.position_m[:2], strict=True))
         gap_m = math.hypot(e, n)
         if not gap_m:
             return Twist()
@@ -192,7 +192,7 @@ class HoldStation(NeverSends):
 
     def _command(self, own_state: State, leaders: Sequence[State]) -> Velocity:
         e, n, u = _mean([leader.position_m for leader in leaders])
-        offset_m = [there - here for here, there in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)]
+        offset_m = [goal - own for own, goal in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)]
         gain_per_s = min(self._gain_per_s, self._top_speed_m_s / (math.hypot(*offset_m) or math.inf))
         v_e, v_n, v_u = _mean([leader.velocity_m_s for leader in leaders])
         return Velocity(

@@ -192,7 +192,7 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
         speed_m_s: Top speed.
         stops: True to slow down and stop at the point.
     """
-    offset_m = [there - here for here, there in zip(own_state.position_m, point_m, strict=True)]
+    offset_m = [goal - own for own, goal in zip(own_state.position_m, point_m, strict=True)]
     left_m = math.hypot(*offset_m)
     if not left_m:
         return Velocity()

@@ -37,7 +37,7 @@ def _end_fields(prefix: str, meaning: str) -> list[pa.Field]:
         ("heading_rad", pa.float64(), "rad", "heading from east towards north, empty if there is none"),
     )
     return [
-        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{meaning} {end}: {name}")
+        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{meaning} {end}, {name}")
         for end in ("source", "destination")
         for quantity, kind, unit, name in kinds
     ]
@@ -78,8 +78,8 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "reason why the packet never arrived; empty if it did, or was under way at the end",
             ),
             _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
-            *_end_fields("known", "assumed by the network when the packet entered it,"),
-            *_end_fields("true", "true when the packet was sent,"),
+            *_end_fields("known", "as the network knew it when the packet entered:"),
+            *_end_fields("true", "true value when the packet was sent:"),
         ]
     ),
     "states": pa.schema(

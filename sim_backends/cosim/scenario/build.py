@@ -26,6 +26,7 @@ from sim_backends.cosim.scenario.external import open_network, open_physics, wri
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
+from sim_backends.federates.ip_radio import IpRadio
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
@@ -54,6 +55,8 @@ def radio_network(
     seed: int,
     observer: WindowObserver | None = None,
     path_losses_db: PathLosses | None = None,
+    *,
+    carrier: NetworkFederate | None = None,
 ) -> RadioNetwork:
     """Return the network that carries the packets of a scenario, which must have passed `checks`.
 
@@ -63,13 +66,16 @@ def radio_network(
         seed: Seed of all random draws.
         observer: Receives all IP packets if it has `log_ip`.
         path_losses_db: As for `WifiInWorld`; fixed links ignore them.
+        carrier: Network that carries its IP packets instead of the built-in radio; or None.
     """
     stations = antennas(scenario)
-    radio: RadioModel[Fragment] = (
-        UniformLinks(seed, scenario.radio)
-        if scenario.radio.fixed
-        else WifiInWorld(seed, scenario.radio, stations, world, path_losses_db=path_losses_db)
-    )
+    radio: RadioModel[Fragment]
+    if carrier is not None:
+        radio = IpRadio(carrier, tuple(stations))
+    elif scenario.radio.fixed:
+        radio = UniformLinks(seed, scenario.radio)
+    else:
+        radio = WifiInWorld(seed, scenario.radio, stations, world, path_losses_db=path_losses_db)
     network = RadioNetwork(
         radio,
         tuple(stations),
@@ -262,13 +268,15 @@ def build(
         if physics is None and (physics := open_physics(*details)) is not None:
             federates.callback(getattr(physics, "close", _nothing_to_close))
         described = None if network is not None or captures is None else _captures(scenario, captures)
-        if network is None and (network := open_network(*details, captures=described)) is not None:
-            federates.callback(getattr(network, "close", _nothing_to_close))
+        carrier = open_network(*details, captures=described) if network is None else None
+        federates.callback(getattr(carrier, "close", _nothing_to_close))
+        if scenario.network.transports == "federate":
+            network = network or carrier
         if physics is None:
             physics = Bodies(scenario_bodies, world, step_ns=scenario.physics.step_ns, lifetimes=scenario.lifetimes)
         if network is None:
             losses_db = partial(getattr, physics, "path_losses_db") if hasattr(physics, "path_losses_db") else None
-            network = radio_network(scenario, world, seed, recorder, losses_db)
+            network = radio_network(scenario, world, seed, recorder, losses_db, carrier=carrier)
         elif isinstance(recorder, IpObserver) and described is None:
             recorder = PacketObserver(recorder, recorder.log_ip)
         for fault in scenario.faults:

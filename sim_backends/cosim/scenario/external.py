@@ -11,11 +11,12 @@ from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
-from sim_backends.federates.handshake import AgentStart, Hello
+from sim_backends.federates.handshake import AgentStart, FederateCapability, Hello
 from sim_backends.federates.named import ProgramFederate, PythonFederate, federates, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
-from sim_backends.federates.simulator_options import options_json
+from sim_backends.federates.simulator_options import SimulatorOptions, options_json
 from sim_backends.federates.transports.transport_table import parse_address
+from sim_backends.network.bare_ip import BROADCAST, UNICAST
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
 from sim_backends.world.world import World
@@ -43,8 +44,8 @@ def has_addresses(scenario: CosimScenario) -> bool:
 
 
 def writes_captures(scenario: CosimScenario) -> bool:
-    """Return True if the network is a program that writes captures of its IP packets itself."""
-    where = scenario.network.federate
+    """Return True if the network is a program that writes captures of the IP packets of its own transports."""
+    where = None if scenario.network.transports == "builtin" else scenario.network.federate
     federate = None if where is None else named(where, NETWORK)
     return isinstance(federate, ProgramFederate) and federate.writes_captures
 
@@ -86,6 +87,7 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
 def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
     """Return the configuration as JSON; the order of agents is that of the scenario, as results may depend on it."""
     radios = antennas(scenario)
+    options = (scenario.physics if role == PHYSICS else scenario.network).options
     configuration = {
         "scenario": without_federates(scenario).model_dump(mode="json", by_alias=True, exclude_none=True),
         "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
@@ -96,8 +98,10 @@ def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
             }
             for name, plan in scenario.agents.items()
         },
-        "options": options_json((scenario.physics if role == PHYSICS else scenario.network).options),
+        "options": options_json(options),
     }
+    if isinstance(options, SimulatorOptions):
+        configuration |= options.further_configuration(configuration)
     return json.dumps(configuration).encode()
 
 
@@ -178,13 +182,21 @@ def open_network(
         return network
     network = remote.open_network(where, hello, deadline_s)
     supported = network.welcome.transports
-    used = sorted({traffic.transport for traffic in scenario.traffic})
+    builtin = scenario.network.transports == "builtin"
+    used = [UNICAST, BROADCAST] if builtin else sorted({traffic.transport for traffic in scenario.traffic})
     if supported and (missing := [transport for transport in used if transport not in supported]):
         network.close()
         raise ConfigurationError(
             f"{network.session.name} does not support the transport {', '.join(missing)} of the scenario's traffic",
             remedy=f"use a scenario whose traffic uses {', '.join(supported)}, or an option of the network, or list "
             "it in welcome: fieldkit docs federates",
+        )
+    if builtin and not network.welcome.capabilities & FederateCapability.NEXT_EVENT:
+        network.close()
+        raise ConfigurationError(
+            f"{network.session.name} does not report the time of its next event",
+            where="network.transports",
+            remedy="remove transports: builtin",
         )
     return network
 

@@ -1,8 +1,8 @@
 """Periods that are commensurate with a window, so that a run samples only a few phases of the window.
 
-The error of a method depends on the phase of the window at which a packet is sent. If b periods are a whole number of
+The error of a policy depends on the phase of the window at which a packet is sent. If b periods are a whole number of
 windows, packets are sent at b phases only, the same ones in every window, and the measured error is that of these
-phases, not of the method.
+phases, not of the policy.
 """
 
 from collections.abc import Iterator, Sequence
@@ -79,10 +79,10 @@ def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float |
     """
     step_s = scenario.physics.step
     steps = round(window_s / step_s)
-    near = sorted(
+    counts = sorted(
         range(max(steps // 2, 1), min(2 * steps, steps + _MAX_STEPS) + 1), key=lambda count: abs(count - steps)
     )
-    return next((count * step_s for count in near if not commensurate_events(scenario, [count * step_s])), None)
+    return next((count * step_s for count in counts if not commensurate_events(scenario, [count * step_s])), None)
 
 
 def _few_phases(event: PeriodicEvent, window_s: float) -> int | None:

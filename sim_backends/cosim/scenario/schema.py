@@ -1,7 +1,7 @@
 """The schema of a scenario file. Checks that need more than the file are in `checks`."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.catalog import Named
@@ -98,10 +98,13 @@ class NetworkOptions(Strict):
         federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
             then responsible for the radio, `tcp` and the faults of radios.
         options: Options of the federate, as for the physics.
+        transports: `federate`: those of the federate. `builtin`: it carries IP packets (its transport `ip`) of the
+            built-in UDP, TCP, topics and ROS 1.
     """
 
     federate: Federate = None
     options: NetworkFederateOptions = None
+    transports: Literal["federate", "builtin"] = "federate"
 
 
 class AgentRadio(Strict):

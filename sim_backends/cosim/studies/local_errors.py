@@ -1,8 +1,8 @@
-"""Local errors: the errors of a method in single windows that start from the state of the exact reference.
+"""Local errors: the errors of a sync policy in single windows that start from the state of the exact reference.
 
 They are measured as for solvers of differential equations: the reference runs exactly; at many times a fork of it
-runs one window with the method and continues exactly. Differences from the reference are then caused by that window
-only, and not by earlier windows. If the window is halved, the errors decrease according to the order of the method.
+runs one window with the policy and continues exactly. Differences from the reference are then caused by that window
+only, and not by earlier windows. If the window is halved, the errors decrease according to the order of the policy.
 
 A window affects the packets that, in the reference, were sent or arrived within it.
 """
@@ -36,7 +36,7 @@ _LONGEST_NS: Final = 3_600_000_000_000
 
 @dataclass(frozen=True)
 class LocalErrors:
-    """Local errors of one method for several parameters, over windows that begin at the same times.
+    """Local errors of one policy for several parameters, over windows that begin at the same times.
 
     Attributes:
         window_s: Lengths of the windows, shape (parameters, begins).
@@ -70,7 +70,7 @@ class LocalErrors:
 
 
 def pool(errors_by_run: Iterable[LocalErrors]) -> LocalErrors:
-    """Return the local errors of one method over the windows of several runs, for example of several seeds."""
+    """Return the local errors of one policy over the windows of several runs, for example of several seeds."""
     runs = list(errors_by_run)
     return LocalErrors(
         np.concatenate([run.window_s for run in runs], axis=1),
@@ -81,22 +81,23 @@ def pool(errors_by_run: Iterable[LocalErrors]) -> LocalErrors:
 
 def local_errors(
     make: Callable[[SyncPolicy], Coordinator],
-    methods: Mapping[str, Callable[[float], SyncPolicy]],
+    policies: Mapping[str, Callable[[float], SyncPolicy]],
     parameters: Sequence[float],
     starts_ns: Sequence[int],
     tail_ns: int = TAIL_NS,
 ) -> dict[str, LocalErrors]:
-    """Return the local errors of each method.
+    """Return the local errors of each policy.
 
     Args:
         make: Builds the co-simulation of one scenario and seed.
-        methods: Functions that return a policy for a parameter: the length of a window in seconds, or its equivalent.
+        policies: Functions that return a policy for a parameter: the length of a window in seconds, or its
+            equivalent.
         parameters: The parameters.
         starts_ns: Start times of windows, ascending; whole steps of the physics.
         tail_ns: Time that forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:
-        PolicyError: A method has no window for a situation.
+        PolicyError: A policy has no window for a situation.
         FieldkitError: A fork changed its original: the scenario has an object that cannot be copied.
     """
     shape = len(parameters), len(starts_ns)
@@ -104,16 +105,16 @@ def local_errors(
         name: LocalErrors(
             np.zeros(shape), *({measure: np.zeros(shape) for measure in MEASURES} for _ in ("sums", "counts"))
         )
-        for name in methods
+        for name in policies
     }
     reference = make(EventDriven())
     for column, start_ns in enumerate(starts_ns):
         _delete_decided(reference.advance(start_ns))
         exact_by_end: dict[int, _Outcome] = {}
-        for name, method in methods.items():
+        for name, make_policy in policies.items():
             for row, parameter in enumerate(parameters):
                 fork = reference.fork()
-                fork.policy = method(parameter)
+                fork.policy = make_policy(parameter)
                 end_ns = fork.advance(start_ns + _LONGEST_NS, max_windows=1).windows_ns[-1]
                 if end_ns == start_ns + _LONGEST_NS:
                     continue  # there are no more events

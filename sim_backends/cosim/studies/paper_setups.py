@@ -167,7 +167,7 @@ def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes
 
 
 def mesh(radio: Changes, changes: Changes) -> Setup:
-    """Return the setup of the experiment with EMANE. It is run exactly, as an emulator has no synchronization method.
+    """Return the setup of the experiment with EMANE. It is run exactly, as an emulator has no sync policy.
 
     Args:
         radio: One of `RADIOS`.

@@ -4,7 +4,7 @@ The paper (section III, below algorithm 1): the network's loss is compared with 
 window is changed by algorithm 1, and the same round is run again, until a result "is deemed to be satisfactory". The
 window of a round is the result of the rule in the previous round.
 
-A synchronization method does not change the losses of the radio. So each round is compared with the exact reference
+A sync policy does not change the losses of the radio. So each round is compared with the exact reference
 of the same scenario and seed, whose loss does not depend on a window. The loop only changes the error of the result,
 and every round adds to its cost.
 """

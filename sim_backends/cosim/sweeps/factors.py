@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import product
 from typing import Any, Final
@@ -9,7 +10,17 @@ from typing import Any, Final
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Topology
-from fieldkit.core.units import parse_distance, parse_duration_s
+from fieldkit.core.units import (
+    BITS_PER_S_PER_UNIT,
+    BYTES_PER_UNIT,
+    FRACTION_PER_UNIT,
+    HERTZ_PER_UNIT,
+    METRES_PER_S_PER_UNIT,
+    METRES_PER_UNIT,
+    SECONDS_PER_UNIT,
+    parse_distance,
+    parse_quantity,
+)
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 
@@ -26,6 +37,27 @@ _NOT_SETTINGS: Final = frozenset({"name", "summary", "seeds"})
 _BETWEEN_VALUES: Final = re.compile(r",(?![^\[{]*[\]}])")
 """A comma outside brackets."""
 _PLAIN_NUMBER: Final = re.compile(r"[+-]?[0-9.]+(?:[eE][+-]?[0-9]+)?")
+
+
+_QUANTITIES: Final = (
+    ("_s", "s", SECONDS_PER_UNIT),
+    ("_m", "m", METRES_PER_UNIT),
+    ("_m_s", "m/s", METRES_PER_S_PER_UNIT),
+    ("_hz", "Hz", HERTZ_PER_UNIT),
+    ("_bit_s", "bit/s", BITS_PER_S_PER_UNIT),
+    ("_bytes", "B", BYTES_PER_UNIT),
+    ("_db", "dB", {"dB": 1.0}),
+    ("_dbm", "dBm", {"dBm": 1.0}),
+    ("_value", "1", FRACTION_PER_UNIT),
+)
+"""Suffix, unit and factors of units of the column of numbers of each kind of quantity."""
+
+
+def _in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
+    """Return a quantity in a unit; only levels may be negative. Raises as `parse_quantity`."""
+    magnitude = text.removeprefix("-") if unit in {"dB", "dBm"} else text
+    value = parse_quantity(magnitude, factors, "value")
+    return value if magnitude == text else -value
 
 
 @dataclass(frozen=True)
@@ -60,14 +92,9 @@ class Factor:
             return None
         if all(_PLAIN_NUMBER.fullmatch(value) for value in self.values):
             return f"{self.column}_value", "1", tuple(map(float, self.values))
-        for suffix, unit, parse in (
-            ("_s", "s", parse_duration_s),
-            ("_m", "m", lambda text: float(parse_distance(text).metres)),
-        ):
-            try:
-                return self.column + suffix, unit, tuple(map(parse, self.values))
-            except ConfigurationError:
-                continue
+        for suffix, unit, factors in _QUANTITIES:
+            with suppress(ConfigurationError):
+                return self.column + suffix, unit, tuple(_in_unit(value, unit, factors) for value in self.values)
         return None
 
 

@@ -1,6 +1,6 @@
 """The results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
 
-Equal results give equal bytes: rows are in the order of the plan, whatever the order in which the runs ended.
+Equal results give equal bytes: rows have the order of the plan; the order in which the runs ended does not matter.
 """
 
 import json
@@ -82,7 +82,7 @@ def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> lis
             name, _, values = declared
             numbers[name] = values[factor.values.index(setting.values[factor.name])]
     runs = (run for run in plan.runs if run.setting is setting)
-    hashes = scenario_hashes(plan.scenario)  # what a factor changes is not another procedure
+    hashes = scenario_hashes(plan.scenario)  # a factor changes a setting, not the procedure
     return [numbers | dict(row) | hashes for run in runs for row in folder.rows(run)]
 
 

@@ -8,8 +8,9 @@ from typing import Any, Final
 
 from fieldkit.core.columns import Value
 from fieldkit.core.errors import ConfigurationError, FieldkitError, LinkError, describe_exception
-from fieldkit.core.events import Note, Progress, Sink, SweepEnded, SweepPlanned, SweepRunEnded
+from fieldkit.core.events import Note, Progress, Sink
 from fieldkit.core.executors import Workers
+from fieldkit.core.sweep_events import SweepEnded, SweepPlanned, SweepRunEnded
 from fieldkit.core.tasks import TaskEnd, WorkerDiedError, completed
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.execution import simulate

@@ -7,7 +7,7 @@ from typing import Final
 from sim_backends.emulated.autopilot import mavlink_frames, microservices
 from sim_backends.emulated.autopilot.commands import Commands, is_integer_up_to
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.flight import SetPoint
+from sim_backends.emulated.autopilot.flight import MakeAirframe, SetPoint
 from sim_backends.emulated.autopilot.mavlink_frames import (
     AUTOPILOT_COMPONENT,
     AVAILABLE_MODES,
@@ -44,6 +44,7 @@ class Autopilot:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
+        make_airframe: See `VehicleBase`.
     """
 
     def __init__(
@@ -56,12 +57,21 @@ class Autopilot:
         obstacles: Sequence[Footprint],
         now_ns: int,
         boot_s: float = 0.0,
+        make_airframe: MakeAirframe | None = None,
     ) -> None:
         self._firmware = firmware
         self._parameters = Parameters(firmware.parameters(limits))
         self._parameters.change("MAV_SYS_ID", system)
         self._system = system
-        self.vehicle = Vehicle(firmware, self._parameters, airframe_limits, obstacles, now_ns, boot_s=boot_s)
+        self.vehicle = Vehicle(
+            firmware,
+            self._parameters,
+            airframe_limits,
+            obstacles,
+            now_ns,
+            boot_s=boot_s,
+            make_airframe=make_airframe,
+        )
         self._telemetry = Telemetry(self.vehicle, self._parameters)
         self._commands = Commands(self.vehicle, self._parameters)
         self._transfer = MissionTransfer(lambda: self.vehicle.mission.items, self._fault, self.vehicle.load)
@@ -88,7 +98,7 @@ class Autopilot:
             if message.get_type() == "HEARTBEAT":
                 self.vehicle.failsafes.heartbeat(message.get_srcSystem(), message.type, now_ns)
             elif self._is_addressed(message):
-                yield from self._port.frames(self._answers(message, now_ns))
+                yield from self._port.frames(self._replies(message, now_ns))
 
     def advance(self, now_ns: int) -> Iterator[Frame]:
         """Fly until this time and yield the frames that are due; the caller must consume all."""
@@ -140,7 +150,7 @@ class Autopilot:
             yield dialect.MAVLink_statustext_message(severity, text.encode("ascii", "replace")[:_TEXT_BYTES])
         self.vehicle.status_texts.clear()
 
-    def _answers(self, message: Message, now_ns: int) -> Iterator[Message]:
+    def _replies(self, message: Message, now_ns: int) -> Iterator[Message]:
         kind = message.get_type()
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
             yield from self._command(message, now_ns)

@@ -5,7 +5,7 @@ state is read.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -60,7 +60,7 @@ class Airframe:
         self._pose = FlightPose(place_m, heading_rad=facing_rad)
         self.home_m = place_m
         self._obstacles = obstacles
-        self._near: Sequence[Footprint] = ()
+        self._obstacles_nearby: Sequence[Footprint] = ()
         self._searched_m: Vector = (math.inf, 0.0, 0.0)
         self._limits = limits
         self._quadrotor = Quadrotor(limits, place_m)
@@ -117,6 +117,10 @@ class Airframe:
             # At rest it neither slides nor tilts nor turns.
             self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
 
+    def rest(self, now_ns: int) -> None:
+        """Stay on the ground without power until this time, in whole steps."""
+        self.now_ns += (now_ns - self.now_ns) // STEP_NS * STEP_NS
+
     def _rests(self, obstacles: Sequence[Footprint]) -> bool:
         east, north, up = self._pose.place_m
         stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _REST_M), obstacles)
@@ -126,16 +130,20 @@ class Airframe:
         """Return the obstacles that it may hit in this step."""
         if not math.dist(place_m, self._searched_m) < _SEARCH_M / 2:
             self._searched_m = place_m
-            self._near = [
+            self._obstacles_nearby = [
                 obstacle for obstacle in self._obstacles if gap_m(obstacle, self._quadrotor, place_m) < _SEARCH_M
             ]
-        return self._near
+        return self._obstacles_nearby
 
     @property
     def course_rad(self) -> float | None:
         """Direction of flight over the ground; None while it is slow."""
         east, north, _ = self.velocity_m_s
         return math.atan2(north, east) if math.hypot(east, north) > _MIN_COURSE_M_S else None
+
+
+MakeAirframe = Callable[[Vector, float, int], Airframe]
+"""Puts a drone at a place: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:
@@ -151,7 +159,7 @@ def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorL
 
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the velocity towards a point relative to home from which it can brake to a stop there."""
-    east, north, up = (goal - here for goal, here in zip(goal_m, body.position_m, strict=True))
+    east, north, up = (goal - current for goal, current in zip(goal_m, body.position_m, strict=True))
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s
     speed_m_s = min(limits.speed_m_s, _approach(distance_m, limits.acceleration_m_s2, along_per_s))

@@ -7,12 +7,15 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+from fieldkit.core.model import Vector
+from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightRecord
 from sim_backends.emulated.ros.own_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.autopilot import Autopilot
+    from sim_backends.emulated.autopilot.flight import MakeAirframe
     from sim_backends.emulated.autopilot.mavlink_frames import Frame
 
 _TICK_NS: Final = 20_000_000
@@ -21,6 +24,18 @@ _TICK_NS: Final = 20_000_000
 _MAX_BYTES: Final = 65_536
 _BURST: Final = 64
 """Datagrams received before the next flight step, so that a flood of datagrams does not stop the flight."""
+
+
+class PhysicsFiles(NamedTuple):
+    """The files between an autopilot and the physics that flies its drone.
+
+    Attributes:
+        commands: File of `FlightCommandRecord`.
+        flown: File of `FlightRecord`.
+    """
+
+    commands: Path
+    flown: Path
 
 
 @dataclass(frozen=True)
@@ -38,6 +53,7 @@ class Drone:
         antenna_m: Height of the antenna, whose position the lab uses, above the lowest point of the drone.
         world: World that it flies in, as JSON.
         boot_s: Time from power-on until its position estimate has an origin.
+        physics: Its files for the physics that flies it; None if the autopilot moves it itself.
     """
 
     system: int
@@ -50,6 +66,7 @@ class Drone:
     antenna_m: float
     world: str
     boot_s: float = 0.0
+    physics: PhysicsFiles | None = None
 
 
 def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
@@ -75,7 +92,8 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
         while True:
             reporter.read_placement(time.monotonic_ns())
             _exchange(autopilot, endpoint)
-            reporter.write_motion()
+            if drone.physics is None:
+                reporter.write_motion()
             selector.select(_wait_s(autopilot))
 
 
@@ -93,7 +111,8 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
     from sim_backends.world.world import World  # noqa: PLC0415
 
-    world = World.model_validate_json(drone.world) if drone.world else None
+    reporter = MotionReporter(motion, steered, time.monotonic_ns())
+    world = World.model_validate_json(drone.world) if drone.world and drone.physics is None else None
     autopilot = Autopilot(
         firmware={"px4": PX4, "ardupilot": ARDUCOPTER}[drone.autopilot],
         system=drone.system,
@@ -102,10 +121,26 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
         obstacles=Ground(world, None).around,
         now_ns=power_on_ns,
         boot_s=drone.boot_s,
+        make_airframe=None if drone.physics is None else simulated_airframe(drone.profile, drone.physics, reporter),
     )
-    return autopilot, DroneMotionReporter(
-        autopilot, MotionReporter(motion, steered, time.monotonic_ns()), drone.antenna_m
-    )
+    return autopilot, DroneMotionReporter(autopilot, reporter, drone.antenna_m)
+
+
+def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
+    """Return the function that puts the drone of a physics at a place."""
+    from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (as above)
+    from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
+
+    limits = quadrotor(profile)
+    commands, flown = FlightCommandRecord.open(files.commands), FlightRecord.open(files.flown)
+
+    def make(place_m: Vector, facing_rad: float, now_ns: int) -> SimulatedAirframe:
+        path_start_ns = reporter.path_start_ns
+        return SimulatedAirframe(
+            limits, place_m, facing_rad, now_ns, commands=commands, flown=flown, path_start_ns=path_start_ns
+        )
+
+    return make
 
 
 class DroneMotionReporter:

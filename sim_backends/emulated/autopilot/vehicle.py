@@ -159,7 +159,7 @@ class Vehicle(VehicleBase):
         battery.advance(now_ns, driven=self.armed)
         while self.body.now_ns + STEP_NS <= now_ns:
             if not self.armed and self.body.on_ground:
-                self.body.now_ns += (now_ns - self.body.now_ns) // STEP_NS * STEP_NS
+                self.body.rest(now_ns)
                 self.land_detector.landed = True
                 break
             self._update_ground_state()

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.failsafes import Fence, VehicleState
 from sim_backends.emulated.autopilot.firmware import Firmware
-from sim_backends.emulated.autopilot.flight import Airframe, Guidance, limits_within, stop_m
+from sim_backends.emulated.autopilot.flight import Airframe, Guidance, MakeAirframe, limits_within, stop_m
 from sim_backends.emulated.autopilot.mission_plan import Mission
 from sim_backends.emulated.autopilot.onboard_estimates import Battery, LandDetector, PositionEstimate
 from sim_backends.emulated.autopilot.parameters import Parameters
@@ -32,6 +32,7 @@ class VehicleBase:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
+        make_airframe: Puts it at a place; None for the airframe that the autopilot itself moves.
 
     Attributes:
         body: Position and motion, relative to home.
@@ -57,12 +58,15 @@ class VehicleBase:
         now_ns: int,
         *,
         boot_s: float = 0.0,
+        make_airframe: MakeAirframe | None = None,
     ) -> None:
         self.firmware = firmware
         self.battery = Battery(now_ns)
         self._parameters = parameters
         self._limits = limits
-        self._obstacles = obstacles
+        self._make_airframe = make_airframe or (
+            lambda place_m, facing_rad, at_ns: Airframe(limits, place_m, facing_rad, obstacles, at_ns)
+        )
         self.estimate = PositionEstimate(boot_s, firmware.starting_flags)
         self.land_detector = LandDetector(firmware.landed_s)
         self.fence = Fence(parameters)
@@ -83,7 +87,7 @@ class VehicleBase:
 
     def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
         """Put it on the ground at another place in the world, as if a person carried it. It keeps its mode."""
-        self.body = Airframe(self._limits, place_m, facing_rad, self._obstacles, now_ns)
+        self.body = self._make_airframe(place_m, facing_rad, now_ns)
         if self.estimate.origin_m is None:
             self.home_m = place_m
         self.body.home_m = self.home_m

@@ -1,7 +1,6 @@
 """The lab's client of a co-simulated medium."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 from typing_extensions import override
@@ -47,7 +46,7 @@ class CosimulatedClient(MediumClient):
     ) -> None:
         super().attach(name, address, radio, fd)
         if (body := self._bodies.get(name)) is not None:
-            request = {"do": "body", "name": name, "profile": body.profile, "limits": asdict(body.limits)}
+            request = {"do": "body", "name": name, "body": body.to_json()}
             self._worker.request(request, descriptors=physics_fds)
 
     @override

@@ -27,7 +27,7 @@ from sim_backends.emulated.cosimulated.clock import RealTime
 from sim_backends.emulated.cosimulated.cosim_session import CosimSession
 from sim_backends.emulated.cosimulated.real_agents import RealPacket
 from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators
-from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.cosimulated.steering import FlightSteering, GroundSteering, Steering
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
 from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, rounded_up
 from sim_backends.emulated.medium.server import (
@@ -39,7 +39,6 @@ from sim_backends.emulated.medium.server import (
     MediumServer,
 )
 from sim_backends.emulated.process.worker import Message
-from sim_backends.physics.differential_drive import DriveLimits
 from sim_backends.radio.links import PACKET, PROCESSING_NS, TRANSMISSION_NS, LinkCounters, Pair
 from sim_backends.world.motion import STILL, State
 
@@ -268,10 +267,11 @@ class CosimulatedMedium(MediumServer):
             return {"error": error.what, "remedy": error.remedy}
 
     def _add_body(self, request: Message, descriptors: list[int]) -> None:
-        name, limits = request["name"], DriveLimits(**request["limits"])
-        self._bodies[name] = RobotBody(request["profile"], limits)
+        name, body = request["name"], RobotBody.from_json(request["body"])
+        self._bodies[name] = body
         if descriptors:
-            self._steerings[name] = Steering(descriptors, time.monotonic_ns())
+            steering = FlightSteering if body.flies else GroundSteering
+            self._steerings[name] = steering(descriptors, time.monotonic_ns())
 
     @override
     def _delays(self, request: Message) -> Message:

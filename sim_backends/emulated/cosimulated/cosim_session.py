@@ -159,5 +159,5 @@ def _packed(packet: Packet, delay_ns: int, parts: ArrivalDelay) -> Delay:
         + processing_ns * PROCESSING_NS
         + parts.transmission_ns * TRANSMISSION_NS
         + parts.propagation_ns * PROPAGATION_NS
-        + parts.queueing_ns * QUEUING_NS
+        + parts.queuing_ns * QUEUING_NS
     )

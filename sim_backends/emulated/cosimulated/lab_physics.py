@@ -9,11 +9,11 @@ from typing_extensions import override
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.emulated.cosimulated.clock import RealTime
-from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.cosimulated.steering import Command, FlightSteering, Steering
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.body import Twist
+from sim_backends.physics.quadrotor import FlightStatus
 from sim_backends.world.motion import STILL, State
 
 OFF_AIR_M: Final[Vector] = (0.0, 0.0, 1e7)
@@ -36,6 +36,15 @@ class Placing(PhysicsFederate, Protocol):
             place_m: Position of the ground below it, metres east, north, up.
             heading_rad: Its heading, from east towards north.
         """
+        ...
+
+
+@runtime_checkable
+class Flying(PhysicsFederate, Protocol):
+    """A physics that flies drones by the commands of their autopilots."""
+
+    def flight_status(self, name: str) -> FlightStatus:
+        """Return attitude and support of a drone at its present state."""
         ...
 
 
@@ -83,7 +92,8 @@ class LabPhysics:
         self._started_ns = 0
         self._advanced_ns = 0
         self._now_ns = 0
-        self._pending: dict[str, Twist] = {}
+        self._pending: dict[str, Command] = {}
+        self._followed: dict[str, Command] = {}
         self._assigned = dict.fromkeys(stations, State(OFF_AIR_M))
         self._hidden: frozenset[str] = frozenset()
         self._in_physics: dict[str, tuple[Vector, float]] = {}
@@ -127,8 +137,8 @@ class LabPhysics:
         if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
             self._poll_placements(now_ns)
         if self._physics is not None:
-            for at_ns, name, twist in sorted(self._commands(to_ns), key=lambda command: command[0]):
-                self._drive(name, max(at_ns, self._now_ns), twist)
+            for at_ns, name, command in sorted(self._commands(to_ns), key=lambda timed: timed[0]):
+                self._drive(name, max(at_ns, self._now_ns), command)
             self._advance(to_ns)
             self._report(to_ns)
         self._now_ns = to_ns
@@ -142,15 +152,19 @@ class LabPhysics:
         if close := getattr(self._physics, "close", None):
             close()
 
-    def _commands(self, to_ns: int) -> Iterator[tuple[int, str, Twist]]:
+    def _commands(self, to_ns: int) -> Iterator[tuple[int, str, Command]]:
         until_ns = self._clock.monotonic_ns(to_ns)
         for name, steering in self._steerings.items():
-            for at_ns, twist in steering.commands(until_ns):
-                yield self._clock.simulated_ns(at_ns), name, twist
+            for at_ns, command in steering.commands(until_ns):
+                yield self._clock.simulated_ns(at_ns), name, command
 
-    def _drive(self, name: str, at_ns: int, twist: Twist) -> None:
+    def _drive(self, name: str, at_ns: int, command: Command) -> None:
+        """Command a robot at a time; a command that the robot follows already needs no exchange with the physics."""
+        if self._followed.get(name) == command:
+            return
+        self._followed[name] = command
         self._advance(at_ns)
-        self._pending[name] = twist
+        self._pending[name] = command
 
     def _advance(self, to_ns: int) -> None:
         """Advance the physics; its time does not advance while nothing moves in it."""
@@ -169,8 +183,11 @@ class LabPhysics:
     def _report(self, to_ns: int) -> None:
         at_ns = self._clock.monotonic_ns(to_ns - (to_ns - self._started_ns) % self.step_ns)
         for name, steering in self._steerings.items():
-            if steering.is_driven:
-                steering.report(at_ns, self._physics_states[name])
+            if steering.is_driven and steering.is_report_due(at_ns):
+                flight: FlightStatus | None = None
+                if isinstance(steering, FlightSteering) and isinstance(self._physics, Flying):
+                    flight = self._physics.flight_status(name)
+                steering.report(at_ns, self._physics_states[name], flight)
 
     def _combined(self) -> Mapping[str, State]:
         states = dict(self._assigned)
@@ -188,9 +205,10 @@ class LabPhysics:
             was_driven = steering.is_driven
             if steering.poll_placement(self._clock.monotonic_ns(now_ns)) is not None:
                 self._changed = True
+                self._followed.pop(name, None)
                 if was_driven and state is not None:
                     self._assigned[name] = State(state.position_m)  # until the lab's request arrives
-                    self._pending[name] = Twist()
+                    self._pending[name] = steering.idle
 
     def _place_bodies(self) -> None:
         """Put the robots that the lab has moved at their places in the physics."""
@@ -208,6 +226,7 @@ class LabPhysics:
         self._in_physics |= moved
         if isinstance(self._physics, Placing):
             for name, ((east_m, north_m, up_m), heading_rad) in moved.items():
+                self._followed.pop(name, None)
                 self._physics.put(name, (east_m, north_m, up_m - ANTENNA_M), heading_rad)
             self._check_overlaps(moved)
             self._physics_states = self._physics.advance(max(self._now_ns - self._started_ns, 0), {})
@@ -229,6 +248,7 @@ class LabPhysics:
         """Start the physics with all robots at their present places; those that move are at rest afterwards."""
         self.close()
         self._physics = None
+        self._followed.clear()
         states = {name: self._body_state(name) for name in self._bodies}
         self._in_physics = {name: (state.position_m, state.heading_rad or 0.0) for name, state in states.items()}
         self._started_ns = self._now_ns - self._now_ns % self.step_ns

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Self
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Topology
@@ -20,6 +20,7 @@ from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
+from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld
@@ -61,11 +62,28 @@ class RobotBody:
 
     Attributes:
         profile: Name of its profile.
-        limits: Limits and size.
+        limits: Limits and size; those of a quadrotor if it flies.
     """
 
     profile: str
-    limits: DriveLimits
+    limits: DriveLimits | QuadrotorLimits
+
+    @property
+    def flies(self) -> bool:
+        """True if it is a drone."""
+        return isinstance(self.limits, QuadrotorLimits)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the body as JSON."""
+        return {"profile": self.profile, "flies": self.flies, "limits": dataclasses.asdict(self.limits)}
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Return the body from the JSON of `to_json`."""
+        limits: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in data["limits"].items()
+        }
+        return cls(data["profile"], QuadrotorLimits(**limits) if data["flies"] else DriveLimits(**limits))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,12 +122,7 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
     """
     name, step_ns = settings.simulators.physics, settings.simulators.step_ns
     if name == KINEMATIC:
-        bodies = {
-            robot: DifferentialDrive(
-                settings.bodies[robot].limits, state.position_m[:2], state.heading_rad or 0.0, antenna_m=ANTENNA_M
-            )
-            for robot, state in states.items()
-        }
+        bodies = {robot: _body(settings.bodies[robot].limits, state) for robot, state in states.items()}
         return Bodies(bodies, settings.world, step_ns=step_ns)
     hello = _hello(settings, PHYSICS, states)
     federate = named(name, PHYSICS)
@@ -124,6 +137,13 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
             remedy="configure this step in the simulator's world",
         )
     return physics
+
+
+def _body(limits: DriveLimits | QuadrotorLimits, state: State) -> DifferentialDrive | Quadrotor:
+    (east_m, north_m, up_m), heading_rad = state.position_m, state.heading_rad or 0.0
+    if isinstance(limits, QuadrotorLimits):
+        return Quadrotor(limits, (east_m, north_m, up_m - ANTENNA_M), heading_rad, antenna_m=ANTENNA_M)
+    return DifferentialDrive(limits, (east_m, north_m), heading_rad, antenna_m=ANTENNA_M)
 
 
 class BuiltinNetwork(NamedTuple):
@@ -170,6 +190,7 @@ def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hel
             name,
             settings.bodies[name].profile if name in settings.bodies else "",
             state._replace(heading_rad=state.heading_rad or 0.0),
+            flies=name in settings.bodies and settings.bodies[name].flies,
             antenna_m=ANTENNA_M,
             limit_m_s2=math.inf,
         )

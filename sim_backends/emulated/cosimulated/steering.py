@@ -1,43 +1,65 @@
-"""Steering of one robot: reads the velocities that its programs command, and writes the record of its motion."""
+"""Steering of one robot: reads the commands of its programs, and writes the record of its motion."""
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
+
+from typing_extensions import override
 
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS, odometry
-from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
+from sim_backends.emulated.robot.commanded import CommandedRecord
+from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightMotion, FlightRecord
 from sim_backends.emulated.ros.own_motion import AT_REST, MotionReporter, OwnMotion
-from sim_backends.physics.body import Twist
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarget
 from sim_backends.world.motion import STILL, State
 
 _REPORT_NS: Final = 10_000_000
 """Interval of the records while a robot moves: those of the robot's own base controller have 20 ms."""
 
 _PENDING_COMMANDS: Final = 1000
-"""Velocities that are kept while the simulation lags, by at most 1 s; older ones are dropped."""
+"""Commands that are kept while the simulation lags, by at most 1 s; older ones are dropped."""
+
+Command = Twist | FlightTarget
 
 
-class Steering:
+class TimedCommand(NamedTuple):
+    """A command.
+
+    Attributes:
+        time_ns: Its time, by the monotonic clock.
+        command: The command.
+        is_idle: True if it need not be repeated: a robot without commands is in the state that it causes.
+    """
+
+    time_ns: int
+    command: Command
+    is_idle: bool = False
+
+
+class Steering(ABC):
     """Commands and record of one robot. Times are those of the monotonic clock.
 
     Args:
-        descriptors: Of the record of its motion, the file of its assigned paths, and the record of its commanded
-            velocity (`EmulatedRobot.physics_fds`).
+        steered: Descriptor of the record of its motion.
+        paths: Descriptor of the file of its assigned paths.
         now_ns: The present time.
 
     Attributes:
+        idle: The command that follows after the last one has not been repeated for `TIMEOUT_NS`.
         is_driven: True if the robot was commanded since the lab put it at its place.
         is_placed: True if the lab has put it at a place.
-        rests: True if it is at rest, no commanded velocity is active, and this is recorded.
+        rests: True if it is at rest, no command is active, and this is recorded.
     """
 
-    def __init__(self, descriptors: Sequence[int], now_ns: int) -> None:
-        steered, paths, commanded = descriptors
-        self._commands = CommandedRecord(commanded)
+    idle: Command
+
+    def __init__(self, steered: int, paths: int, now_ns: int) -> None:
         self._seen_ns = now_ns
-        self._pending: deque[Commanded] = deque(maxlen=_PENDING_COMMANDS)
+        self._pending: deque[TimedCommand] = deque(maxlen=_PENDING_COMMANDS)
         self._reporter = MotionReporter(_path(paths), _path(steered), now_ns)
         self.is_driven = False
         self._start: OwnMotion = AT_REST
@@ -46,10 +68,14 @@ class Steering:
         self._reported: tuple[int, float] | None = None
         self.rests = True
 
+    @abstractmethod
+    def _read_command(self) -> TimedCommand | None:
+        """Return the last command of the robot's programs, or None if there is none."""
+
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
         """Return the place at which the lab has put the robot since the last call, or None if it has not.
 
-        It is at rest there, and earlier velocities are dropped.
+        It is at rest there, and earlier commands are dropped.
         """
         placed = self._reporter.poll_placement(now_ns)
         if placed is not None:
@@ -64,37 +90,44 @@ class Steering:
         """Heading at the place at which the lab put the robot."""
         return self._start.heading_rad
 
-    def commands(self, until_ns: int) -> Iterator[tuple[int, Twist]]:
-        """Yield the times and velocities that were commanded until a time, and the stop after a missing command.
+    def commands(self, until_ns: int) -> Iterator[tuple[int, Command]]:
+        """Yield the times and commands until a time, and the command after a missing one.
 
-        A simulation that lags behind reads velocities that it has not reached; they are kept until then.
+        A simulation that lags behind reads commands that it has not reached; they are kept until then.
         """
-        commanded = self._commands.read()
-        if commanded is not None and self._seen_ns < commanded.time_ns and self.is_placed:
-            self._seen_ns = commanded.time_ns
-            self._pending.append(commanded)
+        last = self._read_command()
+        if last is not None and self._seen_ns < last.time_ns and self.is_placed:
+            self._seen_ns = last.time_ns
+            self._pending.append(last)
         while self._pending and self._pending[0].time_ns <= until_ns:
-            commanded = self._pending.popleft()
-            yield from self._stop_until(commanded.time_ns)
-            self._stops_ns = commanded.time_ns + TIMEOUT_NS
+            time_ns, command, is_idle = self._pending.popleft()
+            yield from self._stop_until(time_ns)
+            if is_idle and not self.is_driven:
+                continue
+            self._stops_ns = None if is_idle else time_ns + TIMEOUT_NS
             self.is_driven, self.rests = True, False
-            yield commanded.time_ns, Twist(commanded.forward_m_s, commanded.turn_rad_s)
+            yield time_ns, command
         yield from self._stop_until(until_ns)
 
-    def _stop_until(self, until_ns: int) -> Iterator[tuple[int, Twist]]:
-        """Yield the stop after a missing command if it is due at a time."""
+    def _stop_until(self, until_ns: int) -> Iterator[tuple[int, Command]]:
+        """Yield the command after a missing one if it is due at a time."""
         if self._stops_ns is not None and self._stops_ns <= until_ns:
-            yield self._stops_ns, Twist()
+            yield self._stops_ns, self.idle
             self._stops_ns = None
 
-    def report(self, at_ns: int, state: State) -> None:
-        """Record the motion of a robot that is driven; a robot that has stopped is recorded once.
+    def is_report_due(self, at_ns: int) -> bool:
+        """Return True if the motion at a time must be recorded; that of a robot that has stopped is recorded once."""
+        return not self.rests and (self._reported is None or at_ns - self._reported[0] >= _REPORT_NS)
+
+    def report(self, at_ns: int, state: State, flight: FlightStatus | None = None) -> None:
+        """Record the motion of a robot that is driven, if that is due.
 
         Args:
             at_ns: Time of the state.
             state: Position of its antenna, velocity and heading.
+            flight: Attitude and support of a drone; None for other robots.
         """
-        if self.rests or (self._reported is not None and at_ns - self._reported[0] < _REPORT_NS):
+        if not self.is_report_due(at_ns):
             return
         before_ns, before_rad = (at_ns, self._start.heading_rad) if self._reported is None else self._reported
         heading_rad = before_rad + math.remainder((state.heading_rad or 0.0) - before_rad, math.tau)
@@ -104,15 +137,99 @@ class Steering:
             if abs(turn_rad_s) < _NO_TURN_RAD_S:
                 turn_rad_s = 0.0
         self._reported = at_ns, heading_rad
-        is_still = math.hypot(*state.velocity_m_s) < _STILL_M_S
+        is_still = math.hypot(*state.velocity_m_s) < _STILL_M_S and (flight is None or flight.is_supported)
         self.rests = is_still and not turn_rad_s and self._stops_ns is None
+        if is_still:
+            state = state._replace(velocity_m_s=STILL)
+        self._write(at_ns, state, heading_rad, turn_rad_s, flight)
+
+    def _write(
+        self,
+        at_ns: int,
+        state: State,
+        heading_rad: float,
+        turn_rad_s: float,
+        flight: FlightStatus | None,  # noqa: ARG002 (see FlightSteering)
+    ) -> None:
         self._reporter.write(
             at_ns,
             state.position_m,
-            STILL if is_still else state.velocity_m_s,
+            state.velocity_m_s,
             heading_rad=heading_rad,
             turn_rad_s=turn_rad_s,
             odometry=odometry(self._start, state.position_m, heading_rad),
+        )
+
+
+class GroundSteering(Steering):
+    """Steering of a robot on wheels.
+
+    Args:
+        descriptors: Of the record of its motion, the file of its assigned paths, and the record of its commanded
+            velocity (`EmulatedRobot.physics_fds`).
+        now_ns: The present time.
+    """
+
+    idle = Twist()
+
+    def __init__(self, descriptors: Sequence[int], now_ns: int) -> None:
+        steered, paths, commanded = descriptors
+        super().__init__(steered, paths, now_ns)
+        self._commanded = CommandedRecord(commanded)
+
+    @override
+    def _read_command(self) -> TimedCommand | None:
+        last = self._commanded.read()
+        return None if last is None else TimedCommand(last.time_ns, Twist(last.forward_m_s, last.turn_rad_s))
+
+
+class FlightSteering(Steering):
+    """Steering of a drone by its autopilot; without commands its rotors are off, so that it falls.
+
+    Args:
+        descriptors: Of the record of its motion, the file of its assigned paths, the record of the autopilot's
+            commands, and the record of its flight (`EmulatedRobot.physics_fds`).
+        now_ns: The present time.
+    """
+
+    idle = ROTORS_OFF
+
+    def __init__(self, descriptors: Sequence[int], now_ns: int) -> None:
+        steered, paths, commanded, flown = descriptors
+        super().__init__(steered, paths, now_ns)
+        self._commanded = FlightCommandRecord(commanded)
+        self._flown = FlightRecord(flown)
+
+    @override
+    def _read_command(self) -> TimedCommand | None:
+        last = self._commanded.read()
+        if last is None or last.path_start_ns != self._reporter.path_start_ns:
+            return None
+        if not last.powered:
+            return TimedCommand(last.time_ns, ROTORS_OFF, is_idle=True)
+        velocity = Velocity(last.velocity_m_s, last.yaw_rad)
+        return TimedCommand(last.time_ns, FlightTarget(velocity, last.acceleration_m_s2, last.climb_m_s2))
+
+    @override
+    def _write(
+        self, at_ns: int, state: State, heading_rad: float, turn_rad_s: float, flight: FlightStatus | None
+    ) -> None:
+        super()._write(at_ns, state, heading_rad, turn_rad_s, flight)
+        if flight is None:
+            return
+        place_m, roll_rad, pitch_rad, is_supported = flight
+        self._flown.write(
+            FlightMotion(
+                at_ns,
+                self._reporter.path_start_ns,
+                is_supported,
+                place_m,
+                state.velocity_m_s,
+                heading_rad,
+                turn_rad_s,
+                roll_rad,
+                pitch_rad,
+            )
         )
 
 

@@ -87,7 +87,7 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
 
 def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
     """Return the index of a mode in the list of the band; for an MCS, that of its modulation and code rate."""
-    same = (mode.modulation, mode.code_rate)
-    indices = [index for index, g_mode in enumerate(G_MODES) if (g_mode.modulation, g_mode.code_rate) == same]
+    coding = (mode.modulation, mode.code_rate)
+    indices = [index for index, g_mode in enumerate(G_MODES) if (g_mode.modulation, g_mode.code_rate) == coding]
     index = indices[0] if indices else len(G_MODES) - 1
     return index if frequency_mhz >= _FIRST_5_GHZ_MHZ else index + _DSSS_RATES

@@ -1,6 +1,6 @@
 """Log of the radio transmissions: one record in `air.pcap` and one line in `air.csv` per attempt.
 
-An ACK is an attempt with the number 0.
+An ACK, RTS or CTS is an attempt with the number 0.
 
 The capture has link type 105, IEEE 802.11 without FCS (https://www.tcpdump.org/linktypes.html), and time stamps in
 nanoseconds. Stations have the addresses 02:00:00:00:00:01 and so on, in the order of their names. If packets are in
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from sim_backends.emulated.medium.framing import IP, Framing
-from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.frames import ControlFrame, TransmissionAttempt
 
 PCAP: Final = "air.pcap"
 CSV: Final = "air.csv"
@@ -27,9 +27,10 @@ _RECORD_HEADER: Final = struct.Struct("<IIII")
 # Frame control, duration, receiver, transmitter, BSSID, sequence control: as in an ad hoc network (IBSS).
 _MAC: Final = struct.Struct("<BBH6s6s6sH")
 _DATA, _RETRY = 0x08, 0x08
-# Frame control, duration (0 in an ACK of the last fragment), receiver: IEEE 802.11-2016, 9.3.1.4.
-_ACK: Final = struct.Struct("<BBH6s")
-_ACK_CONTROL: Final = 0xD4
+# Frame control, duration (0 in an ACK of the last fragment; not modelled in RTS and CTS), receiver, and in RTS the
+# transmitter: IEEE 802.11-2020, 9.3.1.2 to 9.3.1.4.
+_CONTROL: Final = struct.Struct("<BBH6s")
+_FRAME_CONTROL: Final[dict[ControlFrame, int]] = {"ACK": 0xD4, "RTS": 0xB4, "CTS": 0xC4}
 _BSSID: Final = b"\x02" + bytes(5)
 _BROADCAST: Final = b"\xff" * 6
 # LLC and SNAP headers before the packet's type: RFC 1042.
@@ -82,10 +83,14 @@ class AirLog:
 
     def _record(self, attempt: TransmissionAttempt) -> bytes:
         receiver = _BROADCAST if attempt.receiver is None else self._addresses[attempt.receiver]
-        frame = self._data_frame(attempt, receiver) if attempt.number else _ACK.pack(_ACK_CONTROL, 0, 0, receiver)
+        frame = self._control_frame(attempt, receiver) if attempt.control else self._data_frame(attempt, receiver)
         seconds, rest_ns = divmod(attempt.start_ns + self._utc_ns, 1_000_000_000)
         snapshot = frame[:_SNAP_BYTES]
         return _RECORD_HEADER.pack(seconds, rest_ns, len(snapshot), len(frame)) + snapshot
+
+    def _control_frame(self, attempt: TransmissionAttempt, receiver: bytes) -> bytes:
+        transmitter = self._addresses[attempt.transmitter] if attempt.control == "RTS" else b""
+        return _CONTROL.pack(_FRAME_CONTROL[attempt.control], 0, 0, receiver) + transmitter
 
     def _data_frame(self, attempt: TransmissionAttempt, receiver: bytes) -> bytes:
         retry = _RETRY if attempt.number > 1 else 0

@@ -30,7 +30,7 @@ def command(module: str) -> list[str]:
 
 
 LINE_LIMIT_BYTES: Final = 8 << 20
-DESCRIPTORS: Final = 3
+DESCRIPTORS: Final = 4
 """Maximum number of file descriptors in one message."""
 
 Message = dict[str, Any]

@@ -265,13 +265,15 @@ def _build(spec: RobotSpec) -> None:
 
 def _motion_files(spec: RobotSpec) -> list[int]:
     """Return descriptors of the record of the robot's motion, and of the inputs of a simulated physics, if any."""
-    if spec.base is None or not spec.base.simulated:
+    inputs: list[tuple[Path, int]] = []
+    if spec.simulated_flight:
+        inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLOWN, os.O_RDWR)]
+    elif spec.base is not None and spec.base.simulated:
+        inputs = [(COMMANDED, os.O_RDONLY)]
+    if not inputs:
         return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
-    return [
-        os.open(services.STEERED, os.O_RDWR | os.O_CREAT, 0o600),
-        os.open(services.MOTION, os.O_RDONLY | os.O_CREAT, 0o600),
-        os.open(COMMANDED, os.O_RDONLY | os.O_CREAT, 0o600),
-    ]
+    files = [(services.STEERED, os.O_RDWR), (services.MOTION, os.O_RDONLY), *inputs]
+    return [os.open(path, flags | os.O_CREAT, 0o600) for path, flags in files]
 
 
 def _reset_signals() -> None:

@@ -29,6 +29,12 @@ MOTION: Final = Path(STATE, "motion")
 STEERED: Final = Path(STATE, "steered")
 """The file in which a robot that steers itself records its motion."""
 
+FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
+"""The file in which an autopilot records its command for a physics that flies the drone."""
+
+FLOWN: Final = Path(STATE, "flown")
+"""The file in which that physics records the flight."""
+
 READY_FOLDER: Final = f"{STATE}/ready"
 
 ROSCORE: Final = "/usr/bin/roscore"
@@ -200,6 +206,7 @@ def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
         antenna_m=ANTENNA_M,
         world=spec.world,
         boot_s=spec.boot_s,
+        physics=autopilot.PhysicsFiles(FLIGHT_COMMAND, FLOWN) if spec.simulated_flight else None,
     )
 
 

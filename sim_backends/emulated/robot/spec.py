@@ -114,6 +114,7 @@ class RobotSpec:
         registered: Published topics that it registers at that master.
         definitions: Definitions of the message types of its sensors.
         mavlink_port: UDP port of its autopilot; None without an autopilot.
+        simulated_flight: True if the physics of a co-simulation flies it: the autopilot records its commands only.
         autopilot: Firmware that the autopilot emulates, `px4` or `ardupilot`.
         system: MAVLink system id of that autopilot.
         boot_s: Boot time of that autopilot.
@@ -159,6 +160,7 @@ class RobotSpec:
     world: str
     laser_targets: tuple[LaserTarget, ...] = ()
     neighbours: tuple[Neighbour, ...] = ()
+    simulated_flight: bool = False
     autopilot: str = "px4"
     system: int = 1
     boot_s: float = 0.0

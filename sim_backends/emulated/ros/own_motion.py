@@ -89,9 +89,9 @@ class Odometer:
         self._read_paths(now_ns)
         self._base = AT_REST
         if self._path is not None:
-            here = _motion_on(self._path, AT_REST, now_ns)
-            yaw_rad = -here.yaw_rad
-            x_m, y_m = _rotated(here.x_m, here.y_m, yaw_rad)
+            motion = _motion_on(self._path, AT_REST, now_ns)
+            yaw_rad = -motion.yaw_rad
+            x_m, y_m = _rotated(motion.x_m, motion.y_m, yaw_rad)
             self._base = OwnMotion(-x_m, -y_m, yaw_rad)
 
     def at(self, now_ns: int) -> OwnMotion:
@@ -193,6 +193,11 @@ class MotionReporter:
         self._odometer = Odometer(paths, now_ns, record)
         self._path_start_ns: int | None = None
 
+    @property
+    def path_start_ns(self) -> int:
+        """Start of the assigned path that put the robot at its place; 0 before the first one was read."""
+        return self._path_start_ns or 0
+
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
         """Return the place at which the lab has put the robot since the last call, or None if it has not.
 
@@ -201,11 +206,11 @@ class MotionReporter:
         Args:
             now_ns: Time by the monotonic clock; must not decrease from call to call.
         """
-        here = self._odometer.at(now_ns)
+        motion = self._odometer.at(now_ns)
         if self._odometer.path_start_ns == self._path_start_ns:
             return None
         self._path_start_ns = self._odometer.path_start_ns
-        return here
+        return motion
 
     def write(
         self,
@@ -225,5 +230,6 @@ class MotionReporter:
         Raises:
             OSError: There is no space for it.
         """
-        path_start_ns = self._path_start_ns or 0
-        self._record.write(Steered(now_ns, path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry))
+        self._record.write(
+            Steered(now_ns, self.path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+        )

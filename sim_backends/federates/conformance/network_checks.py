@@ -206,8 +206,8 @@ def check_far_away(target: Target) -> None:
     """A packet to an agent that is 1,000 km away is decided; if it is dropped, with a reason."""
     probe = target.open()
     account, states = _Account(probe), _states(probe)
-    far = probe.hello.agents[-1].name if len(probe.hello.agents) < 2 else probe.hello.agents[1].name
-    states[far] = State((_FAR_M, 0.0, 1.0))
+    distant_agent = probe.hello.agents[-1].name if len(probe.hello.agents) < 2 else probe.hello.agents[1].name
+    states[distant_agent] = State((_FAR_M, 0.0, 1.0))
     account.advance(10 * _MS, states, _packets(probe, [5 * _MS]))
     account.advance(_END_NS, states)
     if account.undecided():

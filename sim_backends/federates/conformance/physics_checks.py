@@ -1,7 +1,9 @@
 """Checks of a physics: times, commands, motion, determinism, forks."""
 
+import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Final
 
 from sim_backends.federates.conformance.probe import Advanced, CheckError, FederateProbe, NotDeclaredError, Target
@@ -193,6 +195,39 @@ def check_determinism(target: Target) -> None:
     for number, (first, second) in enumerate(zip(*answers, strict=True)):
         if first != second:
             raise CheckError(f"equal requests up to {number * window_ns} ns gave different answers")
+
+
+def check_lifetimes(target: Target) -> None:
+    """An agent has states from when it appears, at its start, until it disappears, if the federate removes agents."""
+    appears_steps, disappears_steps = 100, 300
+    name = target.hello.agents[0].name
+    step_ns = target.hello.step_ns
+    configuration = json.loads(target.hello.configuration)
+    plans = configuration.setdefault("scenario", {}).setdefault("agents", {})
+    plans[name] = plans.get(name, {}) | {
+        "appears": f"{appears_steps * step_ns / 1e9:.9f}s",
+        "disappears": f"{disappears_steps * step_ns / 1e9:.9f}s",
+    }
+    probe = target.open(replace(target.hello, configuration=json.dumps(configuration).encode()))
+    probe.require(FederateCapability.AGENTS_DISAPPEAR)
+    if probe.welcome.step_ns != step_ns:
+        raise NotDeclaredError(f"its step of {probe.welcome.step_ns} ns is not that of the scenario")
+    if name in probe.physics(0).states:
+        raise NotDeclaredError("it moves agents before they appear, and the coordinator ignores their states")
+    for step in (appears_steps - 1, appears_steps, disappears_steps - 1, disappears_steps, 2 * disappears_steps):
+        states = probe.physics(step * step_ns).states
+        if (name in states) != (appears_steps <= step < disappears_steps):
+            raise CheckError(
+                f"{name}, which appears at {appears_steps * step_ns} ns and disappears at "
+                f"{disappears_steps * step_ns} ns, has {'a' if name in states else 'no'} state at {step * step_ns} ns"
+            )
+        for agent in target.hello.agents[1:]:
+            if agent.name not in states:
+                raise CheckError(f"{agent.name}, which is always present, has no state at {step * step_ns} ns")
+        if step == appears_steps:
+            distance_m = math.dist(states[name].position_m, target.hello.agents[0].start.position_m)
+            if distance_m > _START_M:
+                raise CheckError(f"{name} appears {distance_m:.3g} m away from the start that it was given")
 
 
 def check_fork(target: Target) -> None:

@@ -29,7 +29,7 @@ _CLOSE_S: Final = 5.0
 
 
 class CheckError(Exception):
-    """A federate does not conform to the protocol; the message says why."""
+    """A federate does not conform to the protocol; the message is the reason."""
 
 
 class NotDeclaredError(Exception):

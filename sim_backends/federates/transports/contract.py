@@ -95,9 +95,9 @@ def read_token(address: TransportAddress) -> str:
     return value
 
 
-def is_same_token(one: str, other: str) -> bool:
+def is_same_token(first: str, second: str) -> bool:
     """Return True if two tokens are equal, in constant time."""
-    return hmac.compare_digest(one.encode(), other.encode())
+    return hmac.compare_digest(first.encode(), second.encode())
 
 
 def is_loopback(host: str) -> bool:

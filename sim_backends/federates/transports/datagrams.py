@@ -10,11 +10,11 @@ A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (
   sends the first data.
 - Data are numbered from 0 in each direction, `number` of other kinds is that of the next data. `expected`
   acknowledges all data before this number. At most 64 are unacknowledged.
-- A side that waits after it has received data sends an acknowledgement (4), and one every 2 s. Unacknowledged data
-  are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
-- A side that ends sends close (5) once, when all its data are acknowledged or after 0.5 s. It ends the connection, if
-  `number` is the expected one. It may be lost: an ICMP message that the port is unreachable, or 3,600 s of silence,
-  end it too.
+- A side that waits sends an acknowledgement (4) of new data before it waits, and another every 2 s. Unacknowledged
+  data are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
+- A side that ends sends one close datagram (5), when all its data are acknowledged or after 0.5 s. The receiver ends
+  the connection if `number` is the expected one. If the datagram is lost, the connection ends with an ICMP message
+  that the port is unreachable, or after 3,600 s of silence.
 """
 
 import select
@@ -278,7 +278,7 @@ class DatagramChannel:
         return True
 
     def _transmit(self, kind: DatagramKind, number: int, data: bytes = b"") -> None:
-        """Send a datagram; one that cannot be sent now is a lost one.
+        """Send a datagram; if it cannot be sent now, it counts as lost.
 
         Raises:
             ClosedError: The other side's process has exited.

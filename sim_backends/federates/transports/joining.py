@@ -16,7 +16,7 @@ def accept_federate(address: TransportAddress, expected_token: str, deadline_s: 
     """Return the channel of a federate, which begins with `join` and the token; others are closed.
 
     Args:
-        address: TransportAddress at which to listen.
+        address: Address at which to listen.
         expected_token: The token.
         deadline_s: Time of `time.monotonic` until which to wait.
 

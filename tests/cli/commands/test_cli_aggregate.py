@@ -66,8 +66,8 @@ def test_expectations_of_trials_under_one_condition_are_judged_together(
         (folder / "trial.csv").write_text(table.replace(LOSSY.name, f"trial {number}"), encoding="utf-8")
     assert main(["aggregate", str(tmp_path), "--quantity", "rtt_median_s", "--quantity", "rtt_loss"]) == 0
     output = capsys.readouterr()
-    _, _, judged = output.out.partition(" expected ")
-    assert [re.split("  +", line)[:2] for line in judged.splitlines()[2:]] == [
+    _, _, judgements = output.out.partition(" expected ")
+    assert [re.split("  +", line)[:2] for line in judgements.splitlines()[2:]] == [
         [" rtt_median_s > 1 us", "tcp"], [" rtt_median_s > 1 us", "udp"], [" tcp rtt_loss < 2 %", "tcp"],
     ]  # fmt: skip
     assert output.out.count("  holds\n") == 2
@@ -96,9 +96,9 @@ def test_quantity_missing_in_some_repeats_has_its_count(
 
 
 def test_different_procedures_of_one_name_cause_a_note(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    alike = {"profiles_sha256": "aaaa", "code_sha256": "cccc"}
+    identity = {"profiles_sha256": "aaaa", "code_sha256": "cccc"}
     for name, procedure in (("one", "bbbb"), ("two", "dddd")):  # as for --record 1s and --record 15s
-        write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **alike), 3))
+        write(tmp_path / name, repeats(replace(ROW, trial=name, procedure_sha256=procedure, **identity), 3))
     assert main(["aggregate", str(tmp_path), "--quantity", "ip_loss"]) == 0
     assert capsys.readouterr().err == "note: A procedure differs between its trials\n"
     assert main(["aggregate", str(tmp_path / "one"), "--quantity", "ip_loss"]) == 0

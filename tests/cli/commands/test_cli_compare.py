@@ -46,7 +46,7 @@ def field(lab: Path) -> list[RepeatRow]:
 def test_run_does_not_differ_from_itself(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare("field field/trial.csv --threshold rtt_median_s=10ms") == 0
     output = capsys.readouterr()
-    assert output.err == "note: may matter: attempts that the other run has too: A has 20, B has 20\n"
+    assert output.err == "note: may matter: attempts that are in both runs: A has 20, B has 20\n"
     assert "IP packet loss" in output.out
     assert "no difference seen; up to " in output.out
     assert ": 0 differences seen, 0 after correction" in output.out

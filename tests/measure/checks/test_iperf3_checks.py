@@ -35,10 +35,10 @@ def order(test: str) -> IperfSettings:
 def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (of JSON)
     ends = [iperf3.parse(json.dumps(end)) for end in (client, server)]
     reverse = test.endswith("reverse")
-    own = (
+    local_ports = (
         iperf3_checks.check_one_end(end, sends=sends) for end, sends in zip(ends, (not reverse, reverse), strict=True)
     )
-    return [*chain(*own), *iperf3_checks.compare_ends(ends[0], ends[1], order(test))]
+    return [*chain(*local_ports), *iperf3_checks.compare_ends(ends[0], ends[1], order(test))]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

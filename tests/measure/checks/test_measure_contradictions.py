@@ -37,15 +37,15 @@ class Link:
 
     def carry(self, data: bytes, *, back: bool = False) -> int:
         """Send a packet and return the number of copies that arrive."""
-        near, far = (self.received, self.sent) if back else (self.sent, self.received)
+        from_frames, to_frames = (self.received, self.sent) if back else (self.sent, self.received)
         ahead_ns = (self.ahead_ns, 0) if back else (0, self.ahead_ns)
         self.now_ns += 1_000_000
-        near.append(Frame(self.now_ns + ahead_ns[0], data))
+        from_frames.append(Frame(self.now_ns + ahead_ns[0], data))
         lost, copied, late = (self.chance.random() < share for share in self.shares)
         copies = 0 if lost else 2 if copied else 1
         for _ in range(copies):
             delay_ns = self.chance.randrange(50_000_000 if late else 1_000_000)
-            far.append(Frame(self.now_ns + delay_ns + ahead_ns[1], data))
+            to_frames.append(Frame(self.now_ns + delay_ns + ahead_ns[1], data))
         return copies
 
     def contradictions(

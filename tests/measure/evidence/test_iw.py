@@ -53,13 +53,13 @@ def test_the_associated_access_point() -> None:
         is None
     )
     assert robot_link_samples.parse_cell(output("link-hwsim-ibss-6")) is None
-    ours = StationSample("02:00:00:00:00:00", -30.0)
+    cell = StationSample("02:00:00:00:00:00", -30.0)
     assert robot_link_samples.parse_cell(output("link-hwsim-3")) == replace(
-        ours, tx_rate_bit_s=1e6, tx_packets=21, rx_packets=3530
+        cell, tx_rate_bit_s=1e6, tx_packets=21, rx_packets=3530
     )
-    rates = replace(ours, tx_rate_bit_s=65e6, rx_rate_bit_s=1e6)
+    rates = replace(cell, tx_rate_bit_s=65e6, rx_rate_bit_s=1e6)
     assert robot_link_samples.parse_cell(output("link-hwsim-5")) == replace(rates, tx_packets=19, rx_packets=3320)
-    rates = replace(ours, tx_rate_bit_s=1e6, rx_rate_bit_s=1e6)
+    rates = replace(cell, tx_rate_bit_s=1e6, rx_rate_bit_s=1e6)
     assert robot_link_samples.parse_cell(output("link-hwsim-6")) == replace(rates, tx_packets=21, rx_packets=3950)
 
 

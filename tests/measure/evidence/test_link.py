@@ -101,11 +101,11 @@ def test_an_access_points_link_has_the_station_with_the_most_packets() -> None:
 
 
 def test_counters_continue_when_a_station_roams() -> None:
-    far = replace(SAMPLE, station="bb", tx_packets=4, tx_retries=0)
+    second_cell = replace(SAMPLE, station="bb", tx_packets=4, tx_retries=0)
     recorded = [
         *samples(SAMPLE, replace(SAMPLE, tx_packets=15), cell="aa"),
-        LinkSample(2 * S, (far,), "bb"),
-        LinkSample(3 * S, (replace(far, tx_packets=9),)),
+        LinkSample(2 * S, (second_cell,), "bb"),
+        LinkSample(3 * S, (replace(second_cell, tx_packets=9),)),
         LinkSample(4 * S, (), "aa"),
     ]
     assert measured(recorded)["roams"] == 2
@@ -114,12 +114,12 @@ def test_counters_continue_when_a_station_roams() -> None:
 
 def test_counters_of_a_new_link_start_from_zero() -> None:
     # From mac80211 of a robot that roamed: the counter of the next access point is above that of the previous one.
-    near = StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 11, 1522, 0, 0, 1)
-    far = StationSample("02:00:00:00:03:00", -30.0, 1e6, 1e6, 139, 1775, 0, 0, 0)
+    first_cell = StationSample("02:00:00:00:00:00", -30.0, 1e6, 1e6, 11, 1522, 0, 0, 1)
+    second_cell = StationSample("02:00:00:00:03:00", -30.0, 1e6, 1e6, 139, 1775, 0, 0, 0)
     recorded = [
-        LinkSample(0, (near,)),
-        LinkSample(S, (replace(near, tx_packets=21, rx_packets=1530),), near.station),
-        LinkSample(2 * S, (far,)),
+        LinkSample(0, (first_cell,)),
+        LinkSample(S, (replace(first_cell, tx_packets=21, rx_packets=1530),), first_cell.station),
+        LinkSample(2 * S, (second_cell,)),
     ]
     assert measured(recorded)["roams"] == 1, "only the station dump shows the new access point"
     assert measured(recorded)["radio_tx_packets"] == 10 + 139

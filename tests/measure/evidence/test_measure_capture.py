@@ -6,7 +6,7 @@ from fieldkit.measure.evidence import tcpdump_log
 from fieldkit.measure.evidence.tcpdump_log import CaptureLog
 from tests.helpers.captures import TCPDUMP
 
-SILENT = CaptureLog(False, None, None, None, None)
+WITHOUT_COUNTS = CaptureLog(False, None, None, None, None)
 
 
 @pytest.mark.parametrize(
@@ -18,9 +18,9 @@ SILENT = CaptureLog(False, None, None, None, None)
         ("nothing", CaptureLog(True, 0, 0, 0, 0)),
         ("dropped", CaptureLog(True, 29_484, 1_440_000, 1_311_884, 0)),
         ("killed", CaptureLog(True, None, None, None, None)),
-        ("no-device", SILENT),
-        ("no-right", SILENT),
-        ("bad-filter", SILENT),
+        ("no-device", WITHOUT_COUNTS),
+        ("no-right", WITHOUT_COUNTS),
+        ("bad-filter", WITHOUT_COUNTS),
         ("../4.9/limited", CaptureLog(True, 100, 114, 0, 0)),
     ],
 )

@@ -50,9 +50,9 @@ def test_a_state_without_counters_has_none(text: str) -> None:
 
 
 @given(st.text(), st.text(st.sampled_from("= \n/:UdpIp019RcvbufErrors"), max_size=80))
-def test_garbage_never_raises(text: str, near: str) -> None:
+def test_garbage_never_raises(text: str, snmp: str) -> None:
     host.parse(text)
-    host.parse("==> /proc/net/snmp <==\n" + near)
+    host.parse("==> /proc/net/snmp <==\n" + snmp)
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,8 @@ def summary(sent: int, received: int) -> str:
     return f"{sent} packets transmitted, {received} received, 1% packet loss, time 6066ms"
 
 
-def watched(*seen: tuple[float, str]) -> str:
-    return "\n".join(["watching nc", *(f"{at_s:.2f}{f' up {pids}' if pids else ''}" for at_s, pids in seen), ""])
+def watched(*polls: tuple[float, str]) -> str:
+    return "\n".join(["watching nc", *(f"{at_s:.2f}{f' up {pids}' if pids else ''}" for at_s, pids in polls), ""])
 
 
 def folder(path: Path, kind: FaultKind, text: str, lasted: str = "2.000", interval: str = "0.1") -> Path:

@@ -30,7 +30,7 @@ class Flow:
     port: int
     size_bytes: int
     first_id: int
-    back: bool = False
+    is_reverse: bool = False
     sent: int = 0
     arrived: int = 0
     datagrams: int = 0
@@ -45,7 +45,7 @@ class Flow:
     def transfer(self) -> Transfer:
         base = replace(transfer(Protocol.UDP), port=self.port, sent_file=f"{self.name}.bag", name=self.name)
         base = replace(base, received_file=f"{self.name}.recv.bag")
-        if not self.back:
+        if not self.is_reverse:
             return base
         return replace(
             base,
@@ -62,7 +62,7 @@ class Flow:
         for number, start in enumerate(range(0, len(content), 8192)):
             payload = content[start : start + 8192]
             datagram = struct.pack(">HHHH", 30_000 + self.port, self.port, len(payload) + 8, 0) + payload
-            ends = {"src": RECEIVER, "dst": SENDER} if self.back else {}
+            ends = {"src": RECEIVER, "dst": SENDER} if self.is_reverse else {}
             cuts = range(0, len(datagram), MTU_BYTES)
             yield [
                 ipv4(
@@ -80,7 +80,7 @@ class Flow:
 
 def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> None:
     """Send datagrams of all flows in random order, and write the captures and received files of both robots."""
-    near, far, now_ns = list[Frame](), list[Frame](), 1_700_000_000 * SECOND_NS
+    at_sender, at_receiver, now_ns = list[Frame](), list[Frame](), 1_700_000_000 * SECOND_NS
     waiting = [list(flow.packets()) for flow in flows]
     while any(waiting):
         index = chance.choice([index for index, left in enumerate(waiting) if left])
@@ -89,9 +89,11 @@ def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> 
         lost = [chance.random() < loss for _ in fragments]
         for data, is_lost in zip(fragments, lost, strict=True):
             now_ns += 100_000
-            (far if flow.back else near).append(Frame(now_ns, data, wire_bytes=1500))
+            (at_receiver if flow.is_reverse else at_sender).append(Frame(now_ns, data, wire_bytes=1500))
             if not is_lost:
-                (near if flow.back else far).append(Frame(now_ns + 2_000_000, data, wire_bytes=1500))
+                (at_sender if flow.is_reverse else at_receiver).append(
+                    Frame(now_ns + 2_000_000, data, wire_bytes=1500)
+                )
         flow.sent += len(fragments)
         flow.arrived += len(fragments) - sum(lost)
         flow.datagrams += 1
@@ -100,7 +102,7 @@ def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> 
     for flow in flows:
         (folder / f"{flow.name}.bag").write_bytes(flow.content)
         (folder / f"{flow.name}.recv.bag").write_bytes(flow.received)
-    for name, frames in (("sender.pcap", near), ("receiver.pcap", far)):
+    for name, frames in (("sender.pcap", at_sender), ("receiver.pcap", at_receiver)):
         (folder / name).write_bytes(file_bytes(sorted(frames, key=lambda frame: frame.time_ns)))
 
 
@@ -109,15 +111,15 @@ def air(folder: Path, flows: list[Flow], chance: random.Random, loss: float) -> 
 @given(
     seed=st.integers(0, 2**32),
     sizes=st.lists(st.integers(1, 25_000), min_size=2, max_size=3),
-    apart=st.integers(-8, 8),
-    back=st.booleans(),
+    id_offset=st.integers(-8, 8),
+    is_reverse=st.booleans(),
 )
 def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
-    loss: float, seed: int, sizes: list[int], apart: int, back: bool
+    loss: float, seed: int, sizes: list[int], id_offset: int, is_reverse: bool
 ) -> None:
     """Each socket counts IP ids from a random start (Linux, ip_select_ident_segs), so ids may be equal."""
     flows = [
-        Flow(f"flow{number}", 1234 + number, size, 100 + number * apart, back=back and number == 1)
+        Flow(f"flow{number}", 1234 + number, size, 100 + number * id_offset, is_reverse=is_reverse and number == 1)
         for number, size in enumerate(sizes)
     ]
     with tempfile.TemporaryDirectory() as place:

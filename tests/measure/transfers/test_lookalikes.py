@@ -225,17 +225,17 @@ def test_captures_of_different_link_types_match(protocol: Protocol) -> None:
         truth = links.tcp(Link(2, loss=0.1, copied=0.1, late=0.1), 100, ids=False, again=0.1)
         sent, received = truth.sender, truth.receiver
     vlan, cooked = bytes(12) + b"\x81\x00\x00\x07\x08\x00", bytes(14) + b"\x08\x00"
-    ours = [
+    ambiguous = [
         Frame(frame.time_ns, vlan + frame.data + bytes(20), frame.wire_bytes and frame.wire_bytes + 18)
         for frame in sent
     ]
-    theirs = [
+    reference = [
         Frame(frame.time_ns, cooked + frame.data, frame.wire_bytes and frame.wire_bytes + 16) for frame in received
     ]
     plain = packets(sent), packets(received)
     framed = (
-        pcap.parse(file_bytes(ours, link_type=1), where="test").packets,
-        pcap.parse(file_bytes(theirs, link_type=113), where="test").packets,
+        pcap.parse(file_bytes(ambiguous, link_type=1), where="test").packets,
+        pcap.parse(file_bytes(reference, link_type=113), where="test").packets,
     )
     aim = _to(protocol, ipv6=False)
     if protocol is Protocol.UDP:

@@ -92,8 +92,8 @@ def test_the_error_is_that_of_linear_programs_that_each_leave_out_one_packet(
 
     rows = [
         (sign * np.array([1.0, (int(when) - middle_ns) / 1e9]), sign * (int(ahead) - base_ns) / 1e9 + STAMP_S)
-        for sign, seen in ((1, forward), (-1, reverse))
-        for when, ahead in zip(seen.receiver_ns, seen.receiver_ns - seen.sender_ns, strict=True)
+        for sign, delays in ((1, forward), (-1, reverse))
+        for when, ahead in zip(delays.receiver_ns, delays.receiver_ns - delays.sender_ns, strict=True)
     ]
     x = (int(at_ns[0]) - middle_ns) / 1e9
     reach_s = [
@@ -202,8 +202,8 @@ def _farthest_lines_s(forward: StampPairs, reverse: StampPairs, at_ns: int) -> t
     """Lowest and highest offset of the lines that fit all packets, relative to the first forward packet's."""
     base_ns = int(forward.receiver_ns[0] - forward.sender_ns[0])
     sides = [
-        (sign, (seen.receiver_ns - at_ns) / 1e9, (seen.receiver_ns - seen.sender_ns - base_ns) / 1e9)
-        for sign, seen in ((1, forward), (-1, reverse))
+        (sign, (delays.receiver_ns - at_ns) / 1e9, (delays.receiver_ns - delays.sender_ns - base_ns) / 1e9)
+        for sign, delays in ((1, forward), (-1, reverse))
     ]
     rows = np.concatenate([sign * np.stack((np.ones_like(x), x), axis=1) for sign, x, _ in sides])
     limits = np.concatenate([sign * y + STAMP_S for sign, _, y in sides])
@@ -221,7 +221,7 @@ def test_without_queues_the_skew_is_exact_and_the_error_is_half_a_round_trip() -
     world = World(-12.5, 40e-6)
     random = np.random.default_rng(4)
     sent_s = np.sort(random.uniform(0, 200, 3000))
-    # Every tenth packet has no queueing delay.
+    # Every tenth packet has no queuing delay.
     queue_s = np.where(random.random(3000) < 0.1, 0, random.exponential(0.05, 3000))
     clocks = estimate(world.forward(sent_s, 0.004 + queue_s), world.reverse(sent_s, 0.006 + queue_s[::-1]))
     assert clocks is not None

@@ -267,28 +267,30 @@ def test_a_lost_tcp_frame_does_not_match_a_retransmission_in_a_larger_frame() ->
     sender, receiver = (
         packets(Frame(START_NS + ms * MILLISECOND_NS, data) for ms, data in frames) for frames in (sent, arrivals)
     )
-    own = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer(Protocol.TCP)))
-    assert ((own.receiver_ns - own.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
+    frames = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer(Protocol.TCP)))
+    assert ((frames.receiver_ns - frames.sender_ns) / MILLISECOND_NS).tolist() == [10, 10]
 
 
 Change = Callable[[Packets, Packets], tuple[Packets, Packets]]
 
 WITHHELD: dict[str, Change] = {
-    "no packet of the transfer is in both captures": lambda ours, theirs: (ours, theirs.where(slice(0, 0))),
-    "no packet from receiver to sender is in both captures": lambda ours, theirs: (
-        ours.where(ours.are_from(SENDER)),
-        theirs,
+    "no packet of the transfer is in both captures": lambda sent, received: (sent, received.where(slice(0, 0))),
+    "no packet from receiver to sender is in both captures": lambda sent, received: (
+        sent.where(sent.are_from(SENDER)),
+        received,
     ),
-    "a capture lacks times": lambda ours, theirs: (replace(ours, time_ns=np.full(len(ours), NO_TIME)), theirs),
-    delay.UNSTEADY: lambda ours, theirs: (
-        ours,
-        replace(theirs, time_ns=theirs.time_ns + np.where(np.arange(len(theirs)) < len(theirs) - 6, 0, -(10**9))),
+    "a capture lacks times": lambda sent, received: (replace(sent, time_ns=np.full(len(sent), NO_TIME)), received),
+    delay.UNSTEADY: lambda sent, received: (
+        sent,
+        replace(
+            received, time_ns=received.time_ns + np.where(np.arange(len(received)) < len(received) - 6, 0, -(10**9))
+        ),
     ),
-    delay.SINGLE_PACKET: lambda ours, theirs: (
-        ours.where(ours.are_from(SENDER) | (np.arange(len(ours)) == len(ours) - 1)),
-        theirs,
+    delay.SINGLE_PACKET: lambda sent, received: (
+        sent.where(sent.are_from(SENDER) | (np.arange(len(sent)) == len(sent) - 1)),
+        received,
     ),
-    "the error is above a tenth of: min, median, mean, p95": lambda ours, theirs: (ours, theirs),
+    "the error is above a tenth of: min, median, mean, p95": lambda sent, received: (sent, received),
 }
 
 

@@ -78,12 +78,12 @@ def test_items_are_assigned_to_the_nearest_in_time(sent: list[int], received: li
     skipped = len(sent) - len(received)
     expected: list[int] = []
     for rank, moment in enumerate(received):
-        near = min(range(len(sent)), key=lambda place: abs(sent[place] - (moment + 1)))
+        nearest = min(range(len(sent)), key=lambda place: abs(sent[place] - (moment + 1)))
         before = expected[-1] if expected else -1
         if skipped > 0:
-            expected.append(min(max(near, before + 1), rank + skipped))
+            expected.append(min(max(nearest, before + 1), rank + skipped))
         else:
-            expected.append(min(max(near, rank + skipped), before + 1))
+            expected.append(min(max(nearest, rank + skipped), before + 1))
     if skipped == 0:
         expected = list(range(len(sent)))
     assert positions.tolist() == [*expected, 0, 1, 2]

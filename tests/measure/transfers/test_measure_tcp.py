@@ -66,8 +66,8 @@ def _slow_order(sent: list[Range], arrivals: list[int]) -> tuple[int, int]:
     """Return the number of spurious and of reordered frames, for frames that arrive as they were sent."""
     spurious = 0
     for index, (start, size) in enumerate(sent):
-        there = _bytes(sent[before] for before in range(index) if before in arrivals)
-        spurious += size > 0 and all(byte in there for byte in range(start, start + size))
+        delivered = _bytes(sent[before] for before in range(index) if before in arrivals)
+        spurious += size > 0 and all(byte in delivered for byte in range(start, start + size))
     first = [index for index in dict.fromkeys(arrivals) if sent[index][1]]
     return spurious, sum(any(before > index for before in first[:place]) for place, index in enumerate(first))
 

@@ -60,17 +60,17 @@ def test_any_subset_of_fragments_gives_the_counts_in_closed_form(
 def test_bursts_copies_and_reordering_equal_a_slow_count(sizes: list[int], data: st.DataObject) -> None:
     other = datagram(1000, 3000, port=5353)
     sent = timed([*(packet for ip_id, size in enumerate(sizes) for packet in datagram(ip_id, size)), *other])
-    ours = len(sent) - len(other)
+    of_transfer = len(sent) - len(other)
     arrivals = data.draw(st.lists(st.integers(0, len(sent) - 1), max_size=2 * len(sent)))
     received = [Frame(sent[0].time_ns + place, sent[index].data, 2000) for place, index in enumerate(arrivals)]
 
     counts = _count(sent, received)
 
-    arrived = [index for index in dict.fromkeys(arrivals) if index < ours]
+    arrived = [index for index in dict.fromkeys(arrivals) if index < of_transfer]
     late = sum(any(before > index for before in arrived[:place]) for place, index in enumerate(arrived))
-    runs = [len(list(run)) for lost, run in groupby(range(ours), lambda index: index not in arrived) if lost]
+    runs = [len(list(run)) for lost, run in groupby(range(of_transfer), lambda index: index not in arrived) if lost]
     assert counts.packets_received == len(arrived)
-    assert counts.packets_duplicated == sum(index < ours for index in arrivals) - len(arrived)
+    assert counts.packets_duplicated == sum(index < of_transfer for index in arrivals) - len(arrived)
     assert counts.packets_reordered == late
     assert (counts.loss_bursts, counts.longest_burst) == (len(runs), max(runs, default=0))
     assert counts.packets_ambiguous == 0
@@ -145,20 +145,20 @@ def test_a_lost_first_fragment_loses_the_datagram_but_only_its_bytes() -> None:
 
 
 def test_other_ports_hosts_and_protocols_are_ignored_even_with_equal_ids() -> None:
-    ours = datagram(5, 4000)
+    of_transfer = datagram(5, 4000)
     other_port = datagram(5, 4000, port=5353)
     back = [ipv4(bytes(8), protocol=17, src=RECEIVER, dst=SENDER)]
     ping = [ipv4(bytes(8), protocol=1, size=1480, ip_id=5, more=True)]
-    sent = timed([*other_port, *ours, *back, *ping])
+    sent = timed([*other_port, *of_transfer, *back, *ping])
     counts = _count(sent, sent)
     assert (counts.packets_sent, counts.packets_received) == (3, 3)
     assert (counts.datagrams_sent, counts.datagrams_received) == (1, 1)
 
 
 def test_the_first_fragment_of_another_port_is_ignored() -> None:
-    ours, others = datagram(5, 100), datagram(5, 100, port=5353)
-    sent = timed([*others, *ours])
-    counts = _count(sent, [Frame(sent[1].time_ns, others[0], 2000)])
+    of_transfer, of_other_flow = datagram(5, 100), datagram(5, 100, port=5353)
+    sent = timed([*of_other_flow, *of_transfer])
+    counts = _count(sent, [Frame(sent[1].time_ns, of_other_flow[0], 2000)])
     assert (counts.packets_sent, counts.packets_received, counts.transfer_s) == (1, 0, None)
 
 

@@ -38,8 +38,8 @@ def times(began_ms: int, ended_ms: int | None, ahead_s: float = 0.0, error_s: fl
 
 def measured(when: FaultTimes | None, *streams: Delivery) -> dict[str, Any]:
     result = recoveries.measure("transfer", KIND, lambda: streams, when, ROBOT)
-    own = {column.name for column in recoveries.declare_columns("transfer", KIND)}
-    assert result.values.keys() | result.missing.keys() == own
+    recovery_names = {column.name for column in recoveries.declare_columns("transfer", KIND)}
+    assert result.values.keys() | result.missing.keys() == recovery_names
     assert not result.values.keys() & result.missing.keys()
     return {name.removeprefix("transfer_link_down_"): value for name, value in result.values.items()}
 

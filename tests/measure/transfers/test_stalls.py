@@ -217,10 +217,10 @@ def test_a_clock_that_is_set_back_is_rejected() -> None:
 
 def test_extreme_times_do_not_overflow() -> None:
     stream = sends(20)
-    near, far = captured([stream])
-    times_ns = far.time_ns.copy()
+    at_sender, at_receiver = captured([stream])
+    times_ns = at_receiver.time_ns.copy()
     times_ns[-1] = 2**63 - 1
-    result = measured(of_tcp(near, replace(far, time_ns=times_ns)))
+    result = measured(of_tcp(at_sender, replace(at_receiver, time_ns=times_ns)))
     assert result["stall_s"] > 7e9
 
 

@@ -112,9 +112,9 @@ def test_any_change_of_a_field_is_detected(
 
 def test_telemetry_of_another_flight_is_detected(tmp_path: Path) -> None:
     log = fly_log.read(write_log(tmp_path, lines()))
-    own = np.array([(moment.ahead_m, moment.left_m, moment.up_m) for moment in log])
-    turned = own @ np.array([[math.cos(0.7), -math.sin(0.7), 0], [math.sin(0.7), math.cos(0.7), 0], [0, 0, 1]])
+    reported_m = np.array([(moment.ahead_m, moment.left_m, moment.up_m) for moment in log])
+    turned = reported_m @ np.array([[math.cos(0.7), -math.sin(0.7), 0], [math.sin(0.7), math.cos(0.7), 0], [0, 0, 1]])
     assert fly_checks.telemetry_contradiction(log, turned + 300.0) is None
     assert fly_checks.telemetry_contradiction(log, np.empty((0, 3))) is None
-    assert "over the ground" in (fly_checks.telemetry_contradiction(log, 3 * own) or "")
-    assert "in height" in (fly_checks.telemetry_contradiction(log, own * [1, 1, 5]) or "")
+    assert "over the ground" in (fly_checks.telemetry_contradiction(log, 3 * reported_m) or "")
+    assert "in height" in (fly_checks.telemetry_contradiction(log, reported_m * [1, 1, 5]) or "")

@@ -141,7 +141,7 @@ def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("data", "complaint"),
+    ("data", "message"),
     [
         (b"", "no heartbeat of an autopilot"),
         (b"\0" * 40, "no frame starts at offset 8"),
@@ -151,8 +151,8 @@ def test_one_of_two_autopilots_must_be_named(tmp_path: Path) -> None:
         (stamped([(0, Sender().frame(d.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)))]), "no heartbeat"),
     ],
 )
-def test_an_incomplete_log_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
-    with pytest.raises(EvidenceError, match=complaint):
+def test_an_incomplete_log_is_refused(data: bytes, message: str, tmp_path: Path) -> None:
+    with pytest.raises(EvidenceError, match=message):
         tlog.read(write_log(tmp_path, data), 0, 0)
 
 

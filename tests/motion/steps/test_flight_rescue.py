@@ -33,8 +33,8 @@ def losses(samples: Sequence[bytes]) -> list[bool]:
 def test_loss_of_both_programs_is_detected_within_a_second(states: tuple[int, int]) -> None:
     pilot, guard = states
     turning = [sample(100 + 0.25 * count, (count, pilot), (count, guard)) for count in range(4)]
-    silent = [sample(101 + 0.25 * count, (3, pilot), (3, guard)) for count in range(3)]
-    assert losses([*turning, *silent]) == [False] * 6 + [True], "0.75 s after the last turn"
+    silent_samples = [sample(101 + 0.25 * count, (3, pilot), (3, guard)) for count in range(3)]
+    assert losses([*turning, *silent_samples]) == [False] * 6 + [True], "0.75 s after the last turn"
 
 
 def test_no_loss_while_one_program_counts() -> None:

@@ -16,7 +16,7 @@ JOB = Job(folder="f", name="up.fly", argv=(), limit_s=1.0, log="up.fly.log")
 SHORT_S = 0.05
 
 
-class Link:
+class RecordingShell:
     """A shell that records each written line, and fails for a number of calls."""
 
     robot = "r"
@@ -40,7 +40,7 @@ class Link:
         return [words[-2] for words in self.words]
 
 
-def keeper(link: Link, silent_lease_s: float | None = None) -> LeaseKeeper:
+def keeper(link: RecordingShell, silent_lease_s: float | None = None) -> LeaseKeeper:
     return LeaseKeeper(
         cast("Shell", link),
         JOB,
@@ -53,7 +53,7 @@ def keeper(link: Link, silent_lease_s: float | None = None) -> LeaseKeeper:
 
 
 def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
-    link = Link()
+    link = RecordingShell()
     with keeper(link) as lease:
         assert lease.output == b"output"
         link.failures_left = 2
@@ -70,7 +70,7 @@ def test_order_is_renewed_over_interrupted_link_until_context_is_left() -> None:
 
 
 def test_silent_lease_lasts_longer_and_is_not_renewed() -> None:
-    link = Link()
+    link = RecordingShell()
     with keeper(link, silent_lease_s=90.0) as lease:
         lease.give_order("go")
         assert not any(renewal_threads(lease))
@@ -84,7 +84,7 @@ def renewal_threads(lease: LeaseKeeper) -> list[bool]:
 
 
 def test_order_that_cannot_be_written_is_an_error() -> None:
-    link = Link()
+    link = RecordingShell()
     with keeper(link, silent_lease_s=90.0) as lease:
         link.failures_left = 1
         with pytest.raises(LinkError):
@@ -94,13 +94,13 @@ def test_order_that_cannot_be_written_is_an_error() -> None:
 
 
 def test_unreachable_robot_at_start_is_an_error() -> None:
-    link = Link()
+    link = RecordingShell()
     link.failures_left = 1
     with pytest.raises(LinkError), keeper(link):
         pytest.fail("the lease was entered")
 
 
-class Ending(Link):
+class ExitedProgram(RecordingShell):
     """A shell whose program has exited at the third query."""
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
@@ -116,7 +116,7 @@ def test_body_is_aborted_when_program_ends() -> None:
         assert stop.wait(60)
         raise LinkError("the connection broke", where="r", remedy="wait")
 
-    with keeper(Ending()) as lease:
+    with keeper(ExitedProgram()) as lease:
         assert lease.end_reason == ""
         with pytest.raises(RobotError, match="ended with exit code 7") as caught, lease.run_while_leased(stop.set):
             wait()
@@ -128,5 +128,5 @@ def test_body_is_aborted_when_program_ends() -> None:
 
 
 def test_error_of_body_is_raised_while_program_runs() -> None:
-    with keeper(Link()) as lease, pytest.raises(LinkError), lease.run_while_leased(pytest.fail):
+    with keeper(RecordingShell()) as lease, pytest.raises(LinkError), lease.run_while_leased(pytest.fail):
         raise LinkError("the connection broke", where="r", remedy="wait")

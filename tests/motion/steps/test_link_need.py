@@ -11,7 +11,7 @@ from tests.helpers.casts import CAST
 
 GOOD = json.dumps({"error": "", "system": 7, "candidates": []})
 CLOSED = json.dumps({"error": "Connection refused", "system": 0, "candidates": ["TCP port 5760", "/dev/ttyACM0"]})
-SILENT = json.dumps({"error": "", "system": 0, "candidates": []})
+NO_AUTOPILOT = json.dumps({"error": "", "system": 0, "candidates": []})
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,7 @@ def test_detail_names_connection_and_programs(connection: str, kind: str) -> Non
     ("text", "detail", "remedy"),
     [
         (CLOSED, "cannot be opened: Connection refused", "this computer has TCP port 5760, /dev/ttyACM0; write"),
-        (SILENT, "no heartbeat of an autopilot", "no other common connection"),
+        (NO_AUTOPILOT, "no heartbeat of an autopilot", "no other common connection"),
         ("error: MAVLink over usb: is not a connection", "is not a connection", "mavlink.connection"),
         ("", "no answer", "mavlink.connection"),
         ("[]", "[]", "mavlink.connection"),

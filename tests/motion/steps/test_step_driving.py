@@ -47,11 +47,11 @@ STEP = move("robot: receiver, path: [{away: 2m}, {right: 1m, towards: 1m}], spee
 
 def test_size_of_log_grows_with_drive_and_is_on_driving_robot_only() -> None:
     short, long = (move(f"robot: receiver, path: [{{away: {far}m}}], speed: 0.1m/s") for far in (10, 60))
-    assert [role for role in DRIVES if long.bytes_left(SCENE, role)] == [Role.RECEIVER]
+    assert [role for role in DRIVES if long.stored_bytes(SCENE, role)] == [Role.RECEIVER]
     # Each direction takes 500 s more, and the log has ten lines per second, each of 200 to 250 bytes.
-    grown_bytes = long.bytes_left(SCENE, Role.RECEIVER) - short.bytes_left(SCENE, Role.RECEIVER)
+    grown_bytes = long.stored_bytes(SCENE, Role.RECEIVER) - short.stored_bytes(SCENE, Role.RECEIVER)
     assert 200 * 10_000 < grown_bytes < 250 * 10_000
-    assert not long.bytes_left(replace(SCENE, cast=CAST), Role.RECEIVER), "a robot moved by a person has no log"
+    assert not long.stored_bytes(replace(SCENE, cast=CAST), Role.RECEIVER), "a robot moved by a person has no log"
 
 
 def test_argument_of_driver_has_legs_limits_and_topics() -> None:
@@ -170,7 +170,7 @@ def test_profile_with_drive_needs_a_fence() -> None:
         schema.validate(schema.parse(json.dumps(data), source="robots/x.yaml"), RobotProfile)
 
 
-class Link:
+class RecordingShell:
     """A shell that records each order, and answers with a status.
 
     Args:
@@ -203,12 +203,12 @@ class Link:
 JOB = Job(folder="f", name="drive", argv=(), limit_s=1.0, log="drive.log")
 
 
-def lease_of(link: Link) -> DriveLease:
+def lease_of(link: RecordingShell) -> DriveLease:
     return DriveLease(cast("Shell", link), JOB, "{}", LEASE_S)
 
 
 def test_lease_repeats_the_order_until_robot_is_home() -> None:
-    link = Link(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
+    link = RecordingShell(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
     with lease_of(link) as lease:
         assert (lease.status, lease.end_state) == ({}, "")
         lease.give_order("back")
@@ -219,20 +219,20 @@ def test_lease_repeats_the_order_until_robot_is_home() -> None:
 
 @pytest.mark.parametrize("status_text", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
 def test_invalid_status_is_ignored(status_text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with lease_of(Link(status=[status_text])) as lease:
+    with lease_of(RecordingShell(status=[status_text])) as lease:
         assert lease.end_state == ""
         monkeypatch.setattr(DriveLease, "unchanged_s", 41.0)
         assert lease.end_state == "its driver sent no status for 41 s"
 
 
 def test_reason_of_driver_is_one_short_line() -> None:
-    with lease_of(Link(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
+    with lease_of(RecordingShell(status=[json.dumps({"ended": "\ud800\x1b[2J" + "long\n" * 1000})])) as lease:
         assert lease.end_state.startswith("??[2Jlong long ")
         assert len(lease.end_state) == 200
 
 
 def test_lost_link_does_not_end_the_wait() -> None:
-    link = Link(status=['{"phase": "out"}'])
+    link = RecordingShell(status=['{"phase": "out"}'])
     with lease_of(link) as lease:
         link.broken = True
         link.was_asked.clear()
@@ -241,10 +241,10 @@ def test_lost_link_does_not_end_the_wait() -> None:
         assert lease.status == {"phase": "out"}
 
 
-class Field(IdleTestbed):
+class DrivingTestbed(IdleTestbed):
     """A testbed with a robot that drives; records each call of `bring_back`."""
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: RecordingShell) -> None:
         super().__init__({Role.RECEIVER: cast("Shell", link)})
         self.returns: list[bool] = []
 
@@ -277,7 +277,7 @@ def quick_scene() -> Scene:
     return replace(SCENE, cast={**DRIVES, Role.RECEIVER: robot})
 
 
-def driven(field: Field, body: Any) -> None:  # noqa: ANN401
+def driven(field: DrivingTestbed, body: Any) -> None:  # noqa: ANN401
     scene = quick_scene()
     first, *_ = STEP.jobs(scene)
     with driving.driven(scene, field, first, STEP.motion, "out.{}"):
@@ -285,14 +285,14 @@ def driven(field: Field, body: Any) -> None:  # noqa: ANN401
 
 
 def test_robot_that_returns_is_not_brought_back(stopped: list[str]) -> None:
-    field = Field(Link(after="back", status=['{"ended": "home", "ready": true}']))
+    field = DrivingTestbed(RecordingShell(after="back", status=['{"ended": "home", "ready": true}']))
     driven(field, lambda: None)
     assert field.returns == [True]
     assert stopped == ["out.drive"]
 
 
 def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]) -> None:
-    field = Field(Link(after="out", status=['{"ended": "no odometry for 0.5 s", "ready": true}']))
+    field = DrivingTestbed(RecordingShell(after="out", status=['{"ended": "no odometry for 0.5 s", "ready": true}']))
     with pytest.raises(RobotError, match="it stopped on its path: no odometry"):
         driven(field, lambda: None)
     assert field.returns == [False]
@@ -302,7 +302,7 @@ def test_robot_that_stopped_is_brought_back_and_attempt_fails(stopped: list[str]
 def test_early_stop_aborts_steps_inside(stopped: list[str]) -> None:
     waiting_step = STEP.model_dump(mode="json", by_alias=True) | {"during": [{"wait": {"duration": "60min"}}]}
     step = schema.validate(schema.parse(json.dumps(waiting_step), source="x.yaml"), MoveStep)
-    field = Field(Link(after="out", status=[READY] * 4 + ['{"ended": "beyond the fence"}']))
+    field = DrivingTestbed(RecordingShell(after="out", status=[READY] * 4 + ['{"ended": "beyond the fence"}']))
     with pytest.raises(RobotError, match="it stopped on its path: beyond the fence") as caught:
         step.run(quick_scene(), field, lambda *_: None)
     assert "the wait was interrupted" in str(caught.value.__cause__)
@@ -311,8 +311,8 @@ def test_early_stop_aborts_steps_inside(stopped: list[str]) -> None:
 
 
 def test_interrupted_robot_stays_where_it_is(stopped: list[str]) -> None:
-    link = Link(status=['{"ended": "", "ready": true}'])
-    field = Field(link)
+    link = RecordingShell(status=['{"ended": "", "ready": true}'])
+    field = DrivingTestbed(link)
 
     def interrupt() -> None:
         raise KeyboardInterrupt
@@ -325,7 +325,7 @@ def test_interrupted_robot_stays_where_it_is(stopped: list[str]) -> None:
 
 
 def test_robot_returns_after_error_inside(stopped: list[str]) -> None:
-    field = Field(Link(after="back", status=['{"ended": "home", "ready": true}']))
+    field = DrivingTestbed(RecordingShell(after="back", status=['{"ended": "home", "ready": true}']))
 
     def fail() -> None:
         raise RobotError("it broke", remedy="repair it")

@@ -84,9 +84,9 @@ def test_robot_without_autopilot_is_refused() -> None:
 
 def test_size_of_log_grows_with_flight_and_is_on_drone_only() -> None:
     short, long = (step(f"robot: {DRONE}, height: 2m, path: [{{away: {far}m}}]") for far in (10, 910))
-    assert [role for role in CAST if long.bytes_left(SCENE, role)] == [DRONE]
+    assert [role for role in CAST if long.stored_bytes(SCENE, role)] == [DRONE]
     # The return takes 900 s more, and the log has ten lines per second, each of 100 to 250 bytes.
-    grown_bytes = long.bytes_left(SCENE, DRONE) - short.bytes_left(SCENE, DRONE)
+    grown_bytes = long.stored_bytes(SCENE, DRONE) - short.stored_bytes(SCENE, DRONE)
     assert 100 * 9000 < grown_bytes < 250 * 9000
 
 

@@ -80,8 +80,8 @@ def test_recorder_on_the_drone_and_on_another_robot() -> None:
     (flow,) = step.flows(SCENE)
     assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP, served=True)
     assert not list(mavlink().flows(SCENE))
-    assert step.bytes_left(SCENE, Role.SENDER) > 1000
-    assert step.bytes_left(SCENE, Role.RECEIVER) == 0
+    assert step.stored_bytes(SCENE, Role.SENDER) > 1000
+    assert step.stored_bytes(SCENE, Role.RECEIVER) == 0
 
 
 def test_local_recorder_uses_connection_of_profile() -> None:

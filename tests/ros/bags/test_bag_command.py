@@ -208,11 +208,11 @@ def test_types_are_those_of_the_distribution(tmp_path: Path) -> None:
     bag = tmp_path / "camera.bag"
     with rosbag1.Writer(bag) as writer:
         connection = writer.add_connection("/camera_info", "sensor_msgs/msg/CameraInfo", typestore=types)
-        own = types.types
-        header = own["std_msgs/msg/Header"](7, own["builtin_interfaces/msg/Time"](3, 4), "camera")
-        region = own["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
+        type_names = types.types
+        header = type_names["std_msgs/msg/Header"](7, type_names["builtin_interfaces/msg/Time"](3, 4), "camera")
+        region = type_names["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, do_rectify=False)
         numbers = np.arange(12.0)
-        info = own["sensor_msgs/msg/CameraInfo"](
+        info = type_names["sensor_msgs/msg/CameraInfo"](
             header, 480, 640, "plumb_bob", numbers[:5], numbers[:9], numbers[:9], numbers, 0, 0, region
         )
         writer.write(connection, BEGUN_NS, types.serialize_ros1(info, "sensor_msgs/msg/CameraInfo"))

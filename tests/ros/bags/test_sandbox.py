@@ -189,15 +189,15 @@ def test_a_database_whose_schema_never_ends_is_refused(tmp_path: Path, one_secon
 
 
 def test_forked_processes_do_not_mix_up_their_answers(tmp_path: Path) -> None:
-    mine = write_bag(tmp_path / "mine.bag", {"/scan": 3})
-    theirs = write_bag(tmp_path / "theirs.bag", {"/scan": 4})
-    assert bag.read(mine).messages == 3
+    first_bag = write_bag(tmp_path / "mine.bag", {"/scan": 3})
+    second_bag = write_bag(tmp_path / "theirs.bag", {"/scan": 4})
+    assert bag.read(first_bag).messages == 3
     pid = os.fork()
     if pid == 0:
         code = 1
         try:
-            code = 0 if {bag.read(theirs).messages for _ in range(50)} == {4} else 2
+            code = 0 if {bag.read(second_bag).messages for _ in range(50)} == {4} else 2
         finally:
             os._exit(code)
-    assert {bag.read(mine).messages for _ in range(50)} == {3}
+    assert {bag.read(first_bag).messages for _ in range(50)} == {3}
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0

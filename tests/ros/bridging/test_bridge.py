@@ -51,13 +51,13 @@ class Site:
     """
 
     def __init__(self, hosts: tuple[TestHost, TestHost], folder: Path) -> None:
-        self.near, self.far = hosts
+        self.ros1_host, self.wire_host = hosts
         self.folder = folder
         self.environment = os.environ | {
             "ROS_HOME": str(folder / "ros"),
             "TMPDIR": str(folder),
-            "ROS_MASTER_URI": f"http://{self.near.address}:11311",
-            "ROS_IP": self.near.address,
+            "ROS_MASTER_URI": f"http://{self.ros1_host.address}:11311",
+            "ROS_IP": self.ros1_host.address,
         }
 
     @contextmanager
@@ -74,7 +74,7 @@ class Site:
 
     def completed(self, *argv: str) -> subprocess.CompletedProcess[str]:
         """Run a command on the host with ROS 1, and return its result."""
-        with self.started(self.near, *argv) as process:
+        with self.started(self.ros1_host, *argv) as process:
             output_text, errors = process.communicate()
         return subprocess.CompletedProcess(argv, process.returncode, output_text, errors)
 
@@ -86,7 +86,7 @@ class Site:
             "--to",
             middleware_name,
             "--address",
-            self.near.address,
+            self.ros1_host.address,
             "--domain",
             str(DOMAIN),
         )
@@ -95,7 +95,7 @@ class Site:
     @contextmanager
     def bridge(self, middleware_name: str, *words: str) -> Iterator[Process]:
         """Run a bridge while the body runs; it is ready when the body starts."""
-        with self.started(self.near, *self.bridge_line(middleware_name, *words)) as process:
+        with self.started(self.ros1_host, *self.bridge_line(middleware_name, *words)) as process:
             assert process.stderr is not None
             output_text = process.stderr.readline()
             assert output_text.startswith("note: the bridge is up"), output_text + process.stderr.read()
@@ -103,17 +103,17 @@ class Site:
 
     def ros1(self, verb: str) -> AbstractContextManager[Process]:
         """Run a ROS 1 node."""
-        return self.started(self.near, "/usr/bin/python3", str(ENDS / "ros1_end.py"), verb)
+        return self.started(self.ros1_host, "/usr/bin/python3", str(ENDS / "ros1_end.py"), verb)
 
     def wire(self, verb: str, middleware_name: str, quality: str = "") -> AbstractContextManager[Process]:
         """Run a publisher or subscriber without ROS 1 on the other host."""
         topic = topics.describe(shipped(), "/scan", TYPE, parse_qos(quality), domain=DOMAIN, node=verb)
-        settings = {"listen/endpoints": f'["tcp/{self.far.address}:0"]'} if middleware_name == "zenoh" else {}
-        network = {"address": self.far.address, "domain": DOMAIN, "node": verb, "settings": settings}
+        settings = {"listen/endpoints": f'["tcp/{self.wire_host.address}:0"]'} if middleware_name == "zenoh" else {}
+        network = {"address": self.wire_host.address, "domain": DOMAIN, "node": verb, "settings": settings}
         samples = self.folder / "samples"
         samples.write_text("\n".join(map(scan, range(FOREIGN, FOREIGN + 50 * LIMIT_S))), encoding="ascii")
         words = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(samples))
-        return self.started(self.far, sys.executable, str(ENDS / "wire_end.py"), *words)
+        return self.started(self.wire_host, sys.executable, str(ENDS / "wire_end.py"), *words)
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +205,7 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware
 def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, middleware_name: str) -> None:
     latched = ("rostopic", "pub", "--latch", "/scan", "sensor_msgs/LaserScan", "{header: {frame_id: once}}")
     late = "transient_local,depth=1"
-    with site.bridge(middleware_name, f"{SCAN}:{late}"), site.started(site.near, *latched):
+    with site.bridge(middleware_name, f"{SCAN}:{late}"), site.started(site.ros1_host, *latched):
         for _ in range(2):  # the second subscriber starts after the message was forwarded
             with site.wire("hear", middleware_name, late) as subscriber:
                 assert subscriber.stdout is not None
@@ -229,7 +229,7 @@ def test_stopped_bridge_leaves_no_process_and_file(site: Site) -> None:
 
 @pytest.mark.emulated
 def test_topic_of_another_type_is_reported_and_not_forwarded(site: Site) -> None:
-    with site.bridge("dds", SCAN) as running, site.started(site.near, *OTHER_TYPE):
+    with site.bridge("dds", SCAN) as running, site.started(site.ros1_host, *OTHER_TYPE):
         assert running.stderr is not None
         late = running.stderr.readline()
         at_once = site.completed(*site.bridge_line("dds", "--node", "second", SCAN))

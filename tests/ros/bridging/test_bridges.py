@@ -59,7 +59,7 @@ def cast(bridge: RobotBridge = BRIDGE) -> Cast:
 
 
 @pytest.fixture(scope="module")
-def up() -> Iterator[EmulatedTestbed]:
+def emulation() -> Iterator[EmulatedTestbed]:
     with testbed.bring_up(cast(), options=OPTIONS, world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1) as robots:
         robots.place(Placement(Scenario.LOS, Topology.MASTERLESS, parse_distance("5m")))
         yield robots
@@ -90,10 +90,10 @@ def first_heard(pid: int, address: str) -> bytes:
 
 
 @pytest.mark.emulated
-def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed) -> None:
+def test_dds_nodes_receive_ros_1_messages_during_the_session(emulation: EmulatedTestbed) -> None:
     events: list[Event] = []
-    shell, drone = up.shells[Role.SENDER], up.robots[Role.RECEIVER]
-    with session_jobs.running(cast(), up.shells, "s1", sink=events.append):
+    shell, drone = emulation.shells[Role.SENDER], emulation.robots[Role.RECEIVER]
+    with session_jobs.running(cast(), emulation.shells, "s1", sink=events.append):
         (list_running,) = jobs.list_running(shell, soon())
         assert f"/{session_bridges.folder_of('s1')}/" in list_running
         scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
@@ -103,25 +103,27 @@ def test_dds_nodes_receive_ros_1_messages_during_the_session(up: EmulatedTestbed
 
 
 @pytest.mark.emulated
-def test_a_bridge_that_does_not_start_is_reported_with_its_output(up: EmulatedTestbed) -> None:
+def test_a_bridge_that_does_not_start_is_reported_with_its_output(emulation: EmulatedTestbed) -> None:
     wrong = cast(BRIDGE.model_copy(update={"topics": ("/scan:sensor_msgs/LasrScan",)}))
     with (
         pytest.raises(RobotError, match="LaserScan") as caught,
-        session_jobs.running(wrong, up.shells, "s2", sink=lambda _: None),
+        session_jobs.running(wrong, emulation.shells, "s2", sink=lambda _: None),
     ):
         raise AssertionError("it is not up")
     assert "its bridge does not start" in str(caught.value)
-    assert jobs.list_running(up.shells[Role.SENDER], soon()) == ()
+    assert jobs.list_running(emulation.shells[Role.SENDER], soon()) == ()
 
 
 @pytest.mark.emulated
-def test_a_bridge_that_exits_early_is_reported(up: EmulatedTestbed) -> None:
+def test_a_bridge_that_exits_early_is_reported(emulation: EmulatedTestbed) -> None:
     events: list[Event] = []
     short = f"#!/bin/sh\necho {BRIDGE_IS_UP}\nexit 3\n"
-    up.shells[Role.SENDER].run(("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon())
+    emulation.shells[Role.SENDER].run(
+        ("sh", "-c", "cat >short && chmod +x short"), stdin=short.encode(), deadline=soon()
+    )
     ends = cast(BRIDGE.model_copy(update={"program": "/root/short"}))
-    with session_jobs.running(ends, up.shells, "s3", sink=events.append):
-        wait_until(lambda: not jobs.list_running(up.shells[Role.SENDER], soon()), soon())
+    with session_jobs.running(ends, emulation.shells, "s3", sink=events.append):
+        wait_until(lambda: not jobs.list_running(emulation.shells[Role.SENDER], soon()), soon())
     (note,) = [event for event in events if isinstance(event, Note)]
     assert note.text == "the bridge on turtlebot-1 exited early, with exit code 3"
 

@@ -48,7 +48,7 @@ def cell(
 
 
 def judge(*cells: LinkCell, criterion: LinkCriterion = ONE_PERCENT) -> Assessment:
-    return candidates.assess_candidate(DDS, cells, {(own.place, own.size_bytes) for own in cells}, criterion)
+    return candidates.assess_candidate(DDS, cells, {(cell.place, cell.size_bytes) for cell in cells}, criterion)
 
 
 def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:

@@ -189,7 +189,9 @@ def test_simultaneous_streams_need_different_domains(middleware_name: str) -> No
         f"from: sender, to: receiver, over: {middleware_name}",
         f"from: relay, to: receiver, over: {middleware_name}, topic: /b",
     )
-    with pytest.raises(ConfigurationError, match=r"is used twice at the same time on .*; give one another domain"):
+    with pytest.raises(
+        ConfigurationError, match=r"is used twice at the same time on .*; change the domain of one of them"
+    ):
         schema.validate(schema.parse(together(*keys), source="x.yaml"), Procedure)
     schema.validate(schema.parse(together(keys[0], f"{keys[1]}, domain: 7"), source="x.yaml"), Procedure)
 
@@ -198,7 +200,7 @@ def test_streams_of_dds_may_share_a_domain_but_not_a_pair_in_a_capture() -> None
     keys = "from: sender, to: receiver"
     schema.validate(schema.parse(together(keys, "from: relay, to: receiver"), source="x.yaml"), Procedure)
     schema.validate(schema.parse(together(keys, f"{keys}, domain: 7"), source="x.yaml"), Procedure)
-    with pytest.raises(ConfigurationError, match=r"is used twice in one capture.*; give one another domain"):
+    with pytest.raises(ConfigurationError, match=r"is used twice in one capture.*; change the domain of one of them"):
         schema.validate(schema.parse(together(keys, f"{keys}, topic: /b"), source="x.yaml"), Procedure)
 
 

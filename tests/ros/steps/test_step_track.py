@@ -78,8 +78,8 @@ def test_each_robot_records_with_its_recorder_until_stopped() -> None:
     assert recording.job.limit_s > 900
     assert step.live_topics(Role.SENDER) == ("/odom",)
     assert step.live_topics(Role.RECEIVER) == ()
-    assert step.bytes_left(SCENE, Role.SENDER) > 10_000
-    assert step.bytes_left(SCENE, Role.RECEIVER) == 0
+    assert step.stored_bytes(SCENE, Role.SENDER) > 10_000
+    assert step.stored_bytes(SCENE, Role.RECEIVER) == 0
     assert {"positions.json", "track_sender.bag"} <= set(step.files())
 
 

@@ -23,7 +23,7 @@ from tests.trial.check.test_check_judges import (
     SENDER,
     WARN,
     installed,
-    judged,
+    judge_all,
     only,
     procedure_of,
 )
@@ -38,7 +38,7 @@ def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
     robot = SENDER.model_copy(update={"profile": TURTLEBOT.model_copy(update={"ros": None})})
     plan = PLAN.model_copy(update={"cast": {**PLAN.cast, Role.SENDER: robot}, "procedure": procedure})
     sections = installed(plan)
-    assert {finding.status for finding in judged(sections, plan)} == {OK}
+    assert {finding.status for finding in judge_all(sections, plan)} == {OK}
     assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
     assert topic_check.can_record(plan, Role.SENDER, probed(sections))
     assert topic_check.battery_of(robot) == ""
@@ -55,7 +55,7 @@ def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
 def test_a_setup_file_that_is_missing_is_one_failure() -> None:
     missing = "bash: line 1: /opt/ros/noetic/setup.bash: No such file or directory"
     sections = installed() | {"ROS": CommandResult(missing, 1), "program rosbag": CommandResult(missing, 1)}
-    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
+    (failed,) = [finding for finding in judge_all(sections) if finding.status is not OK]
     assert (failed.check, failed.detail) == ("ROS", missing)
     assert not topic_check.can_record(PLAN, Role.SENDER, probed(sections))
     assert topic_check.can_record(PLAN, Role.RECEIVER, probed({})), "without a recording nothing is needed"
@@ -63,7 +63,9 @@ def test_a_setup_file_that_is_missing_is_one_failure() -> None:
 
 def test_ros_1_without_a_master_is_a_warning() -> None:
     (warned,) = [
-        finding for finding in judged(installed() | {"ROS": CommandResult("noetic", 0)}) if finding.status is not OK
+        finding
+        for finding in judge_all(installed() | {"ROS": CommandResult("noetic", 0)})
+        if finding.status is not OK
     ]
     assert "ROS_MASTER_URI" in warned.detail
 

@@ -33,9 +33,9 @@ def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) ->
         sent_ns,
         np.array(at_ns, dtype=np.int64),
     )
-    begun: dict[str, int | None] = {"begun_ns": START - SECOND, "matched_ns": START - SECOND // 2}
+    times: dict[str, int | None] = {"begun_ns": START - SECOND, "matched_ns": START - SECOND // 2}
     counts = {"refused": 0, "skipped": 0, "foreign": 0}
-    return TopicLog(samples, whole=True, **{**begun, **counts, **changes})  # type: ignore[arg-type]
+    return TopicLog(samples, is_complete=True, **{**times, **counts, **changes})  # type: ignore[arg-type]
 
 
 def published(count: int) -> TopicLog:
@@ -48,16 +48,19 @@ def arrived(sequence: Sequence[int], delay_ns: int = 2 * MS, ahead_ns: int = 0) 
 
 def captures(ahead_ns: int = 0, one_way_ns: int = MS // 100) -> tuple[Packets, Packets]:
     """Ten echoes and their replies; the receiver's clock is ahead by `ahead_ns`."""
-    near, far = [], []
+    publisher, subscriber = [], []
     for number in range(10):
         at_ns = START + number * EVERY
-        asks, answers = (
+        request, reply = (
             ipv4(bytes([8 - 8 * back, 0, 0, 0, 0, 1, 0, number]), protocol=1, ip_id=number, src=src, dst=dst)
             for back, src, dst in ((0, SENDER, RECEIVER), (1, RECEIVER, SENDER))
         )
-        near += [Frame(at_ns, asks), Frame(at_ns + 2 * one_way_ns, answers)]
-        far += [Frame(at_ns + one_way_ns + ahead_ns, asks), Frame(at_ns + one_way_ns + ahead_ns, answers)]
-    return packets(near), packets(far)
+        publisher += [Frame(at_ns, request), Frame(at_ns + 2 * one_way_ns, reply)]
+        subscriber += [
+            Frame(at_ns + one_way_ns + ahead_ns, request),
+            Frame(at_ns + one_way_ns + ahead_ns, reply),
+        ]
+    return packets(publisher), packets(subscriber)
 
 
 def measured(sent: TopicLog, received: TopicLog, *captured: Packets | None) -> dict[str, object]:
@@ -131,10 +134,10 @@ def test_a_delay_below_the_clock_error_is_withheld() -> None:
 
 def test_with_a_single_packet_back_there_is_no_delay() -> None:
     """No other packet confirms its time, so the error of the clock offset is unlimited."""
-    near, far = captures()
-    back = np.flatnonzero(near.are_from(FLOW.receiver_address))
-    near = near.where(np.setdiff1d(np.arange(len(near)), back[1:]))
-    result = measured(published(10), arrived(range(10), 2 * MS), near, far)
+    publisher, subscriber = captures()
+    back = np.flatnonzero(publisher.are_from(FLOW.receiver_address))
+    publisher = publisher.where(np.setdiff1d(np.arange(len(publisher)), back[1:]))
+    result = measured(published(10), arrived(range(10), 2 * MS), publisher, subscriber)
     assert not {name for name in result if "delay_m" in name or "error" in name or "age" in name}
     assert result["topic_delay_variation_p95_s"] == 0
 
@@ -179,13 +182,13 @@ def test_each_deadline_without_a_sample_is_missed(at_ms: list[int], missed: int)
 
 def test_traffic_is_identified_by_its_ports() -> None:
     both = [datagram(1, 100, port=DATA), datagram(2, 100, port=DATA, sport=DISCOVERY), datagram(3, 3000, port=DATA)]
-    looks = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
+    discovery = [datagram(4, 60, port=DISCOVERY), datagram(5, 60, port=DISCOVERY, sport=DATA)]
     others = [datagram(6, 60), [ipv4(bytes(8), protocol=1, ip_id=7)], [ipv4(b"", protocol=1, size=99, offset=1480)]]
-    frames = [Frame(START, packet) for group in (*both, *looks, *others) for packet in group]
+    frames = [Frame(START, packet) for group in (*both, *discovery, *others) for packet in group]
     result = measured(published(2), arrived([0, 1]), packets(frames), packets(frames))
     # 3,008 bytes over UDP are three fragments.
     assert (result["topic_data_packets"], result["topic_discovery_packets"]) == (5, 2)
-    sizes = sum(len(packet) for group in looks for packet in group)
+    sizes = sum(len(packet) for group in discovery for packet in group)
     assert result["topic_discovery_bytes"] == sizes
 
 

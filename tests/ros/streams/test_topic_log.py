@@ -30,7 +30,7 @@ def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
     write_log(tmp_path / "log")
     parsed = topic_samples.read_log(tmp_path / "log")
     assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
-    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, True)
+    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.is_complete) == (1, 6, 1, True)
     assert parsed.samples.sequence.tolist() == [0, 1, 2]
     assert parsed.samples.size_bytes.tolist() == [50, 50, 50]
     assert parsed.samples.sent_ns.tolist() == [100, 110, 120]
@@ -42,7 +42,7 @@ def test_a_truncated_log_has_its_earlier_records_and_no_end(tmp_path: Path) -> N
     for length in range(len(records.MAGIC), len(log)):
         (tmp_path / "cut").write_bytes(log[:length])
         parsed = topic_samples.read_log(tmp_path / "cut")
-        assert not parsed.whole
+        assert not parsed.is_complete
         assert len(parsed.samples) == min(max((length - len(records.MAGIC)) // topic_samples.RECORD_BYTES - 2, 0), 3)
 
 
@@ -65,7 +65,7 @@ def test_zeros_after_the_last_record_are_ignored(
     log.write_bytes(content[: None if has_end else -topic_samples.RECORD_BYTES] + bytes(zeros))
     parsed = topic_samples.read_log(log)
     assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
-    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.whole) == (1, 6, 1, has_end)
+    assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.is_complete) == (1, 6, 1, has_end)
     assert parsed.samples.sequence.tolist() == [0, 1, 2]
 
 

@@ -20,9 +20,9 @@ SECOND = 1_000_000_000
 
 
 def measured(sent: TopicLog | None, received: TopicLog | None, **changes: Any) -> dict[str, Any]:  # noqa: ANN401
-    near, far = captures()
+    publisher, subscriber = captures()
     schedule = replace(EXPECTED, **changes)
-    result = topic_stalls.measure(FLOW, (sent, received), (near, far), schedule)
+    result = topic_stalls.measure(FLOW, (sent, received), (publisher, subscriber), schedule)
     assert result.values.keys() | result.missing.keys() == {column.name for column in topic_stalls.COLUMNS}
     return {name.removeprefix("topic_"): value for name, value in result.values.items()}
 
@@ -66,9 +66,12 @@ def test_a_clock_that_was_set_is_rejected() -> None:
     received = arrived(list(range(100)))
     at_ns = received.samples.at_ns + np.where(received.samples.sequence >= 50, -10 * SECOND, 0)
     assert not measured(published(100), replace(received, samples=replace(received.samples, at_ns=at_ns)))
-    near, far = captures()
-    forward = replace(far, time_ns=far.time_ns + 3600 * SECOND * (np.arange(len(far)) > len(far) // 2))
-    result = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (near, forward), EXPECTED)
+    publisher, subscriber = captures()
+    forward = replace(
+        subscriber,
+        time_ns=subscriber.time_ns + 3600 * SECOND * (np.arange(len(subscriber)) > len(subscriber) // 2),
+    )
+    result = topic_stalls.measure(FLOW, (published(100), arrived(list(range(100)))), (publisher, forward), EXPECTED)
     assert not result.values
 
 

@@ -23,7 +23,7 @@ END_NS = 100
 RECEIVED_AT_NS = range(0, END_NS, 10)
 
 
-class Still:
+class StationaryPhysics:
     step_ns = 1
     limits_m_s2: Mapping[str, float] = dict.fromkeys(NAMES, 0.0)
 
@@ -31,13 +31,13 @@ class Still:
         return dict.fromkeys(NAMES, State((0.0, 0.0, 0.0)))
 
 
-class Planned:
+class ScheduledProgram:
     """Plans its next wake time, each time that it wakes, by the next entry of a list: a delay, or None for never."""
 
     def __init__(self, name: str, after_ns: Sequence[int | None], wakes: list[tuple[int, str]]) -> None:
         self._name = name
         self._after_ns = list(after_ns)[::-1]
-        self._woke = wakes
+        self._wakes = wakes
         self._wake_ns = self._next_ns(0)
 
     def _next_ns(self, now_ns: int) -> int | None:
@@ -48,7 +48,7 @@ class Planned:
         return self._wake_ns
 
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
-        self._woke.append((now_ns, self._name))
+        self._wakes.append((now_ns, self._name))
         self._wake_ns = self._next_ns(now_ns)
         return Action()
 
@@ -64,9 +64,9 @@ def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
     plans: dict[str, list[int | None]], receivers: list[set[str]]
 ) -> None:
     wakes: list[tuple[int, str]] = []
-    agents = Agents(Still(), {name: Planned(name, plan, wakes) for name, plan in plans.items()})
+    agents = Agents(StationaryPhysics(), {name: ScheduledProgram(name, plan, wakes) for name, plan in plans.items()})
     expected: list[tuple[int, str]] = []
-    programs = {name: Planned(name, plan, expected) for name, plan in plans.items()}
+    programs = {name: ScheduledProgram(name, plan, expected) for name, plan in plans.items()}
     state = State((0.0, 0.0, 0.0))
     for now_ns, names in zip(RECEIVED_AT_NS, receivers, strict=True):
         for name in sorted(names):
@@ -82,7 +82,7 @@ def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
         assert agents.next_wake_ns() == min(planned_ns, default=None)
 
 
-class Growing(Still):
+class PhysicsWithLateAgent(StationaryPhysics):
     """Physics in which an agent appears within a window."""
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
@@ -93,7 +93,7 @@ class Growing(Still):
 @pytest.mark.parametrize("extrapolates", [False, True])
 @pytest.mark.parametrize("policy", BUILTIN)
 def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy: str, *, extrapolates: bool) -> None:
-    physics = Growing()
+    physics = PhysicsWithLateAgent()
     physics.step_ns = MS
     programs = {
         "a": Periodic("to late", "late", period_ns=7 * MS, first_ns=13 * MS),
@@ -108,7 +108,7 @@ def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy
     assert not any(fate.reason for fate in run.fates.values())
 
 
-class Visited(Still):
+class PhysicsWithAbsentAgent(StationaryPhysics):
     """Physics in which an agent disappears within a window, and is there again later."""
 
     agents_disappear = True
@@ -121,7 +121,7 @@ class Visited(Still):
 @pytest.mark.parametrize("extrapolates", [False, True])
 @pytest.mark.parametrize("policy", BUILTIN)
 def test_an_agent_that_the_physics_removes_is_absent_with_every_policy(policy: str, *, extrapolates: bool) -> None:
-    physics = Visited()
+    physics = PhysicsWithAbsentAgent()
     physics.step_ns = MS
     programs = {
         "a": Periodic("to b", "b", period_ns=MS, first_ns=MS // 2),

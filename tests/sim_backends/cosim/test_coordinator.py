@@ -25,7 +25,7 @@ END_NS = 1_000
 LOST = None
 
 
-class Drifting:
+class UniformMotion:
     """Agents whose position in metres is the time in nanoseconds, at whole steps."""
 
     def __init__(self, names: Sequence[str], step_ns: int) -> None:
@@ -40,7 +40,7 @@ class Drifting:
         return {name: State((float(to_ns // self.step_ns * self.step_ns), 0.0, 0.0)) for name in self._names}
 
 
-class Scripted:
+class ScriptedProgram:
     """Sends at given times, and replies to every datagram that is not a reply."""
 
     def __init__(self, name: str, sends: Sequence[tuple[int, str]]) -> None:
@@ -66,7 +66,7 @@ class Scripted:
         return Datagram(to, 10, flow, number, payload)
 
 
-class Delays:
+class DelayNetwork:
     """A network in which the n-th packet has the n-th delay, or is dropped after 0 ns if that is None."""
 
     def __init__(self, delays_ns: Sequence[int | None]) -> None:
@@ -117,7 +117,7 @@ class ScriptedPolicy:
 
 
 @dataclass
-class Setting:
+class RepeatableRun:
     """A co-simulation that can be run repeatedly.
 
     Attributes:
@@ -133,14 +133,14 @@ class Setting:
     sends: Mapping[str, Sequence[tuple[int, str]]]
     delays_ns: Sequence[int | None]
     step_ns: int
-    programs: dict[str, Scripted] = field(default_factory=dict)
-    network: Delays = field(init=False)
+    programs: dict[str, ScriptedProgram] = field(default_factory=dict)
+    network: DelayNetwork = field(init=False)
 
     def run(self, observer: WindowObserver | None = None, *, backwards: bool = False) -> Run:
         names = NAMES[::-1] if backwards else NAMES
-        self.programs = {name: Scripted(name, self.sends[name]) for name in names}
-        self.network = Delays(self.delays_ns)
-        agents = Agents(Drifting(names, self.step_ns), self.programs)
+        self.programs = {name: ScriptedProgram(name, self.sends[name]) for name in names}
+        self.network = DelayNetwork(self.delays_ns)
+        agents = Agents(UniformMotion(names, self.step_ns), self.programs)
         pairs = [(source, to) for source in NAMES for to in NAMES if source != to]
         policy = ScriptedPolicy(self.lengths_ns, *self.flags)
         return Coordinator(agents, self.network, policy, pairs, observer=observer).advance(END_NS)
@@ -148,7 +148,7 @@ class Setting:
 
 SENDS = st.lists(st.tuples(st.integers(0, END_NS), st.sampled_from(NAMES)), max_size=6)
 SETTINGS = st.builds(
-    Setting,
+    RepeatableRun,
     lengths_ns=st.lists(st.integers(1, 200), min_size=1, max_size=5),
     flags=st.tuples(st.booleans(), st.booleans(), st.booleans()),
     sends=st.fixed_dictionaries(dict.fromkeys(NAMES, SENDS)),
@@ -158,7 +158,7 @@ SETTINGS = st.builds(
 
 
 @given(SETTINGS)
-def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: Setting) -> None:
+def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: RepeatableRun) -> None:
     run = setting.run()
     defers_sends, uses_end_states, defers_arrivals = setting.flags
     assert run.windows_ns == sorted(set(run.windows_ns))
@@ -194,7 +194,7 @@ def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: Se
 
 
 @dataclass
-class Watching:
+class WindowRecorder:
     """An observer that keeps all windows."""
 
     windows: list[Window] = field(default_factory=list)
@@ -209,8 +209,8 @@ class Watching:
 
 
 @given(SETTINGS)
-def test_the_network_assumes_the_states_that_the_policy_determines(setting: Setting) -> None:
-    watching = Watching()
+def test_the_network_assumes_the_states_that_the_policy_determines(setting: RepeatableRun) -> None:
+    watching = WindowRecorder()
     setting.run(watching)
     for window in watching.windows:
         assumed_at_ns = window.end_ns if setting.flags[1] else window.begin_ns
@@ -221,15 +221,15 @@ def test_the_network_assumes_the_states_that_the_policy_determines(setting: Sett
 
 
 @given(SETTINGS)
-def test_the_digest_is_independent_of_observers_and_of_the_order_of_names(setting: Setting) -> None:
-    run, watching = setting.run(), Watching()
+def test_the_digest_is_independent_of_observers_and_of_the_order_of_names(setting: RepeatableRun) -> None:
+    run, watching = setting.run(), WindowRecorder()
     assert setting.run(watching).digest == run.digest
     assert setting.run(backwards=True).digest == run.digest
 
 
 @given(SETTINGS)
-def test_an_observer_receives_everything_once_and_in_order(setting: Setting) -> None:
-    watching = Watching()
+def test_an_observer_receives_everything_once_and_in_order(setting: RepeatableRun) -> None:
+    watching = WindowRecorder()
     run = setting.run(watching)
     assert [window.end_ns for window in watching.windows] == run.windows_ns
     assert [window.begin_ns for window in watching.windows] == [0, *run.windows_ns[:-1]]
@@ -246,7 +246,7 @@ def test_an_observer_receives_everything_once_and_in_order(setting: Setting) -> 
 
 
 @given(SETTINGS, SETTINGS)
-def test_different_runs_have_different_digests(setting: Setting, other: Setting) -> None:
+def test_different_runs_have_different_digests(setting: RepeatableRun, other: RepeatableRun) -> None:
     first, second = setting.run(), other.run()
     same = first.windows_ns == second.windows_ns and [
         (fate.packet, fate.arrived_ns, fate.reason) for fate in first.fates.values()

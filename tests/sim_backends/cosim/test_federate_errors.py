@@ -84,14 +84,14 @@ def test_a_timeout_names_the_federate_and_the_request(federate: str, message: st
 
 
 def test_an_error_of_a_policy_that_looks_ahead_has_the_time_that_the_window_has_reached() -> None:
-    class Faulty(ErrorBounded):
+    class FaultyPolicy(ErrorBounded):
         def extended_end_ns(self, situation: Situation) -> int:
             if situation.now_ns >= 7 * MS:
                 next(iter(()))
             return situation.now_ns + MS
 
     with pytest.raises(FederateError, match=r"policy error_bounded failed at the request .* StopIteration") as raised:
-        pair(policy=Faulty()).advance(1000 * MS)
+        pair(policy=FaultyPolicy()).advance(1000 * MS)
     assert "extend the window beyond 0.007 s" in str(raised.value)
 
 
@@ -120,7 +120,7 @@ def test_all_stalls_of_one_federate_count_as_waiting_time() -> None:
     assert pair(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
 
 
-class Failing:
+class FailingFederate:
     """Physics and program that fail from a time on."""
 
     step_ns = MS
@@ -152,7 +152,7 @@ class FailingDisc(Disc):
         return [], []
 
 
-class Broken(Disc):
+class NetworkWithoutEvents(Disc):
     def next_event_ns(self) -> int | None:
         raise ValueError("no heap")
 
@@ -161,7 +161,7 @@ class Broken(Disc):
     ("parts", "message"),
     [
         (
-            {"physics": Failing(10 * MS)},
+            {"physics": FailingFederate(10 * MS)},
             r"physics failed at the request .* from 0\.009 s to 0\.012 s: KeyError: 'wheel'",
         ),
         (
@@ -169,15 +169,15 @@ class Broken(Disc):
             r"network failed at the request .* from 0 s to 0\.003 s: ValueError: no air",
         ),
         (
-            {"network": Broken(1.0, MS), "policy": EventDriven()},
+            {"network": NetworkWithoutEvents(1.0, MS), "policy": EventDriven()},
             r"network failed at the request .* its next event after 0 s: ValueError: no heap",
         ),
         (
-            {"program": Failing(MS)},
+            {"program": FailingFederate(MS)},
             r"the program of a failed at the request .* act at 0\.005 s: RuntimeError: no plan",
         ),
         (
-            {"program": Failing(0)},
+            {"program": FailingFederate(0)},
             r"the program of a failed at the request .* next wake time after 0 s: OSError: no clock",
         ),
     ],
@@ -188,7 +188,7 @@ def test_a_failure_names_the_federate_and_its_last_time(parts: dict[str, Any], m
     assert raised.value.__cause__ is not None
 
 
-class Answers:
+class FixedAnswerNetwork:
     """A network that gives a fixed answer in the window in which its first packet enters."""
 
     def __init__(self, arrivals: Sequence[Arrival] = (), drops: Sequence[Drop] = ()) -> None:
@@ -206,26 +206,29 @@ class Answers:
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (Answers([Arrival(2, "b", 2 * MS)]), "reported the fate of packet 2, which never entered it"),
-        (Answers([Arrival(1, "b", 2 * MS)] * 2), "packet 1, which was reported before"),
-        (Answers([Arrival(1, "b", 2 * MS)], [Drop(1, "lost")]), "packet 1, which was reported before"),
-        (Answers([Arrival(1, "a", 2 * MS)]), "delivered packet 1 for b to a"),
-        (Answers([Arrival(1, "b", 2 * MS - 1)]), r"0 s to 0\.003 s, .* entered at 0\.002 s, at 0\.001999999 s"),
-        (Answers([Arrival(1, "b", 3 * MS + 1)]), r"packet 1, .* at 0\.003000001 s"),
+        (FixedAnswerNetwork([Arrival(2, "b", 2 * MS)]), "reported the fate of packet 2, which never entered it"),
+        (FixedAnswerNetwork([Arrival(1, "b", 2 * MS)] * 2), "packet 1, which was reported before"),
+        (FixedAnswerNetwork([Arrival(1, "b", 2 * MS)], [Drop(1, "lost")]), "packet 1, which was reported before"),
+        (FixedAnswerNetwork([Arrival(1, "a", 2 * MS)]), "delivered packet 1 for b to a"),
+        (
+            FixedAnswerNetwork([Arrival(1, "b", 2 * MS - 1)]),
+            r"0 s to 0\.003 s, .* entered at 0\.002 s, at 0\.001999999 s",
+        ),
+        (FixedAnswerNetwork([Arrival(1, "b", 3 * MS + 1)]), r"packet 1, .* at 0\.003000001 s"),
     ],
 )
-def test_impossible_answers_of_the_network_are_refused(answer: Answers, message: str) -> None:
+def test_impossible_answers_of_the_network_are_refused(answer: FixedAnswerNetwork, message: str) -> None:
     with pytest.raises(FederateError, match=f"network.*{message}"):
         pair(network=answer).advance(1000 * MS)
 
 
 def test_a_physics_that_loses_an_agent_is_refused() -> None:
-    class Losing(Paths):
+    class LosingPhysics(Paths):
         def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
             states = super().advance(to_ns, commands)
             return states if to_ns < 5 * MS else {"a": states["a"]}
 
-    losing = Losing([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
+    losing = LosingPhysics([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
     with pytest.raises(FederateError, match=r"physics, requested to advance to 0\.006 s, has no state of b"):
         pair(physics=losing).advance(1000 * MS)
 
@@ -241,13 +244,13 @@ def test_a_datagram_to_an_unknown_agent_or_with_a_used_number_is_refused() -> No
     with pytest.raises(FederateError, match="the program of a sent to c, which is not an agent"):
         pair(program=periodic("c")).advance(1000 * MS)
 
-    class Twice(Periodic):
+    class DuplicateSender(Periodic):
         def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
             super().wake(now_ns, own_state, received)
             return Action((Datagram("b", 10, "ab", 7),))
 
     with pytest.raises(FederateError, match="program of a sent two packets of flow ab with the number 7"):
-        pair(program=Twice("ab", "b", period_ns=MS)).advance(1000 * MS)
+        pair(program=DuplicateSender("ab", "b", period_ns=MS)).advance(1000 * MS)
 
 
 def test_progress_is_reported_at_a_limited_rate(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,7 @@ def same(at_ns: int) -> int:
 
 
 @dataclass(frozen=True)
-class Expected:
+class ExpectedTimes:
     """A policy, and functions for the entry time of packets, the time of assumed states, and the counted arrival."""
 
     policy: SyncPolicy
@@ -92,23 +92,23 @@ class Expected:
 
 W_NS = 1_100_000
 EXPECTATIONS = [
-    Expected(EventDriven()),
-    Expected(VariableStepped()),
-    Expected(TimeStepped(0.0011), enters=end(W_NS), counts=end(W_NS)),
-    Expected(Scheduled(0.0011), assumes=begin(W_NS), counts=end(W_NS)),
-    Expected(SlidingWindow(0.0011), assumes=closed_end(W_NS)),
-    Expected(SlidingWindow(0.25), assumes=closed_end(250 * MS)),
+    ExpectedTimes(EventDriven()),
+    ExpectedTimes(VariableStepped()),
+    ExpectedTimes(TimeStepped(0.0011), enters=end(W_NS), counts=end(W_NS)),
+    ExpectedTimes(Scheduled(0.0011), assumes=begin(W_NS), counts=end(W_NS)),
+    ExpectedTimes(SlidingWindow(0.0011), assumes=closed_end(W_NS)),
+    ExpectedTimes(SlidingWindow(0.25), assumes=closed_end(250 * MS)),
     # 1 ms and the 0.3 ms by which the publisher is faster.
-    Expected(VelocityAwareRaw(0.001), assumes=closed_end(1_300_000)),
+    ExpectedTimes(VelocityAwareRaw(0.001), assumes=closed_end(1_300_000)),
     # 1 ms and the 1.7 ms of the relative velocity.
-    Expected(VelocityAware(0.001), assumes=closed_end(2_700_000)),
+    ExpectedTimes(VelocityAware(0.001), assumes=closed_end(2_700_000)),
     # At constant velocities the extrapolation is exact, so the window has its maximum length.
-    Expected(ErrorBounded(0.1), counts=end(100 * MS)),
+    ExpectedTimes(ErrorBounded(0.1), counts=end(100 * MS)),
 ]
 
 
 @pytest.mark.parametrize("expected", EXPECTATIONS, ids=lambda expected: expected.policy.name)
-def test_fates_and_times_equal_those_computed_by_hand(expected: Expected) -> None:
+def test_fates_and_times_equal_those_computed_by_hand(expected: ExpectedTimes) -> None:
     run = passing(expected.policy)
     assert len(run.fates) == -(-END_NS // PERIOD_NS)
     lost = 0
@@ -311,7 +311,7 @@ def test_error_bounded_keeps_its_bound_for_any_motion_within_the_limits(
         assert abs(error_m) <= bound_m * (1 + 1e-9)
 
 
-class Echo:
+class ReplyingProgram:
     """Replies to every datagram immediately, `times` times."""
 
     def __init__(self, peer: str, times: int, *, begins: bool) -> None:
@@ -343,14 +343,14 @@ class Echo:
     ids=lambda value: getattr(value, "name", value),
 )
 def test_round_trips_of_immediate_replies_have_the_delay_of_the_policy(policy: SyncPolicy, round_ns: int) -> None:
-    requester, responder = Echo("b", 5, begins=True), Echo("a", 5, begins=False)
+    requester, responder = ReplyingProgram("b", 5, begins=True), ReplyingProgram("a", 5, begins=False)
     physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
     agents = Agents(physics, {"a": requester, "b": responder})
     Coordinator(agents, Disc(1.0, DELAY_NS), policy, [("a", "b")]).advance(END_NS)
     assert requester.received_ns[:4] == [round_ns * number for number in range(1, 5)]
 
 
-class Restless:
+class EndlessWakes:
     """Wakes endlessly at one time."""
 
     def next_wake_ns(self) -> int:
@@ -363,4 +363,4 @@ class Restless:
 def test_a_program_that_wakes_endlessly_is_named() -> None:
     physics = Paths([WayPoints("a", [(0.0, 0.0, 0.0)], 1.0)])
     with pytest.raises(FederateError, match=r"program of a woke 1001 times at 0\.000000005 s"):
-        Coordinator(Agents(physics, {"a": Restless()}), Disc(1.0, 1), EventDriven(), []).advance(10)
+        Coordinator(Agents(physics, {"a": EndlessWakes()}), Disc(1.0, 1), EventDriven(), []).advance(10)

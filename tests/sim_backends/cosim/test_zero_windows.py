@@ -25,11 +25,11 @@ MS = 1_000_000
 BEGINS_NS = 7 * MS + 3
 
 
-class Returns:
+class BallProgram:
     """Sends a ball, or returns it at the instant of its arrival, a limited number of times."""
 
     def __init__(self, peer: str, times: int, *, begins: bool = False) -> None:
-        self._peer, self._left, self._begins = peer, times, begins
+        self._peer, self._remaining, self._begins = peer, times, begins
         self.woken_ns: list[int] = []
 
     def next_wake_ns(self) -> int | None:
@@ -38,15 +38,15 @@ class Returns:
     def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
         self._begins = False
         self.woken_ns.append(now_ns)
-        if not self._left:
+        if not self._remaining:
             return Action()
-        self._left -= 1
-        return Action((Datagram(self._peer, 10, f"to {self._peer}", self._left),))
+        self._remaining -= 1
+        return Action((Datagram(self._peer, 10, f"to {self._peer}", self._remaining),))
 
 
-def rally(returns: int, observer: WindowObserver | None = None) -> tuple[Coordinator, list[Returns]]:
+def rally(returns: int, observer: WindowObserver | None = None) -> tuple[Coordinator, list[BallProgram]]:
     """Return a co-simulation of two players that return a ball at one instant, over a network without delay."""
-    programs = [Returns("b", returns, begins=True), Returns("a", returns)]
+    programs = [BallProgram("b", returns, begins=True), BallProgram("a", returns)]
     physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
     agents = Agents(physics, dict(zip("ab", programs, strict=True)))
     return Coordinator(agents, Disc(1.0, 0), EventDriven(), [("a", "b"), ("b", "a")], observer=observer), programs
@@ -82,12 +82,12 @@ def test_an_instant_that_never_ends_is_an_error() -> None:
 
 
 def test_a_window_that_ends_before_it_begins_is_an_error() -> None:
-    class Back(EventDriven):
+    class BackwardPolicy(EventDriven):
         def next_window(self, situation: Situation) -> int | None:
             return situation.now_ns - 1 if situation.now_ns else 5 * MS
 
     coordinator, _ = rally(1)
-    coordinator.policy = Back()
+    coordinator.policy = BackwardPolicy()
     with pytest.raises(PolicyError, match="time does not advance beyond 5000000 ns"):
         coordinator.advance(100 * MS)
     assert coordinator.run.windows_ns == [5 * MS]

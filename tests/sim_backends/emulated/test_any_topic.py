@@ -49,8 +49,8 @@ def shell(request: pytest.FixtureRequest) -> Iterator[Shell]:
     profile = robot.profile.model_copy(update={"ros": ros_of(robot.profile).model_copy(update={"topics": topics})})
     cast = {Role.SENDER: robot.model_copy(update={"profile": profile})}
     options, world = EmulatedOptions(), load_world("lawn")
-    with testbed.bring_up(cast, options=options, world=world, ros=request.param, seed=1) as up:
-        yield up.shells[Role.SENDER]
+    with testbed.bring_up(cast, options=options, world=world, ros=request.param, seed=1) as emulation:
+        yield emulation.shells[Role.SENDER]
 
 
 def test_both_topics_are_recorded_completely_at_their_rates(shell: Shell, tmp_path: Path) -> None:

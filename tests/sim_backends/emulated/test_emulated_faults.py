@@ -32,7 +32,7 @@ PERSISTENT = ("/root/mine", "/home/mine", "/var/log/mine")
 
 
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
-def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
+def emulation(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     with testbed.bring_up(
         cast,
@@ -63,46 +63,46 @@ def wait_healed(shell: Shell, condition: Callable[[], bool] = lambda: True) -> N
         time.sleep(0.01)
 
 
-def reaches(up: EmulatedTestbed, role: Role, of: Role, *, within_s: float = 10.0) -> bool:
+def reaches(emulation: EmulatedTestbed, role: Role, of: Role, *, within_s: float = 10.0) -> bool:
     """Return True if one robot gets an answer from another over the radio."""
-    argv = ("ping", "-c", "1", "-W", f"{within_s:g}", up.robots[of].spec.ip)
-    return up.shells[role].run(argv, deadline=Deadline.after(LONG_S), check=False).exit_code == 0
+    argv = ("ping", "-c", "1", "-W", f"{within_s:g}", emulation.robots[of].spec.ip)
+    return emulation.shells[role].run(argv, deadline=Deadline.after(LONG_S), check=False).exit_code == 0
 
 
 def names(shell: Shell) -> list[str]:
     return output_of(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()  # some exit meanwhile
 
 
-def test_a_link_goes_down_and_comes_up_with_all_its_routes(up: EmulatedTestbed) -> None:
-    sender = up.shells[Role.SENDER]
+def test_a_link_goes_down_and_comes_up_with_all_its_routes(emulation: EmulatedTestbed) -> None:
+    sender = emulation.shells[Role.SENDER]
     routes = output_of(sender, "ip", "route")
     assert "224.0.0.0/4" in routes
-    with inject_until_exit(up, Fault(FaultKind.LINK_DOWN, Role.SENDER, 1.0)):
+    with inject_until_exit(emulation, Fault(FaultKind.LINK_DOWN, Role.SENDER, 1.0)):
         assert "state DOWN" in output_of(sender, "ip", "link", "show", "wlan0")
     assert output_of(sender, "ip", "route") == routes
-    assert reaches(up, Role.RECEIVER, Role.SENDER)
+    assert reaches(emulation, Role.RECEIVER, Role.SENDER)
 
 
-def test_the_duration_of_a_fault_is_returned(up: EmulatedTestbed) -> None:
-    lasted_s = up.inject(Fault(FaultKind.LINK_DOWN, Role.RECEIVER, 0.3))
+def test_the_duration_of_a_fault_is_returned(emulation: EmulatedTestbed) -> None:
+    lasted_s = emulation.inject(Fault(FaultKind.LINK_DOWN, Role.RECEIVER, 0.3))
     assert lasted_s is not None
     assert 0.3 <= lasted_s < LONG_S
-    assert up.inject(Fault(FaultKind.KILL, Role.RECEIVER, process="sensors")) == 0.0
-    wait_healed(up.shells[Role.RECEIVER], lambda: "sensors" in names(up.shells[Role.RECEIVER]))
+    assert emulation.inject(Fault(FaultKind.KILL, Role.RECEIVER, process="sensors")) == 0.0
+    wait_healed(emulation.shells[Role.RECEIVER], lambda: "sensors" in names(emulation.shells[Role.RECEIVER]))
 
 
 @pytest.mark.parametrize("unreachable", FIXED_ROLES)
 def test_a_robot_out_of_range_is_unreachable_and_without_the_relay_all_are(
-    up: EmulatedTestbed, unreachable: Role
+    emulation: EmulatedTestbed, unreachable: Role
 ) -> None:
-    assert reaches(up, Role.SENDER, Role.RECEIVER)
-    with inject_until_exit(up, Fault(FaultKind.OUT_OF_RANGE, unreachable, 1.5)):
-        wait_until(lambda: not reaches(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
-    assert reaches(up, Role.SENDER, Role.RECEIVER), "back in its place"
+    assert reaches(emulation, Role.SENDER, Role.RECEIVER)
+    with inject_until_exit(emulation, Fault(FaultKind.OUT_OF_RANGE, unreachable, 1.5)):
+        wait_until(lambda: not reaches(emulation, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
+    assert reaches(emulation, Role.SENDER, Role.RECEIVER), "back in its place"
 
 
-def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(up: EmulatedTestbed) -> None:
-    sender = up.shells[Role.SENDER]
+def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(emulation: EmulatedTestbed) -> None:
+    sender = emulation.shells[Role.SENDER]
     output_of(
         sender,
         "sh",
@@ -114,25 +114,28 @@ def test_a_reboot_kills_every_process_and_keeps_only_the_sd_card(up: EmulatedTes
     )
     boot_id = output_of(sender, "cat", BOOT_ID)
     start_s = time.monotonic()
-    assert up.inject(Fault(FaultKind.REBOOT, Role.SENDER)) == 0.0
+    assert emulation.inject(Fault(FaultKind.REBOOT, Role.SENDER)) == 0.0
     assert time.monotonic() - start_s >= BOOT_S
     wait_healed(sender, lambda: {"sshd", "sensors"} <= set(names(sender)))
     assert "sleep" not in names(sender)
     assert re.fullmatch(r"[0-9a-f-]{36}\n", boot_id)
-    assert output_of(sender, "cat", BOOT_ID) not in {boot_id, output_of(up.shells[Role.RECEIVER], "cat", BOOT_ID)}
+    assert output_of(sender, "cat", BOOT_ID) not in {
+        boot_id,
+        output_of(emulation.shells[Role.RECEIVER], "cat", BOOT_ID),
+    }
     left = output_of(
         sender, "sh", "-c", 'ls -d "$@" /tmp/deep 2>/dev/null; true', "sh", *VOLATILE, *PERSISTENT
     ).split()
     assert sorted(left) == sorted(PERSISTENT)
     assert "224.0.0.0/4" in output_of(sender, "ip", "route")
-    assert reaches(up, Role.RECEIVER, Role.SENDER)
+    assert reaches(emulation, Role.RECEIVER, Role.SENDER)
 
 
-def test_a_robot_records_again_after_a_reboot_and_after_its_sensors_died(up: EmulatedTestbed) -> None:
-    sender = up.shells[Role.SENDER]
-    up.inject(Fault(FaultKind.REBOOT, Role.SENDER))
+def test_a_robot_records_again_after_a_reboot_and_after_its_sensors_died(emulation: EmulatedTestbed) -> None:
+    sender = emulation.shells[Role.SENDER]
+    emulation.inject(Fault(FaultKind.REBOOT, Role.SENDER))
     wait_healed(sender, lambda: _records(sender, "after-reboot"))
-    up.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
+    emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
     wait_healed(sender, lambda: _records(sender, "after-kill"))
 
 
@@ -141,32 +144,32 @@ def _records(shell: Shell, name: str) -> bool:
     return result.stdout.decode().endswith(f"{name}.bag\n")
 
 
-def test_a_robot_without_power_is_unreachable(up: EmulatedTestbed) -> None:
-    robot = up.robots[Role.RECEIVER]
+def test_a_robot_without_power_is_unreachable(emulation: EmulatedTestbed) -> None:
+    robot = emulation.robots[Role.RECEIVER]
     robot.halt()
     with pytest.raises(ConnectionError, match="refused"):
         robot.connect(5.0)
-    wait_until(lambda: not reaches(up, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
+    wait_until(lambda: not reaches(emulation, Role.SENDER, Role.RECEIVER, within_s=0.3), Deadline.after(LONG_S))
     robot.boot()
-    wait_healed(up.shells[Role.RECEIVER])
+    wait_healed(emulation.shells[Role.RECEIVER])
 
 
-def test_a_killed_server_restarts_with_another_process_id(up: EmulatedTestbed) -> None:
-    sender = up.shells[Role.SENDER]
+def test_a_killed_server_restarts_with_another_process_id(emulation: EmulatedTestbed) -> None:
+    sender = emulation.shells[Role.SENDER]
     listener = ("sh", "-c", "cd /proc; for p in [0-9]*; do echo sshd | cmp -s - $p/comm && echo $p && break; done")
     before = output_of(sender, *listener)
-    up.inject(Fault(FaultKind.KILL, Role.SENDER, process="sshd"))
+    emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="sshd"))
     wait_healed(sender, lambda: output_of(sender, *listener) != before)
 
 
-def test_a_process_that_does_not_run_cannot_be_killed(up: EmulatedTestbed) -> None:
+def test_a_process_that_does_not_run_cannot_be_killed(emulation: EmulatedTestbed) -> None:
     with pytest.raises(RobotError, match="no process named roscore runs") as caught:
-        up.inject(Fault(FaultKind.KILL, Role.SENDER, process="roscore"))
+        emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="roscore"))
     assert "/proc/[0-9]*/comm" in caught.value.remedy
 
 
-def test_a_request_with_a_short_timeout_does_not_affect_later_ones(up: EmulatedTestbed) -> None:
-    _, descriptors = up.robots[Role.SENDER]._worker.request({"do": "socket"}, timeout_s=1e-6)
+def test_a_request_with_a_short_timeout_does_not_affect_later_ones(emulation: EmulatedTestbed) -> None:
+    _, descriptors = emulation.robots[Role.SENDER]._worker.request({"do": "socket"}, timeout_s=1e-6)
     for fd in descriptors:
         os.close(fd)
-    output_of(up.shells[Role.SENDER], "true")
+    output_of(emulation.shells[Role.SENDER], "true")

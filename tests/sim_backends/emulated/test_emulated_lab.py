@@ -37,7 +37,7 @@ from sim_backends.emulated.testbed import EmulatedTestbed
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
-from tests.helpers.host import Untouched, descendants, wait_for_end
+from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
@@ -64,7 +64,7 @@ def master_cast() -> Cast:
 
 
 @pytest.fixture(scope="module", params=[RosChoice.BUILTIN, RosChoice.DEBIAN])
-def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
+def emulation(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
     with testbed.bring_up(
         master_cast(),
         options=EmulatedOptions(radio=RadioOptions(fading=False)),
@@ -77,8 +77,8 @@ def up(request: pytest.FixtureRequest) -> Iterator[EmulatedTestbed]:
 
 
 @pytest.fixture
-def sender(up: EmulatedTestbed) -> Shell:
-    return up.shells[Role.SENDER]
+def sender(emulation: EmulatedTestbed) -> Shell:
+    return emulation.shells[Role.SENDER]
 
 
 def output_of(shell: Shell, *argv: str, seconds: float = 30.0) -> str:
@@ -122,17 +122,17 @@ def test_a_robot_changes_nothing_on_the_host(sender: Shell) -> None:
         assert b"Read-only file system" in result.stderr
 
 
-def test_a_lab_leaves_no_trace_on_the_host(untouched: Untouched) -> None:
+def test_a_lab_leaves_no_trace_on_the_host(untouched: NamespaceComparison) -> None:
     with testbed.bring_up(
         master_cast(), options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
     ):
         untouched()
 
 
-def test_robots_reach_each_other_over_the_medium(up: EmulatedTestbed) -> None:
-    output = output_of(up.shells[Role.SENDER], "ping", "-c", "3", "-i", "0.01", "turtlebot-2")
+def test_robots_reach_each_other_over_the_medium(emulation: EmulatedTestbed) -> None:
+    output = output_of(emulation.shells[Role.SENDER], "ping", "-c", "3", "-i", "0.01", "turtlebot-2")
     assert "3 received" in output
-    assert up.medium.stats().ports["turtlebot-1"].read >= 3
+    assert emulation.medium.stats().ports["turtlebot-1"].read >= 3
 
 
 @pytest.mark.parametrize("destination", ["10.42.0.255", "255.255.255.255", "239.1.1.1"])
@@ -144,13 +144,13 @@ def test_the_kernel_sends_nothing_without_a_request(sender: Shell) -> None:
     assert output_of(sender, "ip", "-6", "address") == ""
 
 
-def test_tcpdump_writes_where_root_does(up: EmulatedTestbed) -> None:
+def test_tcpdump_writes_where_root_does(emulation: EmulatedTestbed) -> None:
     script = (
         "umask 077; mkdir -p ~/deep/er && cd ~/deep/er && "
         "{ timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap & } && "
         "until [ -e x.pcap ]; do sleep 0.01; done && ping -q -c 5 -i 0.05 10.42.0.3 && wait && stat -c %s x.pcap"
     )
-    size_bytes = int(output_of(up.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
+    size_bytes = int(output_of(emulation.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
     # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
     assert size_bytes == 24 + 2 * (16 + 84)
 
@@ -165,10 +165,10 @@ def test_no_signal_is_ignored_or_blocked_in_a_session(sender: Shell) -> None:
     assert int(status["SigBlk"], 16) & standard == 0
 
 
-def test_only_the_lab_s_key_logs_in(up: EmulatedTestbed) -> None:
-    robot = up.robots[Role.SENDER]
+def test_only_the_lab_s_key_logs_in(emulation: EmulatedTestbed) -> None:
+    robot = emulation.robots[Role.SENDER]
     # OpenSSH 9.9 prints its comments to standard output, too.
-    printed = output_of(up.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").splitlines()
+    printed = output_of(emulation.shells[Role.SENDER], "ssh-keyscan", "127.0.0.1").splitlines()
     _, host_key = next(line for line in printed if not line.startswith("#")).split(maxsplit=1)
     other_login = SshShell(
         robot.name,
@@ -253,7 +253,7 @@ def owner(folder: Path) -> tuple[subprocess.Popen[str], dict[str, Any]]:
     return process, json.loads(process.stdout.readline())
 
 
-def test_sigkill_of_the_owner_leaves_no_processes(untouched: Untouched) -> None:
+def test_sigkill_of_the_owner_leaves_no_processes(untouched: NamespaceComparison) -> None:
     process, pids = owner(ROOT)
     lab_pids = {pid for root in (*pids["robots"], pids["medium"]) for pid in (root, *descendants(root))}
     namespaces = set().union(*(namespaces_of(pid) for robot in pids["robots"] for pid in descendants(robot)))

@@ -142,7 +142,7 @@ class TestBackend:
         assert load_options(None) == load_options(parse(SITE, source="fieldkit.yaml")) == EmulatedOptions()
 
     @pytest.mark.parametrize(
-        ("change", "complaint"),
+        ("change", "message"),
         [
             (("sensor_msgs/Imu", "sensor_msgs/Imi"), r"cannot publish sensor_msgs/Imi(.|\n)*'sensor_msgs/Imu'\?"),
             (
@@ -154,12 +154,12 @@ class TestBackend:
         ],
     )
     def test_unsupported_profiles_are_rejected_before_startup(
-        self, change: tuple[str, ...], complaint: str, monkeypatch: pytest.MonkeyPatch
+        self, change: tuple[str, ...], message: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         text = replace_text(locations.find("robots", "turtlebot3_burger").read_text(encoding="utf-8"), *change)
         profile = validate(parse(text, source="robot.yaml"), RobotProfile)
         monkeypatch.setattr("fieldkit.backends.registry.load_profile", lambda _: profile)
-        with pytest.raises(ConfigurationError, match=complaint):
+        with pytest.raises(ConfigurationError, match=message):
             cast_for(Topology.MASTER)
 
 

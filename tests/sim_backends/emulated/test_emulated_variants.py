@@ -49,7 +49,7 @@ def backend(text: str) -> EmulatedBackend:
 
 
 @pytest.fixture(scope="module")
-def up() -> Iterator[EmulatedTestbed]:
+def emulation() -> Iterator[EmulatedTestbed]:
     variants = {
         "turtlebot-1": RobotOptions(ssh="dropbear", sftp=False, userland="busybox"),
         "turtlebot-2": RobotOptions(netcat="openbsd", ping="busybox", sftp=False),
@@ -70,14 +70,14 @@ def up() -> Iterator[EmulatedTestbed]:
             yield robots
 
 
-def output_of(up: EmulatedTestbed, role: Role, *argv: str) -> str:
+def output_of(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
     """Return both output streams of a program that may fail: some print their version in this way."""
-    result = up.shells[role].run(argv, deadline=Deadline.after(60), check=False)
+    result = emulation.shells[role].run(argv, deadline=Deadline.after(60), check=False)
     return (result.stdout + result.stderr).decode()
 
 
-def has_program(up: EmulatedTestbed, role: Role, program: str) -> bool:
-    return bool(output_of(up, role, "sh", "-c", f"command -v {program}"))
+def has_program(emulation: EmulatedTestbed, role: Role, program: str) -> bool:
+    return bool(output_of(emulation, role, "sh", "-c", f"command -v {program}"))
 
 
 @pytest.mark.emulated
@@ -85,37 +85,39 @@ def has_program(up: EmulatedTestbed, role: Role, program: str) -> bool:
     ("role", "words"),
     [(Role.SENDER, "BusyBox"), (Role.RECEIVER, "OpenBSD netcat"), (Role.RELAY, "Ncat 7")],
 )
-def test_the_netcat_of_a_robot_is_the_only_one_it_has(up: EmulatedTestbed, role: Role, words: str) -> None:
-    assert words in output_of(up, role, "nc", "-h")
+def test_the_netcat_of_a_robot_is_the_only_one_it_has(emulation: EmulatedTestbed, role: Role, words: str) -> None:
+    assert words in output_of(emulation, role, "nc", "-h")
     expected = {Role.SENDER: set(), Role.RECEIVER: {"nc.openbsd"}, Role.RELAY: {"ncat"}}[role]
-    assert {name for name in ("nc.traditional", "nc.openbsd", "ncat") if has_program(up, role, name)} == expected
+    assert {
+        name for name in ("nc.traditional", "nc.openbsd", "ncat") if has_program(emulation, role, name)
+    } == expected
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize(
     ("role", "words"), [(Role.SENDER, "seq=0"), (Role.RECEIVER, "seq=0"), (Role.RELAY, "icmp_seq=1")]
 )
-def test_the_ping_of_a_robot_crosses_the_radio(up: EmulatedTestbed, role: Role, words: str) -> None:
+def test_the_ping_of_a_robot_crosses_the_radio(emulation: EmulatedTestbed, role: Role, words: str) -> None:
     other = "10.42.0.1" if role is Role.RELAY else "10.42.0.3"
-    assert words in output_of(up, role, "ping", "-c", "1", other)
+    assert words in output_of(emulation, role, "ping", "-c", "1", other)
 
 
 @pytest.mark.emulated
 @pytest.mark.parametrize("role", [Role.SENDER, Role.RELAY])
-def test_a_busybox_userland_has_no_other_programs(up: EmulatedTestbed, role: Role) -> None:
+def test_a_busybox_userland_has_no_other_programs(emulation: EmulatedTestbed, role: Role) -> None:
     for program in ("sh", "tar", "ip", "tail", "sha256sum", "setsid"):
-        assert output_of(up, role, "readlink", f"/usr/bin/{program}") == "/usr/bin/busybox\n"
+        assert output_of(emulation, role, "readlink", f"/usr/bin/{program}") == "/usr/bin/busybox\n"
     for program in ("perl", "flock", "systemctl", "scp", "getent", "useradd"):
-        assert not has_program(up, role, program)
-    assert output_of(up, role, "sh", "-c", "echo $SHELL") == "/bin/sh\n"
+        assert not has_program(emulation, role, program)
+    assert output_of(emulation, role, "sh", "-c", "echo $SHELL") == "/bin/sh\n"
 
 
 @pytest.mark.emulated
-def test_a_busybox_robot_records_and_captures(up: EmulatedTestbed) -> None:
+def test_a_busybox_robot_records_and_captures(emulation: EmulatedTestbed) -> None:
     words = ("rosbag", "record", "--duration=0.5", "-O", "scan", "/scan")
-    assert "Recording to 'scan.bag'" in output_of(up, Role.SENDER, *with_environment(words, setup=[SETUP]))
+    assert "Recording to 'scan.bag'" in output_of(emulation, Role.SENDER, *with_environment(words, setup=[SETUP]))
     capture = "timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap 2>/dev/null; wc -c <x.pcap"
-    output = output_of(up, Role.SENDER, "sh", "-c", f"ping -q -c 50 -i 0.1 10.42.0.3 >/dev/null & {capture}")
+    output = output_of(emulation, Role.SENDER, "sh", "-c", f"ping -q -c 50 -i 0.1 10.42.0.3 >/dev/null & {capture}")
     # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
     assert int(output) == 24 + 2 * (16 + 84)
 
@@ -125,9 +127,11 @@ def test_a_busybox_robot_records_and_captures(up: EmulatedTestbed) -> None:
     ("role", "server", "sftp"),
     [(Role.SENDER, "dropbear", False), (Role.RECEIVER, "OpenSSH", False), (Role.RELAY, "dropbear", True)],
 )
-def test_the_ssh_server_is_the_configured_one(up: EmulatedTestbed, role: Role, server: str, *, sftp: bool) -> None:
+def test_the_ssh_server_is_the_configured_one(
+    emulation: EmulatedTestbed, role: Role, server: str, *, sftp: bool
+) -> None:
     key = paramiko.Ed25519Key.from_private_key(io.StringIO(KEY.private))
-    with paramiko.Transport(up.robots[role].connect(10.0)) as link:
+    with paramiko.Transport(emulation.robots[role].connect(10.0)) as link:
         link.connect(username=USER, pkey=key)
         assert server in link.remote_version
         assert offers_sftp(link) is sftp
@@ -142,12 +146,14 @@ def offers_sftp(link: paramiko.Transport) -> bool:
 
 
 @pytest.mark.emulated
-def test_a_robot_with_other_tools_recovers_from_a_reboot(up: EmulatedTestbed) -> None:
+def test_a_robot_with_other_tools_recovers_from_a_reboot(emulation: EmulatedTestbed) -> None:
     boot = ("cat", "/proc/sys/kernel/random/boot_id")
-    before = output_of(up, Role.SENDER, *boot)
-    up.inject(Fault(FaultKind.REBOOT, Role.SENDER))
-    assert until(lambda: up.shells[Role.SENDER].run(boot, deadline=Deadline.after(20)).stdout.decode() != before)
-    assert "seq=0" in output_of(up, Role.SENDER, "ping", "-c", "1", "10.42.0.3")
+    before = output_of(emulation, Role.SENDER, *boot)
+    emulation.inject(Fault(FaultKind.REBOOT, Role.SENDER))
+    assert until(
+        lambda: emulation.shells[Role.SENDER].run(boot, deadline=Deadline.after(20)).stdout.decode() != before
+    )
+    assert "seq=0" in output_of(emulation, Role.SENDER, "ping", "-c", "1", "10.42.0.3")
 
 
 def until(condition: Callable[[], bool]) -> bool:

@@ -53,12 +53,12 @@ def row() -> Iterator[Row]:
     options = schema.validate(schema.parse(text, source="fieldkit.yaml"), EmulatedOptions)
     members = {name: LabRobot(name, profile, address, ()) for name, address in ADDRESSES.items()}
     with (
-        running_robots(members, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1) as up,
-        laptop_on_air(up, options.mesh) as laptop,
+        running_robots(members, options=options, world=load_world("open"), ros=RosChoice.BUILTIN, seed=1) as running,
+        laptop_on_air(running, options.mesh) as laptop,
     ):
         places = {name: (SPACING_M * number, 0.0, 0.2) for number, name in enumerate(NAMES)}
-        up.medium.place(places | {LAPTOP_NAME: (0.0, 2.0, 0.2)})
-        yield Row(up, laptop)
+        running.medium.place(places | {LAPTOP_NAME: (0.0, 2.0, 0.2)})
+        yield Row(running, laptop)
 
 
 @pytest.fixture(scope="module")

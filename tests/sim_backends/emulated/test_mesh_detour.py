@@ -31,7 +31,7 @@ LONG_S = 120.0
 
 
 @pytest.fixture
-def up() -> Iterator[EmulatedTestbed]:
+def emulation() -> Iterator[EmulatedTestbed]:
     profile = schema.validate(schema.parse(BOX, source="box.yaml"), RobotProfile)
     procedure = load_procedure("mesh_detour")
     cast = {
@@ -44,14 +44,14 @@ def up() -> Iterator[EmulatedTestbed]:
         yield robots
 
 
-def forwarded(up: EmulatedTestbed) -> list[int]:
+def forwarded(emulation: EmulatedTestbed) -> list[int]:
     """Return the number of robots that forwarded each answer to three pings of the sender."""
-    argv = ("ping", "-n", "-c", "3", "-i", "0.1", "-W", "1", up.robots[Role.RECEIVER].spec.ip)
-    text = up.shells[Role.SENDER].run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode()
+    argv = ("ping", "-n", "-c", "3", "-i", "0.1", "-W", "1", emulation.robots[Role.RECEIVER].spec.ip)
+    text = emulation.shells[Role.SENDER].run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode()
     return [FIRST_TTL - int(ttl) for ttl in re.findall(r"ttl=(\d+)", text)]
 
 
-def test_packets_take_the_longer_detour_while_the_shorter_route_is_lost(up: EmulatedTestbed) -> None:
-    wait_until(lambda: forwarded(up) == [2, 2, 2], Deadline.after(LONG_S))
-    up.robots[Role("first")].switch_off()
-    wait_until(lambda: forwarded(up) == [3, 3, 3], Deadline.after(LONG_S))
+def test_packets_take_the_longer_detour_while_the_shorter_route_is_lost(emulation: EmulatedTestbed) -> None:
+    wait_until(lambda: forwarded(emulation) == [2, 2, 2], Deadline.after(LONG_S))
+    emulation.robots[Role("first")].switch_off()
+    wait_until(lambda: forwarded(emulation) == [3, 3, 3], Deadline.after(LONG_S))

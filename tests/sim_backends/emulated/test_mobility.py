@@ -199,7 +199,7 @@ def test_away_increases_the_distance_to_the_other_end(
 
 
 @dataclass
-class Steering:
+class SteeringRobot:
     """A robot that steers itself."""
 
     spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
@@ -217,8 +217,8 @@ class Steering:
 
 
 @pytest.fixture
-def flying(medium: RecordingMedium) -> tuple[Mobility, Steering]:
-    robot = Steering()
+def flying(medium: RecordingMedium) -> tuple[Mobility, SteeringRobot]:
+    robot = SteeringRobot()
     robots = cast("Mapping[Role, EmulatedRobot]", {Role.RELAY: robot})
     mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, robots)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
@@ -226,7 +226,7 @@ def flying(medium: RecordingMedium) -> tuple[Mobility, Steering]:
 
 
 def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
-    medium: RecordingMedium, flying: tuple[Mobility, Steering]
+    medium: RecordingMedium, flying: tuple[Mobility, SteeringRobot]
 ) -> None:
     mobility, robot = flying
     place = medium.position_of(Role.RELAY)
@@ -251,7 +251,7 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
 
 
 def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: RecordingMedium) -> None:
-    robot = Steering()
+    robot = SteeringRobot()
     robots = cast("Mapping[Role, EmulatedRobot]", {Role.SENDER: robot})
     mobility = Mobility(CAST, cast("MediumClient", medium), load_world("lawn"), None, robots)
     mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))

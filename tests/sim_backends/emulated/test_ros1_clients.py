@@ -36,7 +36,7 @@ STAMPED: Final = ("/scan", "/odom", "/imu", "/battery_state")
 
 
 @pytest.fixture(scope="module")
-def up() -> Iterator[EmulatedTestbed]:
+def emulation() -> Iterator[EmulatedTestbed]:
     robot = EmulatedBackend(None, None).cast(Topology.MASTERLESS)[Role.SENDER]
     with testbed.bring_up(
         {Role.SENDER: robot}, options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1
@@ -44,18 +44,18 @@ def up() -> Iterator[EmulatedTestbed]:
         yield running
 
 
-def in_ros(up: EmulatedTestbed, *argv: str) -> str:
-    command = with_environment(argv, setup=up.robots[Role.SENDER].spec.setup)
-    return up.shells[Role.SENDER].run(command, deadline=Deadline.after(LONG_S)).stdout.decode()
+def in_ros(emulation: EmulatedTestbed, *argv: str) -> str:
+    command = with_environment(argv, setup=emulation.robots[Role.SENDER].spec.setup)
+    return emulation.shells[Role.SENDER].run(command, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def tf_report(up: EmulatedTestbed) -> Any:  # noqa: ANN401 (of JSON)
-    return json.loads(in_ros(up, "python3", str(LISTENER), "odom", *STAMPED))
+def tf_report(emulation: EmulatedTestbed) -> Any:  # noqa: ANN401 (of JSON)
+    return json.loads(in_ros(emulation, "python3", str(LISTENER), "odom", *STAMPED))
 
 
 @pytest.mark.emulated
-def test_a_tf_listener_reaches_the_frame_of_every_header(up: EmulatedTestbed) -> None:
-    report = tf_report(up)
+def test_a_tf_listener_reaches_the_frame_of_every_header(emulation: EmulatedTestbed) -> None:
+    report = tf_report(emulation)
     assert report["frames"] == {"/scan": "base_scan", "/odom": "odom", "/imu": "imu_link", "/battery_state": ""}
     assert report["reached"], report["paths"]
     assert report["paths"]["base_scan"] == ["base_scan", "base_link", "base_footprint", "odom"]
@@ -65,19 +65,19 @@ def test_a_tf_listener_reaches_the_frame_of_every_header(up: EmulatedTestbed) ->
 
 
 @pytest.mark.emulated
-def test_static_transforms_return_after_the_sensors_were_killed(up: EmulatedTestbed) -> None:
-    up.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
-    assert tf_report(up)["reached"]
-    up.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
-    wait_until(lambda: "/tf_static" in in_ros(up, "rostopic", "list"), Deadline.after(LONG_S))
-    assert tf_report(up)["reached"]
+def test_static_transforms_return_after_the_sensors_were_killed(emulation: EmulatedTestbed) -> None:
+    emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="sensors"))
+    assert tf_report(emulation)["reached"]
+    emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
+    wait_until(lambda: "/tf_static" in in_ros(emulation, "rostopic", "list"), Deadline.after(LONG_S))
+    assert tf_report(emulation)["reached"]
 
 
 @pytest.mark.emulated
-def test_packages_of_fieldkit_s_python_precede_debian_s(up: EmulatedTestbed) -> None:
+def test_packages_of_fieldkit_s_python_precede_debian_s(emulation: EmulatedTestbed) -> None:
     """Both must be importable: middlewares of the Python that runs fieldkit, and rospy."""
     origin = "import numpy, rospy, sys; print(sys.executable); print(numpy.__file__)"
-    executable, numpy = in_ros(up, "python3", "-c", origin).splitlines()
+    executable, numpy = in_ros(emulation, "python3", "-c", origin).splitlines()
     assert not numpy.startswith("/usr/lib/python3/dist-packages/")
     assert Path(numpy).parents[1].name == "site-packages", executable
 
@@ -91,10 +91,10 @@ print(json.dumps(rospy.wait_for_message("/scan", LaserScan, 60).ranges))
 
 
 @pytest.mark.emulated
-def test_the_laser_detects_the_wall_next_to_the_sender(up: EmulatedTestbed) -> None:
+def test_the_laser_detects_the_wall_next_to_the_sender(emulation: EmulatedTestbed) -> None:
     """In the lawn at (3, 18) facing west, the wall's near face 0.9 m behind it, from 4 m south to 4 m north."""
-    up.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("5m")))
-    ranges_m = json.loads(in_ros(up, "python3", "-c", ONE_SCAN))
+    emulation.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("5m")))
+    ranges_m = json.loads(in_ros(emulation, "python3", "-c", ONE_SCAN))
     assert len(ranges_m) == 360
     for beam, range_m in enumerate(ranges_m):
         off_rad = math.radians(beam - 180)
@@ -102,16 +102,18 @@ def test_the_laser_detects_the_wall_next_to_the_sender(up: EmulatedTestbed) -> N
         if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:  # noise decides at this distance
             expected_m = true_m if true_m < LASER_RANGE_M[1] else math.inf
             assert range_m == pytest.approx(expected_m, abs=6 * LASER_NOISE_M), beam
-    up.place(PLACED)
-    assert set(json.loads(in_ros(up, "python3", "-c", ONE_SCAN))) == {math.inf}
+    emulation.place(PLACED)
+    assert set(json.loads(in_ros(emulation, "python3", "-c", ONE_SCAN))) == {math.inf}
 
 
 @pytest.mark.emulated
-def test_bagpy_reads_a_recording_as_rosbags_does(up: EmulatedTestbed, tmp_path: Path) -> None:
+def test_bagpy_reads_a_recording_as_rosbags_does(emulation: EmulatedTestbed, tmp_path: Path) -> None:
     topics = ("/scan", "/odom", "/tf", "/tf_static", "/imu", "/battery_state")
-    in_ros(up, "rosbag", "record", "--duration=3", "-O", "clients", *topics)
+    in_ros(emulation, "rosbag", "record", "--duration=3", "-O", "clients", *topics)
     bag = tmp_path / "clients.bag"
-    up.shells[Role.SENDER].fetch(("cat", "clients.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 22)
+    emulation.shells[Role.SENDER].fetch(
+        ("cat", "clients.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 22
+    )
     with Reader(bag) as reader:
         types = {connection.topic: connection.msgtype.replace("/msg/", "/") for connection in reader.connections}
         counts = {connection.topic: connection.msgcount for connection in reader.connections}

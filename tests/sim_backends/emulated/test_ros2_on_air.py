@@ -76,28 +76,40 @@ def options(ros2: str, ros: str = "auto") -> EmulatedOptions:
 @contextmanager
 def lab(robots: Cast, ros2: str) -> Iterator[EmulatedTestbed]:
     chosen = options(ros2)
-    with testbed.bring_up(robots, options=chosen, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1) as up:
-        up.place(PLACED)
-        yield up
+    with testbed.bring_up(
+        robots, options=chosen, world=load_world("lawn"), ros=RosChoice.BUILTIN, seed=1
+    ) as emulation:
+        emulation.place(PLACED)
+        yield emulation
 
 
 @pytest.fixture(scope="module")
 def multicast() -> Iterator[EmulatedTestbed]:
-    with lab(cast(sender="cyclonedds", receiver="zenoh"), "{}") as up:
-        yield up
+    with lab(cast(sender="cyclonedds", receiver="zenoh"), "{}") as emulation:
+        yield emulation
 
 
-def inside(up: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
+def inside(emulation: EmulatedTestbed, *argv: str) -> tuple[str, ...]:
     """Return a command in the network namespace of the drone, which has no ROS 2."""
-    return ("timeout", "-k", "10", str(LONG_S), "nsenter", "-t", str(up.robots[Role.RELAY].pid), "-n", *argv)
+    return (
+        "timeout",
+        "-k",
+        "10",
+        str(LONG_S),
+        "nsenter",
+        "-t",
+        str(emulation.robots[Role.RELAY].pid),
+        "-n",
+        *argv,
+    )
 
 
 @contextmanager
 def listening(
-    up: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object
+    emulation: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object
 ) -> Iterator[Iterator[Any]]:
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone receives."""
-    network_settings = {"address": up.robots[Role.RELAY].spec.ip, "node": "ears", **network}
+    network_settings = {"address": emulation.robots[Role.RELAY].spec.ip, "node": "ears", **network}
     quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
     description = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
     command = (
@@ -108,7 +120,9 @@ def listening(
         json.dumps(network_settings),
         json.dumps(description),
     )
-    with subprocess.Popen(inside(up, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        inside(emulation, *command), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
         assert process.stdout is not None
         try:
             yield (
@@ -119,9 +133,9 @@ def listening(
             process.communicate()
 
 
-def receive(up: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
+def receive(emulation: EmulatedTestbed, middleware_name: str, topic: str, kind: str, **network: object) -> Any:  # noqa: ANN401 (of rosbags)
     """Return the first message of `listening`."""
-    with listening(up, middleware_name, topic, kind, **network) as messages:
+    with listening(emulation, middleware_name, topic, kind, **network) as messages:
         return next(messages)
 
 
@@ -270,18 +284,18 @@ def test_zenoh_scouts_across_the_medium(multicast: EmulatedTestbed) -> None:
 
 @pytest.mark.emulated
 def test_unicast_peers_need_no_multicast() -> None:
-    with lab(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}") as up:
+    with lab(cast(sender="cyclonedds", receiver="zenoh"), "{discovery: peers}") as emulation:
         for role, middleware_name in ((Role.SENDER, "dds"), (Role.RECEIVER, "zenoh")):
-            peers = (up.robots[role].spec.ip,)
-            odom = receive(up, middleware_name, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
+            peers = (emulation.robots[role].spec.ip,)
+            odom = receive(emulation, middleware_name, "/odom", "nav_msgs/Odometry", discovery="peers", peers=peers)
             assert odom.child_frame_id == "base_footprint"
 
 
 @pytest.mark.emulated
 def test_zenoh_works_with_a_router_on_the_relay() -> None:
-    with lab(cast(sender="zenoh"), ROUTER) as up:
-        relay = up.robots[Role.RELAY].spec.ip
-        scan = receive(up, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
+    with lab(cast(sender="zenoh"), ROUTER) as emulation:
+        relay = emulation.robots[Role.RELAY].spec.ip
+        scan = receive(emulation, "zenoh", "/scan", "sensor_msgs/LaserScan", discovery="router", server=relay)
         assert np.isinf(scan.ranges).all()
         assert len(scan.ranges) == 360
 

@@ -22,7 +22,7 @@ from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.world.world import load_world
 from tests.helpers import ordinary_user
 from tests.helpers.casts import ros_of
-from tests.helpers.host import Untouched
+from tests.helpers.host import NamespaceComparison
 
 SETUP = (
     "/opt/ros/noetic/setup.bash",
@@ -46,8 +46,10 @@ def cast_with(*setup: str) -> Cast:
 @pytest.fixture(scope="module")
 def shell() -> Iterator[Shell]:
     options, world = EmulatedOptions(), load_world("lawn")
-    with testbed.bring_up(cast_with(*SETUP), options=options, world=world, ros=RosChoice.BUILTIN, seed=1) as up:
-        yield up.shells[Role.SENDER]
+    with testbed.bring_up(
+        cast_with(*SETUP), options=options, world=world, ros=RosChoice.BUILTIN, seed=1
+    ) as emulation:
+        yield emulation.shells[Role.SENDER]
 
 
 def output_of(shell: Shell, *argv: str) -> str:
@@ -63,7 +65,7 @@ def test_a_setup_file_can_be_sourced_at_the_path_in_the_profile(path: str, shell
 
 
 @pytest.mark.emulated
-def test_the_rest_of_the_file_system_is_as_usual(shell: Shell, untouched: Untouched) -> None:
+def test_the_rest_of_the_file_system_is_as_usual(shell: Shell, untouched: NamespaceComparison) -> None:
     assert output_of(shell, "hostname") == "turtlebot-1\n"
     assert output_of(shell, "getent", "hosts", "turtlebot-1").split() == ["10.42.0.1", "turtlebot-1"]
     for folder in ("/", "/etc", "/usr/share", "/etc/clearpath"):

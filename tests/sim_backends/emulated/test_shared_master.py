@@ -37,7 +37,7 @@ def backend(extra_keys: str = "") -> EmulatedBackend:
 
 
 @pytest.fixture(scope="module")
-def up() -> Iterator[EmulatedTestbed]:
+def emulation() -> Iterator[EmulatedTestbed]:
     with testbed.bring_up(
         backend().cast(Topology.MASTER),
         options=EmulatedOptions(radio=RadioOptions(fading=False)),
@@ -57,8 +57,8 @@ def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def in_ros(up: EmulatedTestbed, role: Role, *argv: str) -> str:
-    return output_of(up.shells[role], *with_environment(argv, setup=up.robots[role].spec.setup))
+def in_ros(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
+    return output_of(emulation.shells[role], *with_environment(argv, setup=emulation.robots[role].spec.setup))
 
 
 def names(shell: Shell) -> set[str]:
@@ -73,19 +73,19 @@ def answer_to(shell: Shell, need: Need) -> CommandResult:
 
 
 @pytest.mark.emulated
-def test_the_relay_runs_roscore_and_the_others_no_master(up: EmulatedTestbed) -> None:
+def test_the_relay_runs_roscore_and_the_others_no_master(emulation: EmulatedTestbed) -> None:
     masters = {"roscore", "rosmaster", "rosout"}
-    wait(lambda: masters <= names(up.shells[Role.RELAY]))
+    wait(lambda: masters <= names(emulation.shells[Role.RELAY]))
     for role in (Role.SENDER, Role.RECEIVER):
-        assert not masters & names(up.shells[role])
+        assert not masters & names(emulation.shells[role])
 
 
 @pytest.mark.emulated
-def test_every_robot_lists_all_topics_with_one_publisher_each(up: EmulatedTestbed) -> None:
-    for role in up.shells:
-        topics = set(in_ros(up, role, "rostopic", "list").split())
+def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: EmulatedTestbed) -> None:
+    for role in emulation.shells:
+        topics = set(in_ros(emulation, role, "rostopic", "list").split())
         assert topics >= {"/scan", "/odom", "/imu", "/battery_state", "/pidrone/imu", "/rosout"}
-    info = in_ros(up, Role.RECEIVER, "rostopic", "info", "/scan")
+    info = in_ros(emulation, Role.RECEIVER, "rostopic", "info", "/scan")
     publishers = info.partition("Publishers:")[2].partition("Subscribers:")[0].split()
     assert publishers[:2] == ["*", "/sensors_turtlebot_1"], "the other TurtleBot's laser has the same name"
     assert len([publisher for publisher in publishers if publisher == "*"]) == 1
@@ -93,10 +93,10 @@ def test_every_robot_lists_all_topics_with_one_publisher_each(up: EmulatedTestbe
 
 
 @pytest.mark.emulated
-def test_subscriptions_to_another_robot_cross_the_medium(up: EmulatedTestbed, tmp_path: Path) -> None:
-    receiver = up.shells[Role.RECEIVER]
-    before = up.medium.stats().ports["turtlebot-1"].read
-    in_ros(up, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
+def test_subscriptions_to_another_robot_cross_the_medium(emulation: EmulatedTestbed, tmp_path: Path) -> None:
+    receiver = emulation.shells[Role.RECEIVER]
+    before = emulation.medium.stats().ports["turtlebot-1"].read
+    in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
     bag = tmp_path / "heard.bag"
     receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
     with Reader(bag) as reader:
@@ -106,32 +106,32 @@ def test_subscriptions_to_another_robot_cross_the_medium(up: EmulatedTestbed, tm
         }
     assert count >= 5
     # 2.9 kB in segments of 1,448 bytes.
-    assert up.medium.stats().ports["turtlebot-1"].read - before >= 3 * count
+    assert emulation.medium.stats().ports["turtlebot-1"].read - before >= 3 * count
 
 
 @pytest.mark.emulated
-def test_the_preflight_probe_detects_a_master_and_its_absence(up: EmulatedTestbed) -> None:
+def test_the_preflight_probe_detects_a_master_and_its_absence(emulation: EmulatedTestbed) -> None:
     cast = backend().cast(Topology.MASTER)
     scene = Scene(Protocol.TCP, cast, "f")
     (need,) = ros_master.needs(scene, Role.SENDER, program="rosbag")
-    answer = answer_to(up.shells[Role.SENDER], need)
+    answer = answer_to(emulation.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
     wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
     (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, program="rosbag")
-    answer = answer_to(up.shells[Role.SENDER], need)
+    answer = answer_to(emulation.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
     assert "Connection refused" in answer.text
 
 
 @pytest.mark.emulated
-def test_a_restarted_master_has_no_topics_until_nodes_register(up: EmulatedTestbed) -> None:
-    relay, sender = up.shells[Role.RELAY], up.shells[Role.SENDER]
+def test_a_restarted_master_has_no_topics_until_nodes_register(emulation: EmulatedTestbed) -> None:
+    relay, sender = emulation.shells[Role.RELAY], emulation.shells[Role.SENDER]
     wait(lambda: "rosmaster" in names(relay))
-    up.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
+    emulation.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
     wait(lambda: "/scan" not in topics_of(sender))
     wait(lambda: {"rosmaster", "rosout"} <= names(relay))
     assert "/scan" not in topics_of(sender)
-    up.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
+    emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
     wait(lambda: "/scan" in topics_of(sender))
 
 

@@ -113,7 +113,7 @@ def test_a_timeout_has_the_last_time() -> None:
     assert raised.value.exit_code == 3
 
 
-class Slow:
+class SlowPhysics:
     """A physics that needs longer than the deadline for its third answer."""
 
     step_ns = MS
@@ -131,12 +131,12 @@ class Slow:
 
 def test_a_federate_that_reports_that_it_computes_may_take_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     hello = replace(HELLO, heartbeat_ms=50)
-    physics = RemotePhysics(*Pair(FederateService(Slow), deadline_s=1.5)(hello))
+    physics = RemotePhysics(*Pair(FederateService(SlowPhysics), deadline_s=1.5)(hello))
     physics.advance(0, {})
     physics.advance(2 * MS, {})
     physics.advance(3 * MS, {})
     monkeypatch.setattr("sim_backends.federates.session.PATIENCE", 1)
-    impatient = RemotePhysics(*Pair(FederateService(Slow), deadline_s=1.5)(hello))
+    impatient = RemotePhysics(*Pair(FederateService(SlowPhysics), deadline_s=1.5)(hello))
     impatient.advance(0, {})
     impatient.advance(2 * MS, {})
     with pytest.raises(UnansweredError, match=r"its last time is 0.002 s; it last reported 0.002 s"):
@@ -267,7 +267,7 @@ def test_heartbeats_are_shorter_than_the_deadline() -> None:
 
     def make(hello: Hello) -> object:
         hellos.append(hello)
-        return Still(hello)
+        return StationaryPhysics(hello)
 
     threading.Thread(target=lambda: serve(make, address=f"tcp-listen:127.0.0.1:{port}", runs=2), daemon=True).start()
     for deadline_s in (2.0, 20.0):
@@ -342,7 +342,7 @@ def test_a_federate_of_the_other_role_is_named() -> None:
     assert HELLO.role == PHYSICS
 
 
-class Still:
+class StationaryPhysics:
     """A physics whose robots do not move."""
 
     step_ns = MS
@@ -366,15 +366,17 @@ def test_mutated_requests_end_the_session_of_a_federate_or_are_answered() -> Non
     frames = [encode(MessageKind.HELLO, 1, 0, HELLO.encode()), *(example_frames()[name] for name in REQUESTS)]
     for seed in range(80):
         draws = random.Random(seed)
-        own, other = socket.socketpair()
+        peer, other = socket.socketpair()
         channel = channel_of(other)
-        thread = threading.Thread(target=serve_channel, args=(channel, FederateService(Still)), daemon=True)
+        thread = threading.Thread(
+            target=serve_channel, args=(channel, FederateService(StationaryPhysics)), daemon=True
+        )
         thread.start()
         wrong = draws.randrange(len(frames))
-        with own, suppress(BrokenPipeError, ConnectionResetError):
+        with peer, suppress(BrokenPipeError, ConnectionResetError):
             for number, frame in enumerate(frames):
-                own.sendall(mutated(frame, draws) if number == wrong else frame)
-            own.shutdown(socket.SHUT_WR)
+                peer.sendall(mutated(frame, draws) if number == wrong else frame)
+            peer.shutdown(socket.SHUT_WR)
         thread.join(20)
         assert not thread.is_alive(), seed
         channel.close()
@@ -384,7 +386,9 @@ def test_mutated_answers_raise_only_errors_that_name_the_federate() -> None:
     for seed in range(80):
         draws = random.Random(seed)
         alter = from_second(lambda frame, draws=draws: mutated(frame, draws))  # type: ignore[misc]
-        physics = RemotePhysics(*Pair(FederateService(Still, name="still"), alter=alter, deadline_s=0.05)(HELLO))
+        physics = RemotePhysics(
+            *Pair(FederateService(StationaryPhysics, name="still"), alter=alter, deadline_s=0.05)(HELLO)
+        )
         try:
             for step in range(4):
                 physics.advance(step * MS, {})
@@ -394,10 +398,10 @@ def test_mutated_answers_raise_only_errors_that_name_the_federate() -> None:
 
 
 def test_a_full_channel_reaches_the_deadline_of_its_writer() -> None:
-    own, other = socket.socketpair()
-    with closing(StreamChannel(own.fileno(), own.fileno())) as channel, other:
+    peer, other = socket.socketpair()
+    with closing(StreamChannel(peer.fileno(), peer.fileno())) as channel, other:
         with pytest.raises(DeadlineError):
             channel.send(bytes(1 << 24), time.monotonic() + 0.1)
-        own.detach()
+        peer.detach()
     with pytest.raises(ClosedError):
         channel.receive(time.monotonic() + 1)

@@ -104,15 +104,17 @@ def test_another_simulator_does_not_get_the_options_of_the_one_that_it_replaces(
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("radio: {loss: 1%}", "ns-3 simulates Wi-Fi, not fixed links; remove loss"),
-        ("faults: [{kind: jammer, power_dbm: 10, at_m: [3, 3]}]", "ns-3 has no jammers; remove the fault"),
         (
             "traffic: [{kind: stream, from: ann, to: bob, rate: 10Hz, protocol: topic}]",
-            "only with network.options.topics: udp",
+            "ns-3 has no topics; set network.transports: builtin, or network.options.topics: udp",
         ),
         (
             "traffic: [{kind: stream, from: ann, to: bob, rate: 10Hz, protocol: ros1}]\nrelay: ann",
-            "ns-3 does not carry topics of ROS 1",
+            "ns-3 has no ROS 1; set network.transports: builtin",
+        ),
+        (
+            "traffic: [{kind: stream, from: ann, to: bob, rate: 10Hz, protocol: ros1-udp}]\nrelay: ann",
+            "ns-3 has no ROS 1; set network.transports: builtin",
         ),
     ],
 )
@@ -124,18 +126,37 @@ def test_what_a_simulator_does_not_support_has_its_line(line: str, message: str,
         load_scenario(path, changes)
     assert caught.value.where.startswith(f"{path}:13")
     load_scenario(path, changes | {"network.federate": "builtin", "network.options": None})
+    load_scenario(path, changes | {"network.transports": "builtin"})
 
 
-@pytest.mark.parametrize("key", ["appears", "disappears"])
-def test_gazebo_refuses_agents_that_appear_or_disappear_with_their_line(key: str, tmp_path: Path) -> None:
+NETWORK_ONLY = """\
+name: pair
+summary: two robots
+world: open
+duration: 1s
+network: {federate: ns3, KEYS}
+radio: {RADIO}
+agents: {ann: {robot: husky, at_m: [0, 0]}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("radio", "keys", "message"),
+    [
+        ("loss: 1%", "options: {standard: 802.11a}", "fixed links have no Wi-Fi; remove standard"),
+        ("delay: 1ms", "options: {ampdu_bytes: 100}", "fixed links have no Wi-Fi; remove ampdu_bytes"),
+        ("rate: 1Mbit/s", "options: {pcap: air-}", "fixed links have no Wi-Fi; remove pcap"),
+        ("", "options: {topics: udp}, transports: builtin", "transports: builtin carries all topics; remove topics"),
+    ],
+)
+def test_options_of_ns3_without_an_effect_are_refused_with_their_line(
+    radio: str, keys: str, message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "pair.yaml"
-    text = (
-        SCENARIO.replace("PHYSICS", "gazebo").replace("    VALUE\n", "    reset: false\n").replace("NETWORK", "ns3")
-    )
-    path.write_text(text.replace("bob: {", f"bob: {{{key}: 500ms, "), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=f"cannot appear or disappear in Gazebo; remove {key}") as caught:
+    path.write_text(NETWORK_ONLY.replace("KEYS", keys).replace("RADIO", radio), encoding="utf-8")
+    with pytest.raises(ConfigurationError, match=message) as caught:
         load_scenario(path)
-    assert caught.value.where == f"{path}:12"
+    assert caught.value.where == f"{path}:5"
 
 
 def test_reliable_topics_over_ns3_are_refused_with_their_line(tmp_path: Path) -> None:

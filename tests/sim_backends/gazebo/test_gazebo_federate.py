@@ -1,5 +1,6 @@
 """The physics federate `gazebo`, against a server like Gazebo Fortress with DART."""
 
+import math
 import re
 import shlex
 import time
@@ -11,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from fieldkit.cli import main
-from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import load_scenario
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.external import make_hello
@@ -24,7 +24,10 @@ from sim_backends.federates.protocols import FederateError
 from sim_backends.federates.remote import RemotePhysics, open_physics
 from sim_backends.federates.session import open_session
 from sim_backends.gazebo.federate import adapter
+from sim_backends.gazebo.sdf import model_sdf
+from sim_backends.physics import robot_limits
 from sim_backends.physics.body import Twist, Velocity
+from sim_backends.physics.quadrotor import QuadrotorLimits
 from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import GazeboServer, gazebo_server, missing_libraries
@@ -165,6 +168,7 @@ def test_parallel_runs_use_it_one_after_the_other_by_its_name(
     monkeypatch.chdir(tmp_path)
     options = ", ".join(f"{key}: {value}" for key, value in server.options.items())
     words = ["cosim", "run", "convoy", "--physics", "gazebo", "--set", f"physics.options={{{options}}}"]
+    words += ["--set", "agents.drone.disappears=300ms"]
     code = main([*words, "--duration", "500ms", "--window", "20ms", "--policy", "sliding_window", "--seeds", "2"])
     output = capsys.readouterr()
     assert code == 0, output.err
@@ -223,9 +227,78 @@ def test_a_gazebo_that_ends_or_is_suspended_is_reported(tmp_path: Path) -> None:
             physics.advance(2 * WINDOW_NS, {})
 
 
-@pytest.mark.parametrize("lifetime", ["appears", "disappears"])
-def test_robots_that_appear_or_disappear_are_refused_before_the_run(lifetime: str, server: GazeboServer) -> None:
-    changes = {f"agents.leader.{lifetime}": "3s"}
-    refusal = pytest.raises(ConfigurationError, match=f"cannot appear or disappear in Gazebo; remove {lifetime}")
-    with refusal, connected(server, {}, changes):
-        pass
+LIFETIMES = {"agents.leader.appears": "100ms", "agents.drone.disappears": "300.5ms"}
+
+
+def presence(physics: RemotePhysics) -> dict[str, list[int]]:
+    """Return the times of each agent's states in ms; the leader drives from 150 ms on."""
+    times_ms: dict[str, list[int]] = {}
+    for time_ms in range(0, 401, 10):
+        commands = {"leader": Twist(0.8)} if time_ms == 160 else {}
+        for name, state in physics.advance(time_ms * 1_000_000, commands).items():
+            times_ms.setdefault(name, []).append(time_ms)
+            if name == "leader" and time_ms <= 150:
+                assert state.position_m == pytest.approx((20, 53, 0.39), abs=0.05)
+                assert math.hypot(*state.velocity_m_s) < 0.05
+    return times_ms
+
+
+@pytest.mark.parametrize("reset", ["time", "world"])
+def test_robots_appear_and_disappear_at_their_times(reset: str, tmp_path: Path) -> None:
+    """A reset of Fortress keeps the models, so the end of a run restores those that it has created and removed."""
+    changes = {**LIFETIMES, "agents.leader.at_m": [20, 53]}
+    with gazebo_server(tmp_path, SDF, "--reset", reset) as running:
+        for _ in range(2):
+            with connected(running, changes=changes) as physics:
+                times_ms = presence(physics)
+                moved_m = physics.advance(1_000_000_000, {})["leader"].position_m[0] - 20
+            assert times_ms["follower"] == list(range(0, 401, 10))
+            assert times_ms["leader"] == list(range(100, 401, 10))
+            assert times_ms["drone"] == list(range(0, 301, 10))
+            assert moved_m == pytest.approx(0.55, abs=0.1), "speed and acceleration are those of its model"
+        with connected(running) as physics:
+            assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
+
+
+def test_a_robot_that_has_been_removed_is_no_obstacle(tmp_path: Path) -> None:
+    changes = {
+        "agents.leader.at_m": [20, 53],
+        "agents.leader.disappears": "100ms",
+        "agents.follower.at_m": [18.4, 53],
+        "agents.follower.heading_deg": 0,
+    }
+    with gazebo_server(tmp_path, SDF) as running, connected(running, changes=changes) as physics:
+        physics.advance(0, {})
+        end = physics.advance(2_500_000_000, {"follower": Twist(0.9)})
+    assert end["follower"].position_m[0] > 20
+
+
+def test_the_file_of_a_model_can_be_given(tmp_path: Path) -> None:
+    body = QuadrotorLimits(**{**vars(robot_limits.quadrotor("iris")), "height_m": 0.3})
+    model = tmp_path / "model.sdf"
+    model.write_text(model_sdf("any name", body, step_ns=1_000_000, version="fortress"), encoding="utf-8")
+    options = {"model_files": {"drone": str(model)}}
+    changes = {"agents.drone.appears": "20ms"}
+    with gazebo_server(tmp_path, SDF) as running, connected(running, options, changes) as physics:
+        assert "drone" not in physics.advance(10_000_000, {})
+        assert "drone" in physics.advance(20_000_000, {})
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"create_service": "/nowhere"}, "the service /nowhere has not answered"),
+        ({"model_files": {"leader": "/no/such.sdf"}}, "nothing subscribes to the commands of leader"),
+    ],
+)
+def test_a_model_that_cannot_be_created_is_reported(
+    options: Mapping[str, object], message: str, tmp_path: Path
+) -> None:
+    with (
+        gazebo_server(tmp_path, SDF) as running,
+        connected(running, {"timeout_s": 3, **options}, LIFETIMES) as physics,
+    ):
+        physics.advance(50_000_000, {})
+        with pytest.raises(FederateError, match=message) as caught:
+            physics.advance(100_000_000, {})
+    assert "whose last time is 0.099 s" in caught.value.what

@@ -31,6 +31,6 @@ def states(name: str, physics: str, duration: str) -> Iterator[Mapping[str, Stat
     ],
 )
 def test_robots_move_as_in_the_built_in_physics(name: str, duration: str) -> None:
-    for ours, expected in zip(states(name, "mujoco", duration), states(name, "builtin", duration), strict=True):
-        for agent, state in ours.items():
+    for simulated, expected in zip(states(name, "mujoco", duration), states(name, "builtin", duration), strict=True):
+        for agent, state in simulated.items():
             assert math.dist(state.position_m, expected[agent].position_m) < TOLERANCES_M[name], agent

@@ -1,4 +1,4 @@
-"""The channel of the ns-3 federate has the losses of the built-in radio: paths, obstacles, shadowing and fading."""
+"""The channel of the ns-3 federate has the losses of the built-in radio, also from jammers."""
 
 import json
 import random
@@ -51,6 +51,7 @@ def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any], wor
     radio, draws = RadioOptions.model_validate(options), random.Random(3)
     channel = WorldChannel(9, dict.fromkeys(NAMES, Antenna("802.11g", 0.0, -82.0)), radio, world)
     links, expected_mw = [], []
+    jammed, jammer_mw = [], []
     for _ in range(PLACES):
         at_ns = draws.randrange(10**11)
         places = {name: (draws.uniform(0, 60), draws.uniform(0, 60), draws.choice((0.4, 1.0, 6.0))) for name in NAMES}
@@ -61,16 +62,22 @@ def test_its_losses_are_those_of_the_built_in_radio(options: dict[str, Any], wor
                 if first != second and powers_mw[second] > 0:  # metal may absorb everything that a float can hold
                     links.append((at_ns, first, places[name], second, places[other]))
                     expected_mw.append(powers_mw[second])
+        jammer_m = draws.uniform(0, 60), draws.uniform(0, 60), 1.0
+        for name, power_mw in zip(NAMES, channel.received_mw(jammer_m, 0.0), strict=True):
+            if power_mw > 0:
+                jammed.append((jammer_m, places[name]))
+                jammer_mw.append(power_mw)
     request = {
         "seed": 9,
         "radio": radio.model_dump(mode="json", exclude_none=True),
         "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
         "names": NAMES,
         "links": links,
+        "places": jammed,
     }
     output = subprocess.run(
         [*command().split(), "losses"], input=json.dumps(request), capture_output=True, text=True, check=True
     )
     powers_mw = [10 ** (-loss_db / 10) for loss_db in json.loads(output.stdout)]
     assert len(powers_mw) > 2 * PLACES
-    assert powers_mw == pytest.approx(expected_mw, rel=1e-9, abs=0)
+    assert powers_mw == pytest.approx([*expected_mw, *jammer_mw], rel=1e-9, abs=0)

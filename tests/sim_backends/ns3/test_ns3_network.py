@@ -3,7 +3,6 @@
 import csv
 import os
 import signal
-from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -18,7 +17,6 @@ from scapy.utils import PcapReader
 from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.build import Simulation
 from sim_backends.cosim.scenario.external import make_hello
@@ -31,26 +29,9 @@ from sim_backends.federates.session import open_session
 from sim_backends.ns3.federate import command
 from sim_backends.world.world import load_world
 from tests.helpers.federate_pairs import children, now_s
+from tests.helpers.ns3_pair import RELAYED, SCENARIO, reasons, stream
 
-SCENARIO = """\
-name: line
-summary: two robots on open ground
-world: open
-duration: 500ms
-policy: {name: sliding_window, window: 10ms}
-radio: {fading: false, queue_packets: 20}
-agents:
-  ann: {robot: husky, at_m: [0, 0], radio: {standard: 802.11g}}
-  bob: {robot: husky, at_m: [10, 0], radio: {standard: 802.11g}}
-traffic:
-  - {kind: stream, name: state, from: ann, to: bob, rate: 100Hz, size_bytes: 3000}
-"""
 TCP = {"kind": "stream", "name": "log", "from": "bob", "to": "ann", "rate": "50Hz", "size_bytes": 5000}
-RELAYED = {
-    "topology": "master",
-    "relay": "hub",
-    "agents.hub": {"robot": "husky", "at_m": [5, 5], "radio": {"standard": "802.11g"}},
-}
 SATURATED_S = 0.3
 
 Simulated = Callable[..., Simulation]
@@ -74,15 +55,6 @@ def simulated(tmp_path: Path) -> Any:  # noqa: ANN401 (an iterator of a function
             return simulations.enter_context(build(scenario, deadline_s=deadline_s))
 
         yield make
-
-
-def with_traffic(**changes: object) -> list[dict[str, object]]:
-    state = {"kind": "stream", "name": "state", "from": "ann", "to": "bob", "rate": "100Hz", "size_bytes": 3000}
-    return [state | changes]
-
-
-def reasons(run: Run) -> Counter[str]:
-    return Counter(fate.reason for fate in run.fates.values() if fate.arrived_ns is None)
 
 
 @pytest.mark.parametrize("name", checks(is_physics=False))
@@ -109,19 +81,19 @@ def test_udp_has_the_goodput_and_losses_of_the_built_in_network(standard: str, s
             "duration": f"{SATURATED_S}s",
             "radio__mode": "g54",
             "agents__bob__at_m": [distance_m, 0],
-            "traffic": with_traffic(rate="4kHz", size_bytes=1000),
+            "traffic": stream(rate="4kHz", size_bytes=1000),
         }
-        ours = goodput_mbit_s(simulated("builtin", **changes))
-        theirs = goodput_mbit_s(simulated(network__options__standard=standard, **changes))
-        assert theirs == pytest.approx(ours, rel=0.1), distance_m
-        assert (ours > 20) == (distance_m < 45)
+        builtin_mbit_s = goodput_mbit_s(simulated("builtin", **changes))
+        ns3_mbit_s = goodput_mbit_s(simulated(network__options__standard=standard, **changes))
+        assert ns3_mbit_s == pytest.approx(builtin_mbit_s, rel=0.1), distance_m
+        assert (builtin_mbit_s > 20) == (distance_m < 45)
 
 
 @pytest.mark.parametrize(
     "changes", [{}, RELAYED, {"network__options__ampdu_bytes": 65535}], ids=("", "relay", "ampdu")
 )
 def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated: Simulated, tmp_path: Path) -> None:
-    traffic = [*with_traffic(), TCP | {"protocol": "tcp"}]
+    traffic = [*stream(), TCP | {"protocol": "tcp"}]
     standard = "802.11n" if "network__options__ampdu_bytes" in changes else "802.11a"
     simulation = simulated(
         traffic=traffic,
@@ -147,21 +119,21 @@ def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated
         # Only a message of TCP waits in its host: for the handshake, and for its window.
         assert min(parts_ns) >= 0
         assert identity[0] == "log/ann" or processing_ns < 25_000_000
-    assert any(int(row["queueing_ns"]) > 100_000 for row in rows.values())
+    assert any(int(row["queuing_ns"]) > 100_000 for row in rows.values())
 
 
 def test_losses_have_reasons(simulated: Simulated) -> None:
-    sparse = with_traffic(rate="10Hz", size_bytes=300)
-    far = simulated(agents__bob__at_m=[500, 0], traffic=sparse).run()
-    assert reasons(far).keys() - {""} == {"retries exhausted"}
-    assert not any(fate.arrived_ns for fate in far.fates.values())
-    full = simulated(radio__mode="g6", traffic=with_traffic(rate="4kHz", size_bytes=1000)).run()
+    sparse = stream(rate="10Hz", size_bytes=300)
+    distant_run = simulated(agents__bob__at_m=[500, 0], traffic=sparse).run()
+    assert reasons(distant_run).keys() - {""} == {"retries exhausted"}
+    assert not any(fate.arrived_ns for fate in distant_run.fates.values())
+    full = simulated(radio__mode="g6", traffic=stream(rate="4kHz", size_bytes=1000)).run()
     assert reasons(full)["queue full"] > 1000
     off = [
         {"kind": "node-loss", "agent": "bob", "from": "100ms", "to": "200ms"},
         {"kind": "link-cut", "between": ["ann", "bob"], "from": "300ms", "to": "400ms"},
     ]
-    small = with_traffic(rate="50Hz", size_bytes=300)
+    small = stream(rate="50Hz", size_bytes=300)
     run = simulated(faults=off, traffic=small, radio__mode="g54", network__options__standard="802.11a").run()
     lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
     assert len(lost_ns) == pytest.approx(10, abs=2)
@@ -191,7 +163,7 @@ def test_it_announces_its_next_event_for_policies_that_need_it(simulated: Simula
 
 
 def test_topics_of_best_effort_are_carried_as_udp_if_the_scenario_says_so(simulated: Simulated) -> None:
-    best_effort = with_traffic(protocol="topic", qos={"reliability": "best_effort"})
+    best_effort = stream(protocol="topic", qos={"reliability": "best_effort"})
     run = simulated(traffic=best_effort, network__options__topics="udp").run()
     assert sum(fate.arrived_ns is not None for fate in run.fates.values()) > 40
 

@@ -30,7 +30,7 @@ def test_a_grid_search_contains_everything_nearby(
     grid = CellGrid(within_m)
     for number, other_m in enumerate(places_m):
         grid.add(number, other_m)
-    numbers = grid.near(place_m)
+    numbers = grid.nearby_indices(place_m)
     assert numbers == sorted(set(numbers))
     expected = {number for number, other_m in enumerate(places_m) if math.dist(other_m[:2], place_m[:2]) <= within_m}
     assert expected <= set(numbers)
@@ -39,7 +39,7 @@ def test_a_grid_search_contains_everything_nearby(
 def test_a_grid_search_omits_distant_numbers() -> None:
     grid = CellGrid(1.0)
     grid.add(0, (100.0, 0.0, 0.0))
-    assert grid.near((0.0, 0.0, 0.0)) == []
+    assert grid.nearby_indices((0.0, 0.0, 0.0)) == []
 
 
 def neighbour_list(bodies: Mapping[str, Body[Any]]) -> Neighbours:

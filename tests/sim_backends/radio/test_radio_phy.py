@@ -112,10 +112,10 @@ def test_far_two_ray_loss_is_40_db_per_decade() -> None:
     """Beyond 4 pi h1 h2 / wavelength (Rappaport, eq. 4.52)."""
     start = np.array([[0, 0, 0.5]] * 2)
     end = np.array([[100, 0, 0.5], [1000, 0, 0.5]])
-    near, far = propagation.two_ray_db(start, end, WIFI_HZ)
-    assert far - near == pytest.approx(40, abs=1)
+    near_db, far_db = propagation.two_ray_db(start, end, WIFI_HZ)
+    assert far_db - near_db == pytest.approx(40, abs=1)
     plane_earth = 40 * math.log10(1000) - 20 * math.log10(0.25)
-    assert far == pytest.approx(plane_earth, abs=1.5)
+    assert far_db == pytest.approx(plane_earth, abs=1.5)
 
 
 def test_free_space_and_log_distance_computed_by_hand() -> None:

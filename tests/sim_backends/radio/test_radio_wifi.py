@@ -193,14 +193,12 @@ def test_below_4_db_the_preamble_is_not_detected() -> None:
 
 @settings(max_examples=25)
 @given(st.integers(0, 2**32), st.lists(st.tuples(st.integers(0, 20_000_000), st.integers(40, 1500)), max_size=40))
-def test_equal_seeds_give_equal_results_in_order_of_time(
-    seed: int, sending_probability: list[tuple[int, int]]
-) -> None:
+def test_equal_seeds_give_equal_results_in_order_of_time(seed: int, sent_frames: list[tuple[int, int]]) -> None:
     def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[("a", "b")]), seed)
         wifi.log_attempts(log.append)
-        for number, (at_ns, size) in enumerate(sorted(sending_probability)):
+        for number, (at_ns, size) in enumerate(sorted(sent_frames)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
         return wifi.deliveries(60 * 10**9), log
 
@@ -249,20 +247,20 @@ def test_received_powers_follow_changes_of_the_channel() -> None:
     wifi: Wifi[str] = Wifi(channel, 1)
     wifi.send(0, "a", "near", 100, None)
     assert len(wifi.deliveries(10**9)) == 1
-    near, channel.rows[0] = channel.rows[0], [0.0, 0.0]
+    row_in_range, channel.rows[0] = channel.rows[0], [0.0, 0.0]
     wifi.send(10**9, "a", "far", 100, None)
     assert wifi.deliveries(2 * 10**9) == []
-    channel.rows[0] = near
+    channel.rows[0] = row_in_range
     wifi.send(2 * 10**9, "a", "near again", 100, None)
     assert [payload for _, _, payload, _, _ in wifi.deliveries(3 * 10**9)] == ["near again"]
 
 
 @settings(max_examples=30)
 @given(st.integers(0, 2**32), st.sets(st.tuples(st.integers(0, 4), st.integers(0, 4)), max_size=6))
-def test_no_station_starts_while_it_detects_a_frame(seed: int, deaf: set[tuple[int, int]]) -> None:
+def test_no_station_starts_while_it_detects_a_frame(seed: int, pairs_without_link: set[tuple[int, int]]) -> None:
     """Of two overlapping frames of stations that are not hidden from each other, the second starts within 4 us."""
     names = "abcde"
-    pairs = [(names[first], names[second]) for first, second in deaf if first != second]
+    pairs = [(names[first], names[second]) for first, second in pairs_without_link if first != second]
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
     hidden = {*pairs, *((second, first) for first, second in pairs)}
@@ -294,11 +292,11 @@ def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) ->
 
 
 def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
-    class Unlinked(FixedPowers):
+    class UnlinkedPowers(FixedPowers):
         def linked(self, transmitter: int, receiver: int) -> bool:
             return False
 
-    wifi: Wifi[int] = Wifi(Unlinked("ab", G54), 1)
+    wifi: Wifi[int] = Wifi(UnlinkedPowers("ab", G54), 1)
     wifi.send(0, "a", 1, 100, "b")
     assert wifi.next_event_ns() is None
     assert wifi.counters()["a", "b"].lost == 1

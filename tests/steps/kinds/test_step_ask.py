@@ -60,7 +60,7 @@ def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None 
 
 
 @pytest.mark.parametrize(
-    ("text", "complaint"),
+    ("text", "message"),
     [
         (f"{GRASS}, unit: m", "they have no unit"),
         (f"{WIND}, choices: [a, b]", "they have no unit"),
@@ -78,8 +78,8 @@ def run_and_view(step: AskStep, folder: Path, operator: ScriptedOperator | None 
         (f"{WIND}, each: day", "'day' is not one of: repeat, trial"),
     ],
 )
-def test_invalid_question_is_refused(text: str, complaint: str) -> None:
-    with pytest.raises(ConfigurationError, match=complaint):
+def test_invalid_question_is_refused(text: str, message: str) -> None:
+    with pytest.raises(ConfigurationError, match=message):
         ask(text)
 
 

@@ -70,7 +70,7 @@ def test_variables_are_filled_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     placement = Placement(Scenario.LOS, Topology.MASTERLESS, Distance(9.144, "30ft"))
     (planned,) = step.jobs(replace(SCENE, placement=placement, repeat=7))
     assert planned.job.argv == (".put/a.run/probe", "--at=30ft", "7", "10.42.0.1")
-    assert planned.program == "sh", "preflight cannot find a program that is not copied yet"
+    assert planned.program == "sh", "a preflight check cannot find a program that is not copied yet"
     assert planned.put is not None
     assert (planned.put.role, planned.put.at, planned.put.program) == (Role.SENDER, ".put/a.run/probe", step.put)
     assert step.files() == ("a.run.txt", "a.sender-run.log"), "the copy is not fetched"

@@ -125,7 +125,7 @@ def test_invalid_keys_are_refused(keys: str, message: str) -> None:
 
 def test_estimates_of_disk_space_and_frames() -> None:
     step = send("size: 3MB")
-    assert [step.bytes_left(SCENE, role) for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)] == [3e6, 3e6, 0.0]
+    assert [step.stored_bytes(SCENE, role) for role in (Role.SENDER, Role.RECEIVER, Role.RELAY)] == [3e6, 3e6, 0.0]
     (flow,) = step.flows(SCENE)
     assert flow.port == 1234
     assert flow.frames == pytest.approx(6 * 3e6 / 8192)

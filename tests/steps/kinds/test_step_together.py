@@ -333,8 +333,12 @@ def load(steps: str) -> Procedure:
     ("steps", "message", "line"),
     [
         ("  - together: {during: [ping: {FLOW}]}", "at least 2 items", 1),
-        (SAME_PORT, "port 1234 is used twice at the same time on receiver; give one another port", 4),
-        (IN_ONE_CAPTURE, "port 1234 is used twice in one capture, from sender to receiver; give one another port", 4),
+        (SAME_PORT, "port 1234 is used twice at the same time on receiver; change the port of one of them", 4),
+        (
+            IN_ONE_CAPTURE,
+            "port 1234 is used twice in one capture, from sender to receiver; change the port of one of them",
+            4,
+        ),
         (TESTS.replace("PORT", "5201"), "port 5201 is used twice at the same time", 4),
         (SENDS.replace("PORT", "1234"), "port 1234 is used twice", 4),
         (FOR_EACH, "port 5201 is used twice in one capture", 6),
@@ -389,6 +393,6 @@ def test_distinguishable_transfers_are_accepted(steps: str) -> None:
 
 
 def test_transfer_cannot_send_a_simultaneous_recording() -> None:
-    beside = "  - together: {during: [record: {robot: relay, topics: [/a], duration: 1s, name: a}, STEP]}"
+    recording = "  - together: {during: [record: {robot: relay, topics: [/a], duration: 1s, name: a}, STEP]}"
     with pytest.raises(ConfigurationError, match="no step before it records on relay"):
-        load(beside.replace("STEP", "transfer: {from: relay, to: sender}"))
+        load(recording.replace("STEP", "transfer: {from: relay, to: sender}"))

@@ -294,7 +294,7 @@ def installed(plan: Plan = PLAN) -> dict[str, CommandResult]:
     }
 
 
-def judged(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
+def judge_all(sections: Sections, plan: Plan = PLAN) -> list[Finding]:
     report = Report(SENDER.name)
     software.judge(plan, Role.SENDER, sections, report)
     return report.findings
@@ -307,7 +307,7 @@ def procedure_of(step: str) -> Procedure:
 
 
 def test_a_robot_that_has_everything_passes() -> None:
-    findings = judged(installed())
+    findings = judge_all(installed())
     assert {finding.status for finding in findings} == {OK}
     tools = "traditional netcat, ping from iputils 20221126, tcpdump version 4.99.3"
     assert only(findings, "tools").detail == tools
@@ -315,7 +315,7 @@ def test_a_robot_that_has_everything_passes() -> None:
 
 def test_a_missing_program_is_one_failure_with_its_package() -> None:
     sections = installed() | {"program nc.traditional": CommandResult("", 1)}
-    (failed,) = [finding for finding in judged(sections) if finding.status is not OK]
+    (failed,) = [finding for finding in judge_all(sections) if finding.status is not OK]
     assert failed.check == "nc.traditional"
     assert failed.remedy == "sudo apt-get install netcat-traditional"
 
@@ -335,14 +335,14 @@ def test_a_missing_program_is_one_failure_with_its_package() -> None:
 def test_a_missing_program_of_a_step_is_reported_with_its_source(step: str, program: str, remedy: str) -> None:
     plan = PLAN.model_copy(update={"procedure": procedure_of(step)})
     sections = installed(plan) | {f"program {program}": CommandResult("", 127)}
-    (failed,) = [finding for finding in judged(sections, plan) if finding.status is not OK]
+    (failed,) = [finding for finding in judge_all(sections, plan) if finding.status is not OK]
     assert (failed.check, failed.remedy) == (program, remedy)
 
 
 def test_a_missing_capture_permission_fails_with_the_command_that_grants_it() -> None:
     result = CommandResult("tcpdump: wlan0: You don't have permission to perform this capture on that device", 1)
     (failed,) = [
-        finding for finding in judged(installed() | {"right to capture": result}) if finding.status is not OK
+        finding for finding in judge_all(installed() | {"right to capture": result}) if finding.status is not OK
     ]
     assert failed.remedy == "sudo setcap cap_net_raw,cap_net_admin+eip $(command -v tcpdump)"
 
@@ -357,7 +357,7 @@ def test_a_missing_sudo_permission_fails_with_the_rule_that_grants_it() -> None:
     ):
         (failed,) = [
             finding
-            for finding in judged(installed(plan) | {"right to capture": output_text}, plan)
+            for finding in judge_all(installed(plan) | {"right to capture": output_text}, plan)
             if finding.status is not OK
         ]
         assert remedy in failed.remedy
@@ -382,7 +382,7 @@ def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
 @pytest.mark.parametrize(
     ("connection", "control", "status", "detail"),
     [
-        ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file says"),
+        ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file states"),
         ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it arrives at 192.168.1.5"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it arrives at 192.168.1.5"),
@@ -401,8 +401,8 @@ def test_the_route_of_ssh_is_detected(connection: str, control: Control, status:
 def test_a_missing_interface_hides_the_check_of_capture_permission(file: str) -> None:
     result = CommandResult("tcpdump: wlan0: No such device exists\n(SIOCGIFHWADDR: No such device)", 1)
     sections = installed() | {"right to capture": result, "interface": output_text(file, 1)}
-    assert "right to capture" not in {finding.check for finding in judged(sections)}
-    findings = judged(sections | {"interface": output_text("ip/6.1.0/up.txt")})
+    assert "right to capture" not in {finding.check for finding in judge_all(sections)}
+    findings = judge_all(sections | {"interface": output_text("ip/6.1.0/up.txt")})
     assert only(findings, "right to capture").status is FAIL
 
 

@@ -318,7 +318,7 @@ def test_a_holder_that_lost_a_robot_is_notified(robot: LocalShell, tmp_path: Pat
     """The holder is also notified if another robot does not answer."""
     plan = plain_plan()
     anna = Holder(plan.session, "anna@one", plan.trial)
-    shells = {Role.SENDER: robot, Role.RECEIVER: Unreachable(tmp_path, robot="abe")}
+    shells = {Role.SENDER: robot, Role.RECEIVER: RobotOutOfRange(tmp_path, robot="abe")}
     with locked({Role.SENDER: robot}, anna, sink=fail_on_event):
         robots = Robots(plan, IdleTestbed(shells))
         robots.require_locks()
@@ -336,49 +336,49 @@ def test_fetched_evidence_is_deleted_after_a_broken_lock(robot: LocalShell) -> N
     assert not (robot.home / FOLDER).exists()
 
 
-class Unreachable(LocalShell):
+class RobotOutOfRange(LocalShell):
     """A robot that goes out of range after a number of commands."""
 
-    left = 0
+    calls_left = 0
 
     def begin(self, argv: object, *, deadline: Deadline, until: bytes | None = None) -> LocalSession:
-        self.left -= 1
-        if self.left < 0:
+        self.calls_left -= 1
+        if self.calls_left < 0:
             raise LinkError("did not answer", where=self.robot)
         return super().begin(argv, deadline=deadline, until=until)  # type: ignore[arg-type]
 
 
 @pytest.fixture
-def cast(tmp_path: Path) -> dict[Role, Unreachable]:
+def cast(tmp_path: Path) -> dict[Role, RobotOutOfRange]:
     shells = {}
     for role, name in ((Role.SENDER, "zoe"), (Role.RECEIVER, "abe")):
         (tmp_path / name).mkdir()
-        shells[role] = Unreachable(tmp_path / name, robot=name)
-        shells[role].left = 100
+        shells[role] = RobotOutOfRange(tmp_path / name, robot=name)
+        shells[role].calls_left = 100
     return shells
 
 
-def test_all_robots_are_locked_or_none(cast: dict[Role, Unreachable]) -> None:
+def test_all_robots_are_locked_or_none(cast: dict[Role, RobotOutOfRange]) -> None:
     with locked({Role.SENDER: cast[Role.SENDER]}, BERT, sink=fail_on_event):
         with pytest.raises(RobotError, match="zoe: bert@two holds it"), locked(cast, ANNA, sink=fail_on_event):
             raise AssertionError("taken")
         assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
 
 
-def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, Unreachable]) -> None:
+def test_a_robot_that_cannot_be_unlocked_is_reported(cast: dict[Role, RobotOutOfRange]) -> None:
     events: list[Event] = []
     with locked(cast, ANNA, sink=events.append):
-        cast[Role.SENDER].left = 0
+        cast[Role.SENDER].calls_left = 0
     (note,) = events
     assert isinstance(note, Note)
     assert note.text.startswith("zoe stays locked until its lock expires")
     assert record(cast[Role.RECEIVER])[0] == "free"
 
 
-def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, Unreachable]) -> None:
+def test_an_unreachable_robot_does_not_prevent_other_aborts(cast: dict[Role, RobotOutOfRange]) -> None:
     with ExitStack() as stack:
         stack.enter_context(locked(cast, ANNA, sink=lambda event: None))
-        cast[Role.RECEIVER].left = 0
+        cast[Role.RECEIVER].calls_left = 0
         link_error = LinkError("did not answer", where="eve")
         results = locks.abort({"abe": cast[Role.RECEIVER], "eve": link_error, "zoe": cast[Role.SENDER]}, "bert@two")
     assert {name: result.error is None for name, result in results.items()} == {
@@ -395,7 +395,7 @@ def test_the_user_of_this_machine_has_a_name() -> None:
     assert machine
 
 
-def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, Unreachable]) -> None:
+def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[Role, RobotOutOfRange]) -> None:
     # A trial without a session uses its name as the token, which may be longer than the name of a socket.
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with locked_exclusively(cast, anna, sink=fail_on_event):
@@ -410,7 +410,7 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
         begin(cast[Role.SENDER], anna)
 
 
-def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Role, Unreachable]) -> None:
+def test_ctrl_c_closes_connections_before_the_robots_are_unlocked(cast: dict[Role, RobotOutOfRange]) -> None:
     """The program must not wait again for a lost link."""
     done: list[str] = []
     for shell in cast.values():

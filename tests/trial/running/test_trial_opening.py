@@ -27,7 +27,7 @@ from tests.helpers.idle_testbed import IdleTestbed
 TESTBED = IdleTestbed()
 
 
-class Nobody:
+class UnusedOperator:
     """An operator that must not be asked."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Any:  # noqa: ANN401 (never returns)
@@ -38,7 +38,7 @@ class Nobody:
 
 
 class Recorder:
-    """A backend that records the use of its testbed; it also replaces preflight, locks and runner.
+    """A backend that records the use of its testbed; it also replaces preflight checks, locks and runner.
 
     Args:
         failing: What raises, by name.
@@ -81,7 +81,7 @@ class Recorder:
         raise AssertionError
 
     def run(self, plans: list[Plan], out: Path) -> list[Outcome | None]:
-        return opening.run(plans, self, CAST, out, sink=self.events.append, operator=Nobody(), stop=Stop())
+        return opening.run(plans, self, CAST, out, sink=self.events.append, operator=UnusedOperator(), stop=Stop())
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
     def make(**failing: BaseException) -> Recorder:
         recording = Recorder(failing)
 
-        def meet(cast: Cast, shells: Shells, sink: Sink) -> None:
+        def connect(cast: Cast, shells: Shells, sink: Sink) -> None:
             assert (cast, shells) == (CAST, TESTBED.shells)
             recording.note("meet")
 
@@ -108,7 +108,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Recorder]:
             recording.note("resume")
             return Outcome(folder, (), 2, 0)
 
-        monkeypatch.setattr(preflight, "connect_all", meet)
+        monkeypatch.setattr(preflight, "connect_all", connect)
         monkeypatch.setattr(locks, "locked_exclusively", lock)
         monkeypatch.setattr(runner, "run_trial", run_trial)
         monkeypatch.setattr(resumption, "resume_trial", resume_trial)
@@ -184,7 +184,7 @@ def test_nothing_is_opened_for_a_folder_that_cannot_be_written(
 
 def resume(recording: Recorder, folder: Path, backend: str = "field") -> Outcome | None:
     return resumption.resume(
-        folder, backend, recording, failed=False, sink=recording.events.append, operator=Nobody(), stop=Stop()
+        folder, backend, recording, failed=False, sink=recording.events.append, operator=UnusedOperator(), stop=Stop()
     )
 
 

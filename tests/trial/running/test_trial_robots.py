@@ -21,7 +21,7 @@ from tests.helpers.sshd import wait_until
 from tests.helpers.userlands import LocalShell
 
 
-class Slow(LocalShell):
+class SlowRobot(LocalShell):
     """A robot that sends its evidence until the connection is closed, and needs a moment to stop."""
 
     def __init__(self, home: Path, fetching: Callable[[], None]) -> None:
@@ -43,7 +43,7 @@ def slow_testbed(home: Path) -> IdleTestbed:
     """Return a testbed of slow robots; the operator presses Ctrl-C while the last one is fetched."""
     barrier = threading.Barrier(2, action=lambda: os.kill(os.getpid(), signal.SIGINT))
     return IdleTestbed(
-        {role: Slow(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
+        {role: SlowRobot(home, lambda: (barrier.wait(60), None)[1]) for role in (Role.SENDER, Role.RECEIVER)}
     )
 
 
@@ -51,17 +51,17 @@ def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: P
     into = tmp_path / "into"
     into.mkdir()
     robots = Robots(plain_plan(), slow_testbed(tmp_path))
-    others = set(threading.enumerate())
+    threads_before = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
         robots.fetch("x", into, clean=True)
     robots.close_connections()
     saved = into.rename(tmp_path / "kept")
-    wait_until(lambda: others.issuperset(threading.enumerate()), Deadline.after(60))
+    wait_until(lambda: threads_before.issuperset(threading.enumerate()), Deadline.after(60))
     assert list(saved.iterdir()) == [], "partially fetched files are removed before the attempt is stored"
     assert not into.exists()
 
 
-class Unreachable(LocalShell):
+class UnreachableRobot(LocalShell):
     """A robot whose link fails whenever it sends its evidence."""
 
     def fetch(self, argv: object, to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
@@ -72,7 +72,7 @@ class Unreachable(LocalShell):
 def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     plan, shells = plain_plan(), {}
     attempts = {name: jobs.work_folder(plan.trial, name) for name in ("udp-01-1", "udp-01-2")}
-    for role, kind in ((Role.SENDER, Unreachable), (Role.RECEIVER, LocalShell)):
+    for role, kind in ((Role.SENDER, UnreachableRobot), (Role.RECEIVER, LocalShell)):
         (home := tmp_path / role).mkdir()
         shells[role] = kind(home)
         jobs.install(shells[role], Deadline.after(60))
@@ -94,7 +94,7 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     assert remaining == {Role.SENDER: ["udp-01-1"], Role.RECEIVER: []}
 
 
-class Rebooted(LocalShell):
+class RebootedRobot(LocalShell):
     """A robot that lost power after the start of an attempt, with the data not yet written to its disk."""
 
     boots = 0
@@ -110,7 +110,9 @@ class Rebooted(LocalShell):
 
 
 def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
-    robots = Robots(plain_plan(), IdleTestbed({role: Rebooted(tmp_path) for role in (Role.SENDER, Role.RECEIVER)}))
+    robots = Robots(
+        plain_plan(), IdleTestbed({role: RebootedRobot(tmp_path) for role in (Role.SENDER, Role.RECEIVER)})
+    )
     robots.begin("x", old=None)
     output_text = robots.fetch("x", tmp_path, clean=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
@@ -121,7 +123,7 @@ def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
     assert sorted(listed) == sorted(["scan.bag: there is no bag", *reasons])
 
 
-class Impatient(LocalShell):
+class InterruptedRobot(LocalShell):
     """A robot whose connection is closed after the first segment of a large file."""
 
     def __init__(self, home: Path) -> None:
@@ -143,7 +145,7 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
     remote, shells = jobs.work_folder(plan.trial, "udp-01-1"), {}
     for role in (Role.SENDER, Role.RECEIVER):
         (home := tmp_path / role).mkdir()
-        shells[role] = Impatient(home)
+        shells[role] = InterruptedRobot(home)
         jobs.install(shells[role], Deadline.after(60))
         evidence.begin(shells[role], remote, role, "lo", need_kib=0)
     (tmp_path / Role.SENDER / remote / "scan.bag").write_bytes(bytes(3 * fetching.PIECE_BYTES))

@@ -63,7 +63,7 @@ ReadNetworkRequest(const std::string& body)
 // Parts of the delay of a packet in the network; the processing in hosts is what remains of it.
 struct DelayParts
 {
-    int64_t queueing_ns = 0;
+    int64_t queuing_ns = 0;
     int64_t transmission_ns = 0;
     int64_t propagation_ns = 0;
 };
@@ -82,7 +82,7 @@ class Outcomes
     void Arrive(uint64_t id, int64_t at_ns, uint32_t agent, const DelayParts& parts)
     {
         Arrive(id, at_ns, agent);
-        m_parts.Put(parts.queueing_ns).Put(parts.transmission_ns).Put(parts.propagation_ns);
+        m_parts.Put(parts.queuing_ns).Put(parts.transmission_ns).Put(parts.propagation_ns);
     }
 
     void Drop(uint64_t id, const std::string& reason)

@@ -33,7 +33,7 @@ MAST_M: Final = (3.0, -2.0, 5.0)
 
 
 @dataclass
-class Spy(Disc):
+class StateRecorder(Disc):
     """A network that records the states that it assumes whenever a packet enters or arrives."""
 
     extrapolates: bool
@@ -80,7 +80,7 @@ def test_no_position_error_exceeds_the_bound(
 ) -> None:
     """The oracle is each motion itself, extrapolated between the steps of the physics."""
     by_name = {name: WayPoints(name, *motion) for name, motion in zip(NAMES, motions, strict=True)}
-    network = Spy(extrapolates, sorted(transmitters), [MAST_M] if mast else [])
+    network = StateRecorder(extrapolates, sorted(transmitters), [MAST_M] if mast else [])
     agents = Agents(Paths([*by_name.values()]), {"a": Periodic("a", "b", period_ns=period_ns)})
     coordinator = Coordinator(agents, network, ErrorBounded(bound_m, 0.2), [("a", "b")])
     try:
@@ -152,7 +152,7 @@ def test_a_jammer_at_a_fixed_position_counts_if_two_robots_move_side_by_side() -
     """Their distance does not change, but their distances from the jammer do."""
     motions = [WayPoints(name, [(0.0, y, 0.0), (9.0, y, 0.0)], 2.0) for name, y in (("a", 0.0), ("b", 1.0))]
     for fixed_m, worst_m in ((), 0.0), ([MAST_M], 0.2):
-        network = Spy(False, (), fixed_m)
+        network = StateRecorder(False, (), fixed_m)
         agents = Agents(Paths(motions), {"a": Periodic("a", "b", period_ns=3 * STEP_NS)})
         run = Coordinator(agents, network, Scheduled(0.1), [("a", "b")]).advance(2000 * STEP_NS)
         assert max(map(position_error_m, run.fates.values())) == pytest.approx(worst_m, abs=0.005)

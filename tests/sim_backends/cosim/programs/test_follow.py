@@ -32,14 +32,16 @@ def state_of(
     return Received(source, State(place_m, velocity_m_s), sent_ns, sent_ns)
 
 
-OWN = State((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+FOLLOWER_STATE = State((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
 
 
 def test_the_state_of_a_leader_is_extrapolated_from_its_time_stamp() -> None:
     """At 5 m and 1 m/s 0.3 s ago it is at 5.3 m, which is 3.3 m more than the desired 2 m at standstill."""
     program = FollowAtHeadway("a", headway_s=0.5, standstill_m=2.0, gain_per_s=0.4)
-    program.wake(0, OWN, [])
-    twist = program.wake(350 * MS, OWN, [state_of((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)]).command
+    program.wake(0, FOLLOWER_STATE, [])
+    twist = program.wake(
+        350 * MS, FOLLOWER_STATE, [state_of((5.0, 0.0, 0.0), (1.0, 0.0, 0.0), sent_ns=50 * MS)]
+    ).command
     acceleration_m_s2 = (1.0 + 0.4 * 3.3) / 0.5
     assert (twist.forward_m_s, twist.turn_rad_s) == pytest.approx((0.05 * acceleration_m_s2, 0.0))
 
@@ -47,20 +49,20 @@ def test_the_state_of_a_leader_is_extrapolated_from_its_time_stamp() -> None:
 def test_older_states_and_other_datagrams_are_ignored() -> None:
     program = FollowAtHeadway("a")
     latest = state_of((5.0, 0.0, 0.0), sent_ns=40 * MS)
-    expected = FollowAtHeadway("a").wake(50 * MS, OWN, [latest])
+    expected = FollowAtHeadway("a").wake(50 * MS, FOLLOWER_STATE, [latest])
     ignored = [
         state_of((9.0, 0.0, 0.0), sent_ns=30 * MS),
         state_of((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
         Received("a", "hello", 50 * MS, 50 * MS),
     ]
-    assert program.wake(50 * MS, OWN, [latest, *ignored]) == expected
+    assert program.wake(50 * MS, FOLLOWER_STATE, [latest, *ignored]) == expected
 
 
 @pytest.mark.parametrize(
     ("place_m", "command"), [((-5.0, 0.0, 0.0), Twist(0.0, 2 * math.pi)), ((0.0, 0.0, 0.0), Twist())]
 )
 def test_it_turns_to_a_leader_behind_it_and_stops_at_one_in_its_position(place_m: Vector, command: Twist) -> None:
-    actual = FollowAtHeadway("a").wake(0, OWN, [state_of(place_m)]).command
+    actual = FollowAtHeadway("a").wake(0, FOLLOWER_STATE, [state_of(place_m)]).command
     assert (actual.forward_m_s, abs(actual.turn_rad_s)) == pytest.approx((command.forward_m_s, command.turn_rad_s))
 
 
@@ -118,10 +120,12 @@ def test_a_drone_that_holds_station_flies_above_the_centre_of_its_leaders() -> N
 
 def test_a_drone_that_holds_station_hovers_without_states() -> None:
     program = HoldStation(["a", "b"], above_m=8.0, gain_per_s=1.0, timeout_ns=S)
-    assert program.wake(0, OWN, []).command == Velocity()
-    velocity = program.wake(50 * MS, OWN, [state_of((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]).command
+    assert program.wake(0, FOLLOWER_STATE, []).command == Velocity()
+    velocity = program.wake(
+        50 * MS, FOLLOWER_STATE, [state_of((2.0, 0.0, -8.0), (0.3, 0.0, 0.0), sent_ns=50 * MS)]
+    ).command
     assert velocity.velocity_m_s == pytest.approx((2.3, 0.0, 0.0))
-    assert program.wake(2 * S, OWN, []).command == Velocity()
+    assert program.wake(2 * S, FOLLOWER_STATE, []).command == Velocity()
 
 
 @pytest.mark.parametrize("wrong", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}])

@@ -110,7 +110,7 @@ def test_a_periodic_program_stops_at_its_stop_time() -> None:
     assert [at_ns for at_ns, _ in packets] == [5 * MS, 15 * MS]
 
 
-class Steering:
+class CommandingProgram:
     """Gives a command at given times, and keeps received datagrams."""
 
     def __init__(self, command: str, *wakes_ns: int) -> None:
@@ -130,7 +130,7 @@ class Steering:
 
 
 def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -> None:
-    first, second = Steering("first", 3, 7), Steering("second", 5, 7)
+    first, second = CommandingProgram("first", 3, 7), CommandingProgram("second", 5, 7)
     program = CombinedProgram([first, second])
     commands = []
     while (wake_ns := program.next_wake_ns()) is not None:
@@ -140,11 +140,14 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
     assert program.wake(9, ORIGIN, received) == Action()
     assert first.received == second.received == received
     # With a fast clock a program may wake later than planned.
-    assert CombinedProgram([Steering("first", 3), Steering("second", 5)]).wake(4, ORIGIN, ()).command == "first"
+    assert (
+        CombinedProgram([CommandingProgram("first", 3), CommandingProgram("second", 5)]).wake(4, ORIGIN, ()).command
+        == "first"
+    )
 
 
 def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() -> None:
-    sends, steers = Periodic("f", "b", period_ns=10), Steering("go", 5, 15, 35)
+    sends, steers = Periodic("f", "b", period_ns=10), CommandingProgram("go", 5, 15, 35)
     program = Outage(CombinedProgram([sends, steers]), 12, 31, "stop")
     actions = []
     while (wake_ns := program.next_wake_ns()) is not None and wake_ns <= 50:

@@ -210,7 +210,7 @@ def test_a_disk_without_space_is_refused_before_the_run(tmp_path: Path, monkeypa
 
 
 def test_the_recording_names_what_failed(tmp_path: Path) -> None:
-    class Failing(EventDriven):
+    class FailingPolicy(EventDriven):
         def next_window(self, situation: Situation) -> int | None:
             return super().next_window(situation) if situation.now_ns < 100 * MS else 1 // 0
 
@@ -218,7 +218,7 @@ def test_the_recording_names_what_failed(tmp_path: Path) -> None:
         pytest.raises(FederateError, match="policy event_driven failed") as raised,
         RunRecorder(tmp_path / "run", ABOUT) as recorder,
     ):
-        passing_robots(recorder, Failing()).advance(MS * 200)
+        passing_robots(recorder, FailingPolicy()).advance(MS * 200)
     recording = read_recording(tmp_path / "run")
     assert (recording.manifest.ending, recording.manifest.why) == (
         RunEnding.FAILED,

@@ -17,7 +17,7 @@ from sim_backends.world.motion import Motion, State, WayPoints
 MS = 1_000_000
 
 
-class Sprint(Motion):
+class LateStart(Motion):
     """Does not move for 4 s, and then moves at 2 m/s; it accelerates at its limit."""
 
     end_ns = None
@@ -31,7 +31,7 @@ class Sprint(Motion):
 
 
 def sprint(policy: SyncPolicy) -> Run:
-    physics = Paths([Sprint(), WayPoints("b", [(9.0, 3.0, 0.0)], 1.0)], limits_m_s2={"a": 4.0})
+    physics = Paths([LateStart(), WayPoints("b", [(9.0, 3.0, 0.0)], 1.0)], limits_m_s2={"a": 4.0})
     agents = Agents(physics, {"a": Periodic("a", "b", period_ns=2_300_001)})
     return Coordinator(agents, Disc(100.0, 10, extrapolates=True), policy, [("a", "b")]).advance(5_000 * MS)
 

@@ -106,7 +106,7 @@ def test_the_share_of_packets_with_another_fate_at_the_range_limit_is_proportion
         assert errors.order("fates").value == pytest.approx(1.0, abs=0.1), name
 
 
-class Chased:
+class CommandedMotion:
     """A stationary body, and one that moves at the last commanded velocity, in steps of 10 us."""
 
     step_ns = STEP_NS
@@ -126,7 +126,7 @@ class Chased:
         }
 
 
-class Faster:
+class AcceleratingProgram:
     """Increases its speed by 1 mm/s for every received datagram."""
 
     def __init__(self) -> None:
@@ -141,8 +141,13 @@ class Faster:
 
 
 def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordinator:
-    programs: dict[str, Program] = {"lead": Periodic("lead", "chaser", period_ns=500_000), "chaser": Faster()}
-    return Coordinator(Agents(physics or Chased(), programs), Disc(100.0, 100_000), policy, [("lead", "chaser")])
+    programs: dict[str, Program] = {
+        "lead": Periodic("lead", "chaser", period_ns=500_000),
+        "chaser": AcceleratingProgram(),
+    }
+    return Coordinator(
+        Agents(physics or CommandedMotion(), programs), Disc(100.0, 100_000), policy, [("lead", "chaser")]
+    )
 
 
 def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_order() -> None:
@@ -158,7 +163,7 @@ def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> 
     """As with solvers of differential equations. The mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
 
     def tracks(policy: SyncPolicy) -> Tracks:
-        sampled = SampledPhysics(Chased(), 50 * MS)
+        sampled = SampledPhysics(CommandedMotion(), 50 * MS)
         chase(policy, sampled).advance(1000 * MS)
         return sampled.tracks
 
@@ -184,7 +189,7 @@ def test_windows_of_several_runs_are_pooled() -> None:
 SHARED: list[int] = []
 
 
-class Disturbed(Disc):
+class SharedDelayNetwork(Disc):
     """A network whose delay depends on data that all copies share."""
 
     def __init__(self) -> None:
@@ -201,8 +206,8 @@ class Disturbed(Disc):
 
 def test_data_that_is_not_copied_is_detected() -> None:
     def make(policy: SyncPolicy) -> Coordinator:
-        agents = Agents(Chased(), {"lead": Periodic("lead", "chaser", period_ns=MS)})
-        return Coordinator(agents, Disturbed(), policy, [("lead", "chaser")])
+        agents = Agents(CommandedMotion(), {"lead": Periodic("lead", "chaser", period_ns=MS)})
+        return Coordinator(agents, SharedDelayNetwork(), policy, [("lead", "chaser")])
 
     with pytest.raises(FieldkitError, match="a fork changed the run"):
         local_errors(make, {"scheduled": Scheduled}, (0.01,), [10 * MS, 20 * MS], tail_ns=5 * MS)

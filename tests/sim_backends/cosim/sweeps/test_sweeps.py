@@ -225,6 +225,17 @@ def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
     assert {row["window_s"] for row in csv.DictReader(some.out.splitlines())} == {"0.013"}
 
 
+@pytest.mark.parametrize("between", ["window=7ms,13ms", "window_s=0.007,0.013"])
+def test_two_values_with_units_are_compared_in_both_forms(lab: Path, between: str) -> None:
+    done = run_here(lab, "compare", "sweep", "--between", between, "--format", "csv")
+    assert done.code == 0, done.err
+    rows = list(csv.DictReader(done.out.splitlines()))
+    assert {(row["flow"], row["policy"], row["n_a"], row["n_b"]) for row in rows} == {
+        ("pose/b", "scheduled", "2", "2"),
+        ("pose/b", "sliding_window", "2", "2"),
+    }
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -240,9 +251,29 @@ def test_a_wrong_comparison_of_two_settings_is_explained(lab: Path, options: tup
     assert (done.code, message in done.err) == (2, True), done.err
 
 
-def test_a_report_has_heat_maps_over_two_factors(lab: Path) -> None:
-    done = run_here(lab, "report", "sweep", "-o", "sweep.html")
+def test_a_report_of_many_settings_has_heat_maps_in_the_order_of_numbers(lab: Path) -> None:
+    factors = ("radio.loss=20%,0%,10%,5%", "window=13ms,7ms")
+    command = ("cosim", "sweep", "pair.yaml", "--set", "policy.name=scheduled", "--over", *factors, "--seeds", "1")
+    assert run_here(lab, *command, "--jobs", "1", "-o", "many").code == 0
+    done = run_here(lab, "report", "many", "-o", "many.html")
     assert done.code == 0, done.err
-    page = (lab / "sweep.html").read_text(encoding="utf-8")
+    page = (lab / "many.html").read_text(encoding="utf-8")
+    assert "<h1>Sweep over radio_loss and window</h1>" in page
     assert 'id="map-added_delay_mean_s"' in page
-    assert re.search(r"policy scheduled, window_s 0\.013: \d", page), "values for screen readers"
+    (words,) = re.findall(r'aria-label="added delay, mean, pose/b[^"]*"', page)  # for screen readers
+    cells = [(loss, window) for window in ("7ms", "13ms") for loss in ("0%", "5%", "10%", "20%")]
+    assert re.findall(r"radio_loss (\S+), window (\S+): \d", words) == cells
+    assert "Figures with a line or a strip per setting are left out" in page
+    assert 'id="strips"' not in page
+    aggregated = run_here(lab, "aggregate", "many", "--quantity", "byte_loss", "--format", "csv")
+    values = [row["radio_loss_value"] for row in csv.DictReader(aggregated.out.splitlines())]
+    assert values == [value for value in ("0", "0.05", "0.1", "0.2") for _ in range(2)]
+
+
+def test_factors_with_units_are_numbers() -> None:
+    words = ["radio.loss=2%,10%", "traffic.0.rate=1kHz,10Hz", "radio.tx_power=-3dBm,20dBm", "agents.a.along=-5m,5m"]
+    loss, rate, power, along = parse_factors(words)
+    assert loss.numbers == ("radio_loss_value", "1", (0.02, 0.1))
+    assert rate.numbers == ("traffic_0_rate_hz", "Hz", (1000, 10))
+    assert power.numbers == ("radio_tx_power_dbm", "dBm", (-3, 20))
+    assert along.numbers is None, "the value of a column in metres is not negative"

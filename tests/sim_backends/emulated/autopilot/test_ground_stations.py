@@ -26,7 +26,7 @@ LOSS = "0.05"
 
 
 @pytest.fixture
-def up() -> Iterator[EmulatedTestbed]:
+def emulation() -> Iterator[EmulatedTestbed]:
     with testbed.bring_up(
         EmulatedBackend(None, None).cast(Topology.MASTER),
         options=EmulatedOptions(radio=RadioOptions(fading=False)),
@@ -38,38 +38,40 @@ def up() -> Iterator[EmulatedTestbed]:
         yield robots
 
 
-def fly(up: EmulatedTestbed, program: str) -> dict[str, Any]:
+def fly(emulation: EmulatedTestbed, program: str) -> dict[str, Any]:
     """Let a program on the sender's robot fly the drone; return its report."""
-    drone = up.robots[Role.RELAY].spec
-    carried = up.medium.stats().ports[drone.name].read
+    drone = emulation.robots[Role.RELAY].spec
+    carried = emulation.medium.stats().ports[drone.name].read
     words = (sys.executable, "-m", f"tests.helpers.{program}", drone.ip, str(drone.mavlink_port), LOSS)
     argv = ("env", f"PYTHONPATH={ROOT}", *words)
-    result = up.shells[Role.SENDER].run(argv, deadline=Deadline.after(240))
-    assert up.medium.stats().ports[drone.name].read - carried > 100
-    log = up.shells[Role.RELAY].run(("cat", "/run/robot/autopilot.log"), deadline=Deadline.after(10))
+    result = emulation.shells[Role.SENDER].run(argv, deadline=Deadline.after(240))
+    assert emulation.medium.stats().ports[drone.name].read - carried > 100
+    log = emulation.shells[Role.RELAY].run(("cat", "/run/robot/autopilot.log"), deadline=Deadline.after(10))
     assert log.stdout == b""
-    seen: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])
-    assert max(seen["nearest_m"]) < 0.5
-    return seen
+    report: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])
+    assert max(report["nearest_m"]) < 0.5
+    return report
 
 
 def test_mavsdk_flies_a_mission_of_three_points_although_every_twentieth_datagram_is_lost(
-    up: EmulatedTestbed,
+    emulation: EmulatedTestbed,
 ) -> None:
-    seen = fly(up, "mavsdk_flight")
-    assert seen["items"] == 3
-    assert 90 <= seen["battery"] < 100.1
+    report = fly(emulation, "mavsdk_flight")
+    assert report["items"] == 3
+    assert 90 <= report["battery"] < 100.1
     # The lab recorded the same flight, down to the ground below its last corner.
 
-    flown_m = [point.position_m for point in up.oracle.track(0) if point.role is Role.RELAY and point.position_m]
+    flown_m = [
+        point.position_m for point in emulation.oracle.track(0) if point.role is Role.RELAY and point.position_m
+    ]
     (east_m, north_m, up_m), last_m = flown_m[0], flown_m[-1]
     assert max(point[2] for point in flown_m) - up_m == pytest.approx(1.0, abs=0.2)
     assert min(math.dist(point[:2], (east_m + 2.0, north_m + 2.0)) for point in flown_m) < 0.5
     assert math.dist(last_m, (east_m, north_m + 2.0, up_m)) < 0.6
 
 
-def test_mavproxy_flies_a_mission_although_every_twentieth_datagram_is_lost(up: EmulatedTestbed) -> None:
-    seen = fly(up, "mavproxy_flight")
-    assert seen["height_m"] < 0.2
+def test_mavproxy_flies_a_mission_although_every_twentieth_datagram_is_lost(emulation: EmulatedTestbed) -> None:
+    report = fly(emulation, "mavproxy_flight")
+    assert report["height_m"] < 0.2
     for words in ("Loaded 4 waypoints in ", "COMPONENT_ARM_DISARM: ACCEPTED", "DISARMED"):
-        assert words in seen["output"]
+        assert words in report["output"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sim_backends.emulated.cosimulated.steering import Steering
+from sim_backends.emulated.cosimulated.steering import Command, GroundSteering
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
 from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
 from sim_backends.emulated.robot.spec import ANTENNA_M
@@ -30,10 +30,10 @@ def record(driven: Driven) -> Iterator[CommandedRecord]:
     record.close()
 
 
-def placed(driven: Driven) -> tuple[Steering, int]:
+def placed(driven: Driven) -> tuple[GroundSteering, int]:
     """Return the steering of a robot at its place, and the time of its placement."""
     start_ns = time.monotonic_ns()
-    steering = Steering(driven.descriptors, start_ns)
+    steering = GroundSteering(driven.descriptors, start_ns)
     assert steering.poll_placement(start_ns) is not None
     return steering, start_ns
 
@@ -41,7 +41,7 @@ def placed(driven: Driven) -> tuple[Steering, int]:
 def test_a_simulation_that_lags_applies_every_velocity_at_its_time(driven: Driven, record: CommandedRecord) -> None:
     """It lags by 200 ms, more than the interval of the velocities, 50 ms: each is read before it applies."""
     steering, start_ns = placed(driven)
-    applied: list[tuple[int, Twist]] = []
+    applied: list[tuple[int, Command]] = []
     for command in range(1, 21):
         at_ns = start_ns + 50 * MS * command
         record.write(Commanded(at_ns, 0.01 * command, 0.0))

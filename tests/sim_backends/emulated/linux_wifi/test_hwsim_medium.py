@@ -70,14 +70,14 @@ def results(medium: HwsimMedium, now_ns: int = START_NS) -> Iterator[tuple[int, 
 
 def receivers(medium: HwsimMedium) -> tuple[list[bytes], bool]:
     """Return the radios that received the frame on the air, and True if it was acknowledged."""
-    found, acknowledged = [], False
+    radios, acknowledged = [], False
     for command, attributes in results(medium):
         if command == CMD_FRAME:
-            found.append(attributes[1])
+            radios.append(attributes[1])
         else:
             assert command == CMD_TX_INFO_FRAME
             acknowledged = bool(struct.unpack("=I", attributes[4])[0] & FLAG_ACKNOWLEDGED)
-    return found, acknowledged
+    return radios, acknowledged
 
 
 def test_a_frame_is_passed_to_its_receiver_before_it_is_acknowledged() -> None:

@@ -27,7 +27,7 @@ PLACE = {"do": "place", "positions": {"r1": [0, 0, 1], "r2": [3, 0, 1]}, "veloci
 
 
 class PairedKernel:
-    """The program's end of a socket pair, on which a test plays the kernel."""
+    """The program's end of a socket pair; a test writes to the other end as the kernel does."""
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
@@ -47,7 +47,7 @@ class PairedKernel:
         return list(decode_messages(datagram))
 
 
-class Owner:
+class MediumOwner:
     """The owner of a medium: sends requests, and messages as the kernel does."""
 
     def __init__(self, kernel: socket.socket, requests: int, replies: int) -> None:
@@ -70,16 +70,18 @@ class Owner:
 
 
 @contextmanager
-def running() -> Iterator[Owner]:
+def running() -> Iterator[MediumOwner]:
     """Run a medium in a thread; it must exit when its requests end."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.settimeout(DEADLINE_S)
-    theirs.setblocking(False)
+    socket_here, program_socket = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    socket_here.settimeout(DEADLINE_S)
+    program_socket.setblocking(False)
     request_read, request_write = os.pipe()
     reply_read, reply_write = os.pipe()
-    thread = threading.Thread(target=serve, args=(PairedKernel(theirs), RequestLines(request_read), reply_write))
+    thread = threading.Thread(
+        target=serve, args=(PairedKernel(program_socket), RequestLines(request_read), reply_write)
+    )
     thread.start()
-    owner = Owner(ours, request_write, reply_read)
+    owner = MediumOwner(socket_here, request_write, reply_read)
     try:
         yield owner
     finally:
@@ -89,8 +91,8 @@ def running() -> Iterator[Owner]:
         owner.close()
         for fd in (request_read, reply_read, reply_write):
             os.close(fd)
-        ours.close()
-        theirs.close()
+        socket_here.close()
+        program_socket.close()
 
 
 def test_a_frame_passes_through_the_program() -> None:
@@ -159,7 +161,7 @@ def read_all(lines: RequestLines) -> list[bytes]:
 
 
 @pytest.mark.skipif(Path("/sys/module/mac80211_hwsim").exists(), reason="this kernel has loaded hwsim")
-def test_without_hwsim_the_program_says_how_to_load_it() -> None:
+def test_without_hwsim_the_error_names_the_command_that_loads_it() -> None:
     argv = (sys.executable, "-m", "sim_backends.emulated.linux_wifi.medium_program")
     result = subprocess.run(argv, input="", capture_output=True, text=True, timeout=DEADLINE_S, check=False)
     assert result.returncode == 2

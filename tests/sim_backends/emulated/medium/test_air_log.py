@@ -17,7 +17,7 @@ from fieldkit.measure.captures import pcap
 from sim_backends.emulated.medium import air_log
 from sim_backends.emulated.medium.air_log import AirLog
 from sim_backends.emulated.medium.medium_client import MediumClient
-from sim_backends.radio.frames import TransmissionAttempt
+from sim_backends.radio.frames import ControlFrame, TransmissionAttempt
 from sim_backends.radio.modes import G_MODES
 from sim_backends.radio.radio_options import RadioOptions
 from tests.helpers.known_radio import make_lab
@@ -57,6 +57,20 @@ def test_a_retry_is_marked_and_long_frames_are_cut(tmp_path: Path) -> None:
     first, second = rdpcap(str(paths[0]))
     assert ("retry" in first[Dot11].FCfield, "retry" in second[Dot11].FCfield) == (False, True)
     assert (first.wirelen, len(first)) == (1532, 160)
+
+
+def test_control_frames_have_their_type_and_addresses(tmp_path: Path) -> None:
+    paths = [tmp_path / air_log.PCAP, tmp_path / air_log.CSV]
+    log = AirLog([os.open(path, os.O_WRONLY | os.O_CREAT) for path in paths], ("a", "b"))
+    frames_sent: tuple[tuple[ControlFrame, int], ...] = (("RTS", 20), ("CTS", 14), ("ACK", 14))
+    for control, size_bytes in frames_sent:
+        log.write(TransmissionAttempt(1000, 51_000, "a", "b", G_MODES[0], size_bytes, 0, ("b",), None, control))
+    log.close()
+    frames = rdpcap(str(paths[0]))
+    assert [(frame.type, frame.subtype, frame.addr1) for frame in frames] == [
+        (1, subtype, MAC["b"]) for subtype in (11, 12, 13)
+    ]
+    assert frames[0].addr2 == MAC["a"]
 
 
 @pytest.fixture

@@ -18,10 +18,10 @@ from sim_backends.emulated.medium.framing import IP as BARE
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.radio.radio_options import RadioOptions
 
-OWN = IPv4Interface("10.42.0.1/24")
-OTHERS = {"b": IPv4Interface("10.42.0.2/24"), "c": IPv4Interface("10.42.0.3/24")}
+OWN_ADDRESS = IPv4Interface("10.42.0.1/24")
+OTHER_ADDRESSES = {"b": IPv4Interface("10.42.0.2/24"), "c": IPv4Interface("10.42.0.3/24")}
 MACS = {"a": "02:00:0a:2a:00:01", "b": "02:00:0a:2a:00:02", "c": "02:00:0a:2a:00:03"}
-ADDRESSES = {"a": OWN, **OTHERS}
+ADDRESSES = {"a": OWN_ADDRESS, **OTHER_ADDRESSES}
 RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
@@ -43,8 +43,8 @@ def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
 def test_a_bare_packet_goes_to_its_destination_address(to: str, expected: str | None) -> None:
     packet = bytes(IP(src="10.42.0.1", dst=to) / UDP())
     assert BARE.carries(packet)
-    assert BARE.destination(packet, BARE.routes(OWN, OTHERS)) == expected
-    assert BARE.destination(packet, BARE.routes(OWN, {})) == NO_ROBOT
+    assert BARE.destination(packet, BARE.routes(OWN_ADDRESS, OTHER_ADDRESSES)) == expected
+    assert BARE.destination(packet, BARE.routes(OWN_ADDRESS, {})) == NO_ROBOT
     assert not BARE.carries(bytes(IPv6()))
 
 
@@ -62,8 +62,8 @@ def test_a_frame_goes_to_the_next_hop_with_any_payload(to: str, expected: str | 
     for inner in (IP(dst="10.42.0.3"), IPv6(dst="ff02::1:6"), ARP()):
         frame = bytes(Ether(dst=to, src=MACS["a"]) / inner)
         assert ETHERNET.carries(frame)
-        assert ETHERNET.destination(frame, ETHERNET.routes(OWN, OTHERS)) == expected
-        assert ETHERNET.destination(frame, ETHERNET.routes(OWN, {})) == NO_ROBOT
+        assert ETHERNET.destination(frame, ETHERNET.routes(OWN_ADDRESS, OTHER_ADDRESSES)) == expected
+        assert ETHERNET.destination(frame, ETHERNET.routes(OWN_ADDRESS, {})) == NO_ROBOT
 
 
 def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
@@ -77,7 +77,7 @@ def test_the_packet_in_a_frame_is_found_by_its_type() -> None:
 
 @given(st.binary(min_size=1, max_size=40), st.ip_addresses(v=4))
 def test_any_bytes_are_handled(frame: bytes, address: IPv4Address) -> None:
-    routes = ETHERNET.routes(OWN, {"x": IPv4Interface(address)})
+    routes = ETHERNET.routes(OWN_ADDRESS, {"x": IPv4Interface(address)})
     assert not ETHERNET.carries(frame) or len(frame) >= 14
     assert ETHERNET.destination(frame, routes) in {None, NO_ROBOT, "x"}
 

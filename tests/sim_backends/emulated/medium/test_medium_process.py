@@ -239,12 +239,12 @@ def test_loss_has_the_set_value(bench: Bench) -> None:
 def test_lateness_of_the_medium_is_reported(bench: Bench) -> None:
     medium, spaces = bench("{loss: 0%, delay: 1500ms, rate: unlimited}")
     medium.place(PLACES)
-    pinging = spaces["a"].start("ping", "-n", "-c", "1", ADDRESSES["b"])
+    request = spaces["a"].start("ping", "-n", "-c", "1", ADDRESSES["b"])
     until(lambda: medium.stats().links["a", "b"].sent == 1, "the request is on the air")
     os.kill(medium.pid, signal.SIGSTOP)
     assert ping(spaces["b"], ADDRESSES["a"], "-W", "2", count=1) == [], "the medium is stopped"
     os.kill(medium.pid, signal.SIGCONT)
-    pinging.communicate(timeout=LONG_S)
+    request.communicate(timeout=LONG_S)
     late = medium.stats().late
     assert sum(late.values()) >= 2
     # Two seconds, of which 1.5 s were the request's own.

@@ -71,10 +71,10 @@ def test_only_solids_at_the_laser_s_height_end_a_beam() -> None:
 
 
 def test_surfaces_out_of_reach_are_infinite_and_the_nearer_one_hides_the_other() -> None:
-    near = LaserTarget(((2.0, -9.0), (2.0, 9.0), (2.1, 0.0)), 0.0, 0.0, 2.0)
-    far = LaserTarget(((3.0, -9.0), (3.0, 9.0), (3.1, 0.0)), 0.0, 0.0, 2.0)
-    assert ranges_m([far, near], (0.0, 0.0, 0.2), 0.0, BEAMS, 3.5)[0] == pytest.approx(2.0)
-    assert ranges_m([far], (0.0, 0.0, 0.2), 0.0, BEAMS, 2.5)[0] == math.inf
+    near_target = LaserTarget(((2.0, -9.0), (2.0, 9.0), (2.1, 0.0)), 0.0, 0.0, 2.0)
+    far_target = LaserTarget(((3.0, -9.0), (3.0, 9.0), (3.1, 0.0)), 0.0, 0.0, 2.0)
+    assert ranges_m([far_target, near_target], (0.0, 0.0, 0.2), 0.0, BEAMS, 3.5)[0] == pytest.approx(2.0)
+    assert ranges_m([far_target], (0.0, 0.0, 0.2), 0.0, BEAMS, 2.5)[0] == math.inf
 
 
 @pytest.mark.parametrize("name", ["lawn", "baylands"])
@@ -85,8 +85,8 @@ def test_beams_end_where_the_radio_s_paths_enter_a_solid(name: str) -> None:
     targets = laser_targets(world)
     numbers = np.random.default_rng(1)
     hits = missed = 0
-    near = [part.shape.centre_m[:2] for part in world.parts for _ in range(max(1, 40 // len(world.parts)))]
-    for east_m, north_m in (np.array(near) + numbers.normal(0, 6, (len(near), 2))).tolist():
+    near_target = [part.shape.centre_m[:2] for part in world.parts for _ in range(max(1, 40 // len(world.parts)))]
+    for east_m, north_m in (np.array(near_target) + numbers.normal(0, 6, (len(near_target), 2))).tolist():
         start = np.tile((east_m, north_m, 0.2), (BEAMS, 1))
         if solids.depths_m(start[:1], np.add(start[:1], (0, 0, 1e-6))).any():
             continue  # in a solid

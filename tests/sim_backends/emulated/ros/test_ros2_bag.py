@@ -86,8 +86,8 @@ def robots() -> Iterator[Robots]:
     # Debian's ROS is for robots with ROS 1; these get the built-in recorder anyway.
     with testbed.bring_up(
         cast, options=EmulatedOptions(), world=load_world("lawn"), ros=RosChoice.DEBIAN, seed=1
-    ) as up:
-        yield {name: up.shells[role] for role, name in distributions.items()}
+    ) as emulation:
+        yield {name: emulation.shells[role] for role, name in distributions.items()}
 
 
 def record(

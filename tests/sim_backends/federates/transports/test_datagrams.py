@@ -50,10 +50,10 @@ class Network:
     def __init__(self, server: int, forward: Forward) -> None:
         self.forward = forward
         self.count = 0
-        self._near, self._far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
-        self._near.bind(("127.0.0.1", 0))
-        self._far.connect(("127.0.0.1", server))
-        self.port = self._near.getsockname()[1]
+        self._client_side, self._server_side = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        self._client_side.bind(("127.0.0.1", 0))
+        self._server_side.connect(("127.0.0.1", server))
+        self.port = self._client_side.getsockname()[1]
         self._client: Any = None
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -61,23 +61,23 @@ class Network:
 
     def _run(self) -> None:
         while not self._stopped.is_set():
-            for side in select.select([self._near, self._far], [], [], 0.05)[0]:
+            for side in select.select([self._client_side, self._server_side], [], [], 0.05)[0]:
                 with suppress(OSError):
                     datagram, peer = side.recvfrom(65536)
                     self.count += 1
-                    if side is self._near:
+                    if side is self._client_side:
                         self._client = peer
-                    for forwarded in self.forward(datagram, side is self._near):
-                        if side is self._near:
-                            self._far.send(forwarded)
+                    for forwarded in self.forward(datagram, side is self._client_side):
+                        if side is self._client_side:
+                            self._server_side.send(forwarded)
                         else:
-                            self._near.sendto(forwarded, self._client)
+                            self._client_side.sendto(forwarded, self._client)
 
     def stop(self) -> None:
         self._stopped.set()
         self._thread.join()
-        self._near.close()
-        self._far.close()
+        self._client_side.close()
+        self._server_side.close()
 
 
 def unchanged(datagram: bytes, _: bool) -> list[bytes]:
@@ -114,38 +114,38 @@ def connected(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChannel, Ne
             accepted: list[FrameChannel] = []
             thread = threading.Thread(target=lambda: accepted.append(listener.accept(after_s(30))), daemon=True)
             thread.start()
-            near = UdpAddress("udp", "127.0.0.1", network.port).connect(after_s(30))
-            near.send(hello, after_s(30))
+            federate_end = UdpAddress("udp", "127.0.0.1", network.port).connect(after_s(30))
+            federate_end.send(hello, after_s(30))
             while thread.is_alive():
                 with suppress(DeadlineError):
-                    near.receive(after_s(0.05))
-            with closing(near), closing(accepted[0]) as far:
-                assert far.receive(after_s(30)).body == b"8 bytes."
-                yield near, far, network
+                    federate_end.receive(after_s(0.05))
+            with closing(federate_end), closing(accepted[0]) as coordinator_end:
+                assert coordinator_end.receive(after_s(30)).body == b"8 bytes."
+                yield federate_end, coordinator_end, network
     finally:
         network.stop()
 
 
-def exchange(near: FrameChannel, far: FrameChannel, bodies: list[bytes]) -> None:
+def exchange(federate_end: FrameChannel, coordinator_end: FrameChannel, bodies: list[bytes]) -> None:
     """Send each body from both sides, as request and answer."""
 
     def answer() -> None:
         for body in bodies:
-            assert far.receive(after_s(60)).body == body
-            far.send(encode(MessageKind.STATES, 1, 0, body), after_s(60))
+            assert coordinator_end.receive(after_s(60)).body == body
+            coordinator_end.send(encode(MessageKind.STATES, 1, 0, body), after_s(60))
         # The last answer is resent until it is acknowledged; the network may lose the end of the connection.
         with suppress(ClosedError):
             while not closed.is_set():
                 with suppress(DeadlineError):
-                    far.receive(after_s(0.1))
+                    coordinator_end.receive(after_s(0.1))
 
     closed = threading.Event()
     thread = threading.Thread(target=answer, daemon=True)
     thread.start()
     for body in bodies:
-        near.send(encode(MessageKind.PING, 1, 0, body), after_s(60))
-        assert near.receive(after_s(60)).body == body
-    near.close()
+        federate_end.send(encode(MessageKind.PING, 1, 0, body), after_s(60))
+        assert federate_end.receive(after_s(60)).body == body
+    federate_end.close()
     closed.set()
     thread.join(60)
     assert not thread.is_alive()
@@ -156,30 +156,30 @@ def test_lost_repeated_and_reordered_datagrams_change_nothing(seed: int) -> None
     draws = random.Random(seed)
     bodies = [draws.randbytes(draws.choice((0, 8, 700, 1160, 5000))) for _ in range(15)]
     bodies += [draws.randbytes(100_000)]  # more than the window
-    with connected(lossy(seed)) as (near, far, network):
-        exchange(near, far, bodies)
+    with connected(lossy(seed)) as (federate_end, coordinator_end, network):
+        exchange(federate_end, coordinator_end, bodies)
         assert network.count > 2 * len(bodies)
 
 
 def test_an_answer_acknowledges_the_request_so_that_an_exchange_has_two_datagrams() -> None:
-    with connected(unchanged) as (near, far, network):
-        near._timer.interval_s = far._timer.interval_s = 10.0  # type: ignore[attr-defined]
+    with connected(unchanged) as (federate_end, coordinator_end, network):
+        federate_end._timer.interval_s = coordinator_end._timer.interval_s = 10.0  # type: ignore[attr-defined]
         before = network.count
-        exchange(near, far, [bytes(700)] * 20)
+        exchange(federate_end, coordinator_end, [bytes(700)] * 20)
         assert network.count - before <= 40 + 6
 
 
 def test_datagrams_of_other_programs_are_ignored() -> None:
-    with connected(unchanged) as (near, far, network):
-        header = DatagramHeader(DatagramKind.DATA, near._identity[0], 12345, near._number)  # type: ignore[attr-defined]
+    with connected(unchanged) as (federate_end, coordinator_end, network):
+        header = DatagramHeader(DatagramKind.DATA, federate_end._identity[0], 12345, federate_end._number)  # type: ignore[attr-defined]
         forged = [pack_datagram(header, b"forged"), b"", b"garbage" * 20, pack_datagram(header)[:30]]
-        close = DatagramHeader(DatagramKind.CLOSE, near._identity[0], 0, near._number)  # type: ignore[attr-defined]
+        close = DatagramHeader(DatagramKind.CLOSE, federate_end._identity[0], 0, federate_end._number)  # type: ignore[attr-defined]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
             for datagram in (*forged, pack_datagram(close)):
                 other.sendto(datagram, ("127.0.0.1", network.port))
-                other.sendto(datagram, far._socket.getsockname())  # type: ignore[attr-defined]
-        network._client = near._socket.getsockname()  # type: ignore[attr-defined]
-        exchange(near, far, [b"8 bytes."])
+                other.sendto(datagram, coordinator_end._socket.getsockname())  # type: ignore[attr-defined]
+        network._client = federate_end._socket.getsockname()  # type: ignore[attr-defined]
+        exchange(federate_end, coordinator_end, [b"8 bytes."])
 
 
 def test_only_a_program_that_returns_the_cookie_of_its_address_is_accepted() -> None:
@@ -208,18 +208,18 @@ def test_only_a_program_that_returns_the_cookie_of_its_address_is_accepted() -> 
 
 
 def test_the_other_process_has_exited_or_closed() -> None:
-    with connected(unchanged) as (near, far, _):
-        far.close()
+    with connected(unchanged) as (federate_end, coordinator_end, _):
+        coordinator_end.close()
         with pytest.raises(ClosedError):
-            near.receive(after_s(20))
+            federate_end.receive(after_s(20))
 
 
 def test_a_process_that_exits_is_noticed_by_the_refusal_of_its_machine() -> None:
-    own, peer = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+    sender, peer = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     peer.bind(("127.0.0.1", 0))
-    own.connect(peer.getsockname())
+    sender.connect(peer.getsockname())
     peer.close()
-    channel = datagrams.DatagramChannel(own, 1, 2)
+    channel = datagrams.DatagramChannel(sender, 1, 2)
     with pytest.raises(ClosedError, match="the connection was closed"):
         channel.receive(after_s(20))
     channel.close()

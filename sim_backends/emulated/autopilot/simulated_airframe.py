@@ -1,0 +1,99 @@
+"""The drone of an autopilot on the co-simulation: a physics moves it, and the autopilot records its commands."""
+
+from typing import Final
+
+from typing_extensions import override
+
+from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe
+from sim_backends.emulated.ros.flight_records import FlightCommand, FlightCommandRecord, FlightMotion, FlightRecord
+from sim_backends.physics.body import Velocity
+from sim_backends.physics.quadrotor import FlightPose, Quadrotor, QuadrotorLimits
+
+_LATEST_NS: Final = 100_000_000
+"""Longest extrapolation of a state of the physics, which records one every 10 ms."""
+
+
+class SimulatedAirframe(Airframe):
+    """A drone that a physics moves, as `Airframe`.
+
+    On the ground its rotors turn without thrust until it climbs. Before its first flight from a place it is where
+    the lab has put it.
+
+    Args:
+        limits: Limits of the airframe.
+        place_m: Position of its lowest point in the world, which is also home.
+        facing_rad: Heading.
+        now_ns: Time of this state.
+        commands: Record of the autopilot's commands.
+        flown: Record of the flight by the physics.
+        path_start_ns: Start of the assigned path that put it at its place.
+    """
+
+    def __init__(
+        self,
+        limits: QuadrotorLimits,
+        place_m: Vector,
+        facing_rad: float,
+        now_ns: int,
+        *,
+        commands: FlightCommandRecord,
+        flown: FlightRecord,
+        path_start_ns: int,
+    ) -> None:
+        super().__init__(limits, place_m, facing_rad, (), now_ns)
+        self._commands = commands
+        self._flown = flown
+        self._path_start_ns = path_start_ns
+        self._is_off = False
+
+    @override
+    def step(self, target_m_s: Vector, limits: QuadrotorLimits, yaw_rad: float | None = None) -> None:
+        self.now_ns += STEP_NS
+        self._sense()
+        if not self.driven or (self.on_ground and target_m_s[2] <= 0):
+            self._switch_off()
+            return
+        target = Quadrotor(limits, self.place_m).target(Velocity(target_m_s, yaw_rad))
+        self._command(target, limits, powered=True)
+
+    @override
+    def rest(self, now_ns: int) -> None:
+        super().rest(now_ns)
+        self._sense()
+        if not self._is_off:
+            self._switch_off()
+
+    def _switch_off(self) -> None:
+        self._command(Velocity(), self._limits, powered=False)
+
+    def _command(self, target: Velocity, limits: QuadrotorLimits, *, powered: bool) -> None:
+        self._is_off = not powered
+        self._commands.write(
+            FlightCommand(
+                self.now_ns,
+                self._path_start_ns,
+                powered,
+                target.velocity_m_s,
+                target.yaw_rad,
+                limits.acceleration_m_s2,
+                limits.climb_m_s2,
+            )
+        )
+
+    def _sense(self) -> None:
+        """Read the state of the physics, and extrapolate it to the present; there is none before the first flight."""
+        flight = self._flown.read()
+        if flight is None or flight.path_start_ns != self._path_start_ns:
+            return
+        self.on_ground, self.turn_rad_s = flight.is_supported, flight.turn_rad_s
+        self._pose = FlightPose(
+            self._extrapolated_m(flight), flight.velocity_m_s, flight.roll_rad, flight.pitch_rad, flight.heading_rad
+        )
+
+    def _extrapolated_m(self, flight: FlightMotion) -> Vector:
+        if flight.is_supported:
+            return flight.place_m
+        elapsed_s = min(max(self.now_ns - flight.time_ns, 0), _LATEST_NS) / 1e9
+        (e, n, u), (v_e, v_n, v_u) = flight.place_m, flight.velocity_m_s
+        return e + v_e * elapsed_s, n + v_n * elapsed_s, u + v_u * elapsed_s

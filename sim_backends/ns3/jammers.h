@@ -1,0 +1,83 @@
+// Jammers of a scenario: noise in the whole channel. YansWifiChannel carries frames only, so the noise is added to each
+// radio as a signal that is no frame: ns-3's interference model adds it to the interference of frames, and its energy
+// detection (-62 dBm) to the carrier sense.
+
+#ifndef FIELDKIT_JAMMERS_H
+#define FIELDKIT_JAMMERS_H
+
+#include "stations.h"
+
+#include "ns3/interference-helper.h"
+#include "ns3/wifi-phy.h"
+
+namespace fieldkit
+{
+
+// Access to what ns-3 reserves for its radios.
+class RadioAccess : public WifiPhy
+{
+  public:
+    static void AddNoise(WifiPhy& phy, Time duration, double power_w)
+    {
+        RxPowerWattPerChannelBand powers;
+        powers[phy.GetBand(kWidthMhz)] = power_w;
+        (phy.*&RadioAccess::m_interference)->AddForeignSignal(duration, powers);
+        (phy.*&RadioAccess::SwitchMaybeToCcaBusy)(nullptr);
+    }
+
+  private:
+    static constexpr uint16_t kWidthMhz = 20;
+};
+
+class Jammers
+{
+  public:
+    Jammers(const std::vector<Station>& stations, const Channel& channel, double noise_dbm)
+        : m_stations(stations),
+          m_channel(channel),
+          m_negligible_dbm(noise_dbm - 40)
+    {
+    }
+
+    // Emit noise from a time on, until another one; `place` returns false if the jammer is absent.
+    void Add(double power_dbm, Time from, Time until, std::function<bool(Point&)> place)
+    {
+        Simulator::Schedule(from - Simulator::Now(), [this, power_dbm, until, place] { Emit(power_dbm, until, place); });
+    }
+
+  private:
+    // Power is constant for this time, in which a robot hardly moves.
+    static constexpr int64_t kSliceNs = 1'000'000;
+
+    void Emit(double power_dbm, Time until, const std::function<bool(Point&)>& place)
+    {
+        Time slice = std::min(NanoSeconds(kSliceNs), until - Simulator::Now());
+        Point at;
+        if (slice.IsZero() || slice.IsNegative())
+        {
+            return;
+        }
+        if (place(at))
+        {
+            for (const Station& station : m_stations)
+            {
+                Vector here = station.mobility->GetPosition();
+                double received_dbm = power_dbm - m_channel.MeanLossDb(at, {here.x, here.y, here.z});
+                if (received_dbm > m_negligible_dbm)
+                {
+                    auto device = DynamicCast<WifiNetDevice>(station.device);
+                    RadioAccess::AddNoise(*device->GetPhy(), slice, std::pow(10, received_dbm / 10 - 3));
+                }
+            }
+        }
+        Simulator::Schedule(slice, [this, power_dbm, until, place] { Emit(power_dbm, until, place); });
+    }
+
+    const std::vector<Station>& m_stations;
+    const Channel& m_channel;
+    double m_negligible_dbm;
+};
+
+} // namespace fieldkit
+
+#endif

@@ -1,0 +1,100 @@
+"""Rate control by the firmware of a radio, as an envelope: it is not published and differs between versions.
+
+Most robots have such a radio: brcmfmac (FullMAC, Raspberry Pi) and ath10k select rates in firmware, iwlwifi in its
+firmware or its driver. The model has what they have in common, with two parameters. The firmware measures the signal
+of the peer's frames, and after each interval selects the fastest mode that has at most 10 % of errors with a margin
+below that signal. If fewer than half of an interval's frames were acknowledged, it selects a mode one step slower; if
+more than 90 % were, it goes one of these steps back. Each further attempt for a frame is one step slower than the
+last.
+
+To bound a result, compare a margin of 0 dB and a short interval with 10 dB and a long interval.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Final
+
+from sim_backends.radio.error_rates import packet_error
+from sim_backends.radio.frames import decibel
+from sim_backends.radio.modes import WifiMode
+from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.rate_control import RateControl
+
+_REFERENCE_BYTES: Final = 1200
+_TARGET_ERROR: Final = 0.1
+_STEP_DOWN_BELOW, _STEP_UP_ABOVE = 0.5, 0.9
+_LOWEST_DB, _HIGHEST_DB, _PRECISION_DB = -10.0, 60.0, 0.01
+
+
+class FirmwareRate(RateControl):
+    """Rate control of one link.
+
+    Args:
+        modes: The available modes.
+        signal_to_noise_db: Returns the ratio of the peer's signal to the noise in 20 MHz at a time in ns.
+        margin_db: Margin below the measured signal.
+        interval_ns: Time between two selections.
+    """
+
+    def __init__(
+        self,
+        modes: Sequence[WifiMode],
+        signal_to_noise_db: Callable[[int], float],
+        *,
+        margin_db: float,
+        interval_ns: int,
+    ) -> None:
+        self._ladder = ladder(modes)
+        self._required_db = [required_db(mode) for mode in self._ladder]
+        self._signal_to_noise_db = signal_to_noise_db
+        self._margin_db = margin_db
+        self._interval_ns = interval_ns
+        self._next_ns = 0
+        self._rung = self._steps_down = 0
+        self._frames = self._acknowledged = 0
+
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:  # noqa: ARG002 (see RateControl)
+        """Implement `RateControl.choose`."""
+        if attempt == 1 and now_ns >= self._next_ns:
+            self._select(now_ns)
+        return self._ladder[max(self._rung - self._steps_down - (attempt - 1), 0)]
+
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:  # noqa: ARG002 (see RateControl)
+        """Implement `RateControl.report`."""
+        self._frames += attempts
+        self._acknowledged += acknowledged
+
+    def _select(self, now_ns: int) -> None:
+        self._next_ns = now_ns + self._interval_ns
+        usable_db = self._signal_to_noise_db(now_ns) - self._margin_db
+        self._rung = max(sum(required <= usable_db for required in self._required_db) - 1, 0)
+        if self._frames:
+            share = self._acknowledged / self._frames
+            self._frames = self._acknowledged = 0
+            if share < _STEP_DOWN_BELOW:
+                self._steps_down += 1
+            elif share > _STEP_UP_ABOVE:
+                self._steps_down -= 1
+        self._steps_down = min(max(self._steps_down, 0), self._rung)
+
+
+def ladder(modes: Sequence[WifiMode]) -> tuple[WifiMode, ...]:
+    """Return the modes that no other mode equals or exceeds in both rate and robustness, slowest first."""
+    rungs: list[WifiMode] = []
+    for mode in sorted(modes, key=lambda mode: (required_db(mode), -mode.rate_bit_s)):
+        if not rungs or mode.rate_bit_s > rungs[-1].rate_bit_s:
+            rungs.append(mode)
+    return tuple(rungs)
+
+
+@cache
+def required_db(mode: WifiMode) -> float:
+    """Return the ratio of signal to noise in 20 MHz at which 10 % of frames of 1200 bytes are corrupted."""
+    low_db, high_db = _LOWEST_DB, _HIGHEST_DB
+    while high_db - low_db > _PRECISION_DB:
+        middle_db = (low_db + high_db) / 2
+        if packet_error(mode, middle_db - decibel(mode.noise_factor), _REFERENCE_BYTES) > _TARGET_ERROR:
+            low_db = middle_db
+        else:
+            high_db = middle_db
+    return high_db

@@ -1,0 +1,152 @@
+"""A drone whose autopilot flies it in a physics: a flight to a wall, a fall without power, and a lost autopilot."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Vector
+from sim_backends.emulated.autopilot.autopilot import Autopilot
+from sim_backends.emulated.autopilot.flight import SetPoint
+from sim_backends.emulated.autopilot.mavlink_server import DroneMotionReporter, PhysicsFiles, simulated_airframe
+from sim_backends.emulated.autopilot.modes import Mode
+from sim_backends.emulated.autopilot.px4 import PX4
+from sim_backends.emulated.autopilot.vehicle import Vehicle
+from sim_backends.emulated.cosimulated.simulators import RobotBody
+from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
+from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.emulated.ros.flight_records import FlightMotion, FlightRecord
+from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.physics.body import GRAVITY_M_S2
+from sim_backends.physics.ground import Ground
+from sim_backends.physics.quadrotor import DUCKIEDRONE
+from sim_backends.world.world import load_world
+from tests.helpers.cosim_benches import PLACES, CosimBench, Driven, cosim_bench
+from tests.helpers.ground_station import LIMITS
+
+pytestmark = pytest.mark.emulated
+
+DRONE = RobotBody("duckiedrone", DUCKIEDRONE)
+START_M: Vector = (2.5, 18.0, 0.0)
+WALL_M = 3.9
+"""East of its start, the lawn's wall begins here; it is 2 m high."""
+HEIGHT_M = 1.0
+
+
+@dataclass
+class Drone:
+    """An autopilot whose drone is in a physics.
+
+    Attributes:
+        bench: The bench.
+        autopilot: The autopilot.
+        reporter: Its placements.
+    """
+
+    bench: CosimBench
+    autopilot: Autopilot
+    reporter: DroneMotionReporter
+
+    @property
+    def vehicle(self) -> Vehicle:
+        return self.autopilot.vehicle
+
+    def fly(self, until: Callable[[], bool], limit_s: float = 60.0) -> None:
+        """Run the autopilot as its process does, until something has happened."""
+        deadline = Deadline.after(limit_s)
+        while not until():
+            assert not deadline.expired, f"{self.vehicle.mode} at {self.vehicle.body.place_m}"
+            self.reporter.read_placement(time.monotonic_ns())
+            list(self.autopilot.advance(time.monotonic_ns()))
+            time.sleep(0.02)
+
+    def take_off(self) -> None:
+        self.fly(lambda: self.vehicle.body.place_m == START_M)
+        self.vehicle.arm()
+        self.vehicle.take_off(HEIGHT_M)
+        self.fly(lambda: self.vehicle.mode is Mode.LOITER)
+
+    def flight(self) -> FlightMotion:
+        """Return the motion that the physics recorded last."""
+        record = FlightRecord.open(self.bench.driven.folder / "flown")
+        try:
+            flight = record.read()
+        finally:
+            record.close()
+        assert flight is not None
+        return flight
+
+    def fall(self) -> list[FlightMotion]:
+        """Return the recorded motion until it has landed, without the autopilot."""
+        flights, deadline = [self.flight()], Deadline.after(30)
+        while not (flights[-1].is_supported and flights[-1].velocity_m_s == (0.0, 0.0, 0.0)):
+            assert not deadline.expired, flights[-1]
+            time.sleep(0.005)
+            if (flight := self.flight()) != flights[-1]:
+                flights.append(flight)
+        return flights
+
+
+@contextmanager
+def drone(folder: Path, physics: str) -> Iterator[Drone]:
+    place_m = (*START_M[:2], ANTENNA_M)
+    places_m: dict[str, Vector] = {**PLACES, "a": place_m}
+    driven = Driven.make(folder / "a", "flight_command", "flown")
+    with cosim_bench(
+        folder, physics=physics, world=load_world("lawn"), places_m=places_m, driven=driven, body=DRONE
+    ) as bench:
+        now_ns = time.monotonic_ns()
+        motion = MotionReporter(driven.folder / "motion", driven.folder / "steered", now_ns)
+        files = PhysicsFiles(driven.folder / "flight_command", driven.folder / "flown")
+        autopilot = Autopilot(
+            firmware=PX4,
+            system=1,
+            limits=LIMITS,
+            airframe_limits=DUCKIEDRONE,
+            obstacles=Ground(None, None).around,
+            now_ns=now_ns,
+            make_airframe=simulated_airframe("duckiedrone", files, motion),
+        )
+        yield Drone(bench, autopilot, DroneMotionReporter(autopilot, motion, ANTENNA_M))
+
+
+@pytest.mark.parametrize("physics", ["kinematic", "mujoco"])
+def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_path: Path) -> None:
+    """Its rotors stop `TIMEOUT_NS` after the last command, and it falls for sqrt(2 h / g)."""
+    with drone(tmp_path, physics) as flown:
+        flown.take_off()
+        vehicle = flown.vehicle
+        assert vehicle.body.place_m == pytest.approx((*START_M[:2], HEIGHT_M), abs=0.15)
+        nearest_m = WALL_M - DUCKIEDRONE.radius_m
+
+        def push() -> bool:
+            vehicle.accept_set_point(SetPoint((1.0, 0.0, 0.0), is_place=False))
+            return vehicle.body.place_m[0] > nearest_m - 0.03
+
+        push()
+        vehicle.change_mode(Mode.OFFBOARD)
+        flown.fly(push)
+        end_ns = time.monotonic_ns() + 500_000_000
+        flown.fly(lambda: not push() or time.monotonic_ns() > end_ns)
+        assert time.monotonic_ns() > end_ns, "it stays at the wall"
+        assert vehicle.body.place_m[0] < nearest_m + 0.02
+        assert not vehicle.body.on_ground
+
+        last_ns = time.monotonic_ns()
+        flights = flown.fall()
+        contact = next(flight for flight in flights if flight.is_supported)
+        fall_s = math.sqrt(2 * flights[0].place_m[2] / GRAVITY_M_S2)
+        assert (contact.time_ns - last_ns - TIMEOUT_NS) / 1e9 == pytest.approx(fall_s, abs=0.1)
+        assert max(-flight.velocity_m_s[2] for flight in flights) == pytest.approx(GRAVITY_M_S2 * fall_s, rel=0.15)
+        assert flights[-1].place_m[2] == pytest.approx(0.0, abs=0.005)
+
+        flown.bench.driven.assign((*START_M[:2], ANTENNA_M))
+        flown.bench.medium.place({**PLACES, "a": (*START_M[:2], ANTENNA_M)})
+        flown.fly(lambda: not vehicle.armed)
+        assert vehicle.body.place_m == START_M
+        flown.take_off()
