@@ -94,6 +94,10 @@ class GuestLab:
         """Implement `Lab.overview`; it is computed here, because the machine is slow."""
         return self._draw({name: self.place_m(name) for name in self.members})
 
+    def lateness(self) -> None:
+        """Implement `Lab.lateness`: the lab has no co-simulation."""
+        return
+
     def _state(self, name: str) -> RobotState:
         state = self._request("state", unpack_state)
         return next(robot for robot in state.robots if robot.name == name)
