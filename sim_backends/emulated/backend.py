@@ -1,11 +1,12 @@
 """The emulated backend: the robots of a site file, or the robots of the paper, in namespaces on this machine."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS, Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
@@ -90,16 +91,54 @@ class EmulatedBackend:
                 where=document.where(("robots", LAPTOP_NAME)) if document else "",
                 remedy="give the robot another name",
             )
+        if site.control is Control.RADIO and self._options.has_linux_wifi:
+            raise ConfigurationError(
+                "with `wifi: linux`, the operator's laptop has no radio",
+                where=document.where(("control",)) if document else "",
+                remedy="remove control: radio",
+            )
         self._addresses = dict(zip(site.robots, hosts, strict=False))
 
     @property
     def simulators(self) -> Mapping[str, str]:
         """Implement `Simulating.simulators`."""
+        if self._options.has_linux_wifi:
+            from sim_backends.emulated.linux_wifi import virtual_machine  # noqa: PLC0415 (other labs need none of it)
+
+            clock = {CLOCK: INSTRUCTIONS} if virtual_machine.clock_counts_instructions() else {}
+            return {"wifi": "linux", **clock}
         if not self._options.is_cosimulated:
             return {}
         from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
 
         return simulator_choice.summary(self._options)
+
+    @property
+    def must_relocate(self) -> bool:
+        """Implement `Relocating.must_relocate`: the Wi-Fi of Linux needs radios of hwsim in this kernel."""
+        if not self._options.has_linux_wifi:
+            return False
+        from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
+
+        return not radios.runs_here()
+
+    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
+        """Implement `Relocating.run_elsewhere` by a virtual machine."""
+        from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
+
+        return guest.run_command(argv, results, radios=len(self._site.robots))
+
+    def use_wifi(self, kind: str) -> None:
+        """Implement `ChoosesWifi.use_wifi`."""
+        self._options = self._options.with_wifi(kind)
+
+    def _site_of_guest(self) -> dict[str, object]:
+        """Return the content of a site file for this lab."""
+        content = dict(self._document.data) if self._document is not None else {}
+        emulated = content.get("emulated") or {}
+        assert isinstance(emulated, dict)
+        site = self._site.model_dump(mode="json", exclude_defaults=True)
+        return site | {"backend": "emulated", "emulated": emulated | {"wifi": self._options.wifi}}
 
     @property
     def lab_bytes(self) -> int:
@@ -176,6 +215,14 @@ class EmulatedBackend:
         if self._site.control is Control.RADIO:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
+        if self.must_relocate:
+            from sim_backends.emulated.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
+
+            sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
+            draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
+            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, draw=draw) as lab:
+                yield lab
+            return
         ros = self._checked_ros(members)
         _check_bridges(members, ros)
         self._note_simulators(sink)
@@ -231,17 +278,20 @@ class EmulatedBackend:
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:
+            purposes = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
             texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
-            sink(Note(f"the robots run on the co-simulation: {', '.join(texts)}"))
+            sink(Note(f"{purposes} {', '.join(texts)}"))
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""
         from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
 
-        variants = self._options.robots
+        has_linux_wifi, variants = self._options.has_linux_wifi, self._options.robots
         robot_variants = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for options in robot_variants for program in options.programs()} | mesh)
+        wifi = {"hostapd", "iw", "nft", "wpa_supplicant"} if has_linux_wifi else set()
+        programs = {program for options in robot_variants for program in options.programs()}
+        requirements.check(programs | mesh | wifi, needs_tun=not has_linux_wifi)
         return requirements.ros_in_use(self._options.ros)
 
 
