@@ -105,7 +105,7 @@ def test_a_robot_that_real_ros_drives_stops_at_the_wall(tmp_path: Path) -> None:
             listed = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
             return float(listed["robots"][0]["place_m"][0])
 
-        wait_until(lambda: east_m() > 3.78, Deadline.after(90))
+        wait_until(lambda: east_m() > 3.786, Deadline.after(90))
         assert east_m() == pytest.approx(3.787, abs=0.002)
         record = "timeout -s INT 60 rosbag record -q -l 5 -O wall.bag /odom /scan >/dev/null 2>&1; base64 wall.bag"
         (tmp_path / "wall.bag").write_bytes(b64decode(fieldkit(tmp_path, "lab", "shell", "robot-1", record).out))
