@@ -246,7 +246,7 @@ def robot_spec(
     is_ros2 = profile_ros is not None and profile_ros.variant == "ros2"
     ros2_over_radio = _ros2_spec(robots, robot, options)
     has_debian_ros1 = ros is RosChoice.DEBIAN and profile_ros is not None and not is_ros2
-    mavlink, limits = mavlink_of(robot.profile) if options.has_autopilots else None, robot.profile.limits
+    mavlink, limits = mavlink_of(robot.profile), robot.profile.limits
     has_laser = any(topic.type == LASER_SCAN for topic in robot.profile.topics)
     return RobotSpec(
         name=robot.name,

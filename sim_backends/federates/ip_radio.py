@@ -71,8 +71,9 @@ class IpRadio:
         *,
         packet: PacketIdentity | None = None,
         before: Delay = 0,  # noqa: ARG002 (see RadioModel)
+        dscp: int = 0,  # noqa: ARG002
     ) -> None:
-        """Implement `RadioModel.send`."""
+        """Implement `RadioModel.send`; a federate has one access category."""
         if destination is not None:
             receivers, protocol, identity = [destination], UNICAST, packet or payload.identity
         else:
