@@ -107,7 +107,7 @@ def count_first_attempts(result: Outcome) -> int:
 
 def test_the_noise_of_a_jammer_follows_from_the_path_loss() -> None:
     """Each of seven attempts is lost with the packet error p of the SNR, so p^7 of the packets are lost."""
-    ratio_db, n, size_bytes = 3.98, 300, 1400
+    ratio_db, n, size_bytes = 3.98, 150, 1400
     signal_dbm = ANTENNA.tx_power_dbm - loss_db(20)
     noise_mw = 10 ** ((signal_dbm - ratio_db) / 10) - 10 ** (IN_THE_OPEN.noise_floor_dbm / 10)
     jammer = Jammer(10 * math.log10(noise_mw) + loss_db(100), 0, place_m=(120.0, 0.0, 1.0))

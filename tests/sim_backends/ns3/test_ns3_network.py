@@ -32,7 +32,7 @@ from tests.helpers.federate_pairs import children, now_s
 from tests.helpers.ns3_pair import RELAYED, SCENARIO, reasons, stream
 
 TCP = {"kind": "stream", "name": "log", "from": "bob", "to": "ann", "rate": "50Hz", "size_bytes": 5000}
-SATURATED_S = 0.3
+SATURATED_S = 0.2
 
 Simulated = Callable[..., Simulation]
 
