@@ -101,7 +101,26 @@ def test_hidden_stations_collide_in_rts_and_not_in_data() -> None:
         data = [attempt for attempt in log if attempt.number]
         share = sum(bool(attempt.received) for attempt in data) / len(data)
         assert share > 0.97 if threshold == 0 else share < 0.7
+        # The CTS keeps the hidden station silent during the data, unless it has sent RTS at the time of the CTS.
+        spans = {(attempt.start_ns, attempt.end_ns) for attempt in data}
+        starts = [attempt.start_ns for attempt in log if attempt.control == "RTS"]
+        overlaps = sum(any(begin < start_ns < end for begin, end in spans) for start_ns in starts)
+        assert overlaps < 0.1 * len(starts) or threshold is None
     assert rates[0] > 1.2 * rates[None]
+
+
+def test_a_station_that_has_heard_another_cts_does_not_answer_an_rts() -> None:
+    """r hears the CTS of y, but not the data of x to y; a hears neither."""
+    wifi: Wifi[int] = Wifi(Protecting("arxy", G_MODES[0], deaf=[("a", "x"), ("a", "y"), ("r", "x")]), 1)
+    log: list[TransmissionAttempt] = []
+    wifi.log_attempts(log.append)
+    wifi.send(0, "x", 0, 1500, "y")
+    wifi.send(500_000, "a", 1, 1500, "r")
+    assert len(wifi.deliveries(10**9)) == 2
+    first_data = next(attempt for attempt in log if attempt.number)
+    assert first_data.transmitter == "x"
+    during = [attempt for attempt in log if first_data.start_ns < attempt.start_ns < first_data.end_ns]
+    assert {(attempt.control, attempt.transmitter) for attempt in during} == {("RTS", "a")}
 
 
 def test_frames_up_to_the_threshold_are_sent_without_rts() -> None:
