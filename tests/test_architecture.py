@@ -246,7 +246,14 @@ def test_backends_import_only_the_seams() -> None:
         seams = COMMAND_SEAMS if str(path.relative_to(ROOT)).startswith(COMMANDS) else ()
         if name.startswith("fieldkit."):
             assert package_name(name) in {"core", "config", "backends", "remote", "agent"} or name.startswith(
-                ("fieldkit.lab.protocol", "fieldkit.lab.robots", *ROS_SEAMS, *seams)
+                (
+                    "fieldkit.lab.folder",
+                    "fieldkit.lab.protocol",
+                    "fieldkit.lab.requests",
+                    "fieldkit.lab.robots",
+                    *ROS_SEAMS,
+                    *seams,
+                )
             ), f"{path} imports {name}"
 
 
@@ -384,6 +391,7 @@ FEDERATE_SEAMS = {
     "sim_backends/cosim/scenario/external.py": {
         "frames",
         "handshake",
+        "ip_radio",
         "named",
         "protocols",
         "remote",

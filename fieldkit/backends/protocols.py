@@ -251,6 +251,12 @@ class Attended(Protocol):
         ...
 
 
+CLOCK: Final = "clock"
+"""Purpose of the simulator of time, in `Simulating.simulators`."""
+INSTRUCTIONS: Final = "instructions"
+"""A clock that counts the instructions of a processor in software: times are no durations."""
+
+
 class Backend(Protocol):
     """A source of robots, created from the lab's site file: `Backend(site, document)`.
 
@@ -315,11 +321,36 @@ class Simulating(Protocol):
     """Optional capability of a `Backend` whose robots run on simulators.
 
     Attributes:
-        simulators: What each simulator is, by its purpose: `physics`, `network`, and `sync`, the policy between them.
-            Empty if there are none.
+        simulators: What each simulator is, by its purpose: `physics`, `network`, and `sync`, the policy between them;
+            `wifi`; `CLOCK`. Empty if there are none.
     """
 
     simulators: Mapping[str, str]
+
+
+@runtime_checkable
+class Relocating(Protocol):
+    """Optional capability of a `Backend` that may have to run commands of fieldkit in a virtual machine."""
+
+    @property
+    def must_relocate(self) -> bool:
+        """True if commands that use robots cannot run in this process."""
+        ...
+
+    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
+        """Run a command line of fieldkit elsewhere.
+
+        Args:
+            argv: The words after `fieldkit`.
+            results: Folder that the command may change; it is created. Other changes may be lost.
+
+        Returns:
+            Its exit code.
+
+        Raises:
+            FieldkitError: It cannot run.
+        """
+        ...
 
 
 def simulators_of(backend: Backend) -> dict[str, str]:

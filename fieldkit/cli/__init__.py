@@ -96,6 +96,7 @@ def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOpti
     """Parse and run the command. Print any error that stops it, and return its exit code."""
     try:
         arguments = top.parse_args(argv)
+        arguments.words = tuple(sys.argv[1:] if argv is None else argv)
         options.read(arguments)
         return _run(arguments)
     except FieldkitError as error:

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, TextIO
 
-from fieldkit.backends.protocols import Backend
+from fieldkit.backends.protocols import Backend, Relocating
 from fieldkit.backends.registry import load_backend
 from fieldkit.cli.sites import backend_name, lab_site
 from fieldkit.cli.terminal import Terminal
@@ -70,6 +70,29 @@ def _open_answers(path: str) -> TextIO:
         raise ConfigurationError(
             f"the answers cannot be read: {error.strerror}", where=path, remedy="correct --answers"
         ) from error
+
+
+def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
+    """Run this command line where the backend must run it; return its exit code, or None to run it here.
+
+    Args:
+        chosen: The backend.
+        arguments: The arguments of the command.
+        results: Folder of the results.
+
+    Raises:
+        ConfigurationError: The command would write a file outside of that folder.
+    """
+    if not isinstance(chosen, Relocating) or not chosen.must_relocate:
+        return None
+    junit: Path | None = getattr(arguments, "junit", None)
+    if junit is not None and not junit.resolve().is_relative_to(results.resolve()):
+        raise ConfigurationError(
+            f"with these robots, only files below {results} can be written",
+            where="--junit",
+            remedy=f"write for example --junit {results / junit.name}",
+        )
+    return chosen.run_elsewhere(arguments.words, results)
 
 
 def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:

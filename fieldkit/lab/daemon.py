@@ -171,7 +171,7 @@ def _serve(client: socket.socket, robots: Lab, start_s: float) -> None:
                 case "state":
                     client.sendall(_state(robots, time.monotonic() - start_s))
                 case "overview":
-                    client.sendall(requests.pack_overview(robots.overview()))
+                    client.sendall(_overview(robots))
                 case "move":
                     client.sendall(_move(robots, *arguments.split(" ", 1)))
         except (OSError, TypeError, ValueError):
@@ -198,6 +198,14 @@ def _move(robots: Lab, name: str, to: str) -> bytes:
         if name not in robots.members:
             raise unknown_robot(name, robots.members)
         return requests.pack_place(robots.move(name, requests.unpack_destination(to)))
+    except FieldkitError as error:
+        return requests.pack_error(error)
+
+
+def _overview(robots: Lab) -> bytes:
+    """Return the plan view of the lab, or the error of a lab that has lost a process."""
+    try:
+        return requests.pack_overview(robots.overview())
     except FieldkitError as error:
         return requests.pack_error(error)
 

@@ -142,7 +142,11 @@ class Lab(Protocol):
         ...
 
     def overview(self) -> Overview:
-        """Return the plan view with the current positions of the robots."""
+        """Return the plan view with the current positions of the robots.
+
+        Raises:
+            FieldkitError: The positions are unknown, because a process of the lab has failed.
+        """
         ...
 
     def lateness(self) -> LabLateness | None:
@@ -171,6 +175,19 @@ class LabBackend(Protocol):
 
         Raises:
             ConfigurationError: A profile is missing or invalid.
+        """
+        ...
+
+
+@runtime_checkable
+class ChoosesWifi(Protocol):
+    """Optional capability of a `LabBackend` with several kinds of Wi-Fi."""
+
+    def use_wifi(self, kind: str) -> None:
+        """Use a kind of Wi-Fi, `model` or `linux`.
+
+        Raises:
+            ConfigurationError: The site file excludes it.
         """
         ...
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS
 from fieldkit.core.columns import Column, Measured, cell, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness, RepeatId
@@ -17,6 +18,9 @@ from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import PlacedStep
 from fieldkit.trial.step_errors import StepErrors
+
+_TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
+_NO_TIMES: Final = "its clock counts the instructions of a processor in software"
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     # The robots' states are judged first, because their problems cause many of the others.
     problems = list(hosts.problems(plan.procedure, scene, evidence, step_errors))
     lateness = evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
+    timeless = plan.simulators.get(CLOCK) == INSTRUCTIONS
     measured = oracle_delays.measure_lateness(lateness) | oracle_delays.measure_window_lateness(lateness)
     for role in link.ROLES:
         measured |= link.measure(role, evidence.links(role))
@@ -75,6 +80,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
             if placement_problem:
                 dependent = {name: placement_problem for name in result.values if position_columns.is_dependent(name)}
                 result = result.without(dependent)
+            if timeless:
+                result = result.without({column.name: _NO_TIMES for column in columns if column.unit in _TIME_UNITS})
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 (see the docstring)

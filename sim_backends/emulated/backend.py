@@ -1,11 +1,12 @@
 """The emulated backend: the robots of a site file, or the robots of the paper, in namespaces on this machine."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from fieldkit.backends.protocols import Cast, Robot, Testbed
+from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS, Cast, Robot, Testbed
 from fieldkit.backends.registry import cast_of
 from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
@@ -90,16 +91,54 @@ class EmulatedBackend:
                 where=document.where(("robots", LAPTOP_NAME)) if document else "",
                 remedy="give the robot another name",
             )
+        if site.control is Control.RADIO and self._options.has_linux_wifi:
+            raise ConfigurationError(
+                "with `wifi: linux`, the operator's laptop has no radio",
+                where=document.where(("control",)) if document else "",
+                remedy="remove control: radio",
+            )
         self._addresses = dict(zip(site.robots, hosts, strict=False))
 
     @property
     def simulators(self) -> Mapping[str, str]:
         """Implement `Simulating.simulators`."""
+        if self._options.has_linux_wifi:
+            from sim_backends.emulated.linux_wifi import virtual_machine  # noqa: PLC0415 (other labs need none of it)
+
+            clock = {CLOCK: INSTRUCTIONS} if virtual_machine.clock_counts_instructions() else {}
+            return {"wifi": "linux", **clock}
         if not self._options.is_cosimulated:
             return {}
         from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)
 
         return simulator_choice.summary(self._options)
+
+    @property
+    def must_relocate(self) -> bool:
+        """Implement `Relocating.must_relocate`: the Wi-Fi of Linux needs radios of hwsim in this kernel."""
+        if not self._options.has_linux_wifi:
+            return False
+        from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
+
+        return not radios.runs_here()
+
+    def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
+        """Implement `Relocating.run_elsewhere` by a virtual machine."""
+        from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
+
+        return guest.run_command(argv, results, radios=len(self._site.robots))
+
+    def use_wifi(self, kind: str) -> None:
+        """Implement `ChoosesWifi.use_wifi`."""
+        self._options = self._options.with_wifi(kind)
+
+    def _site_of_guest(self) -> dict[str, object]:
+        """Return the content of a site file for this lab."""
+        content = dict(self._document.data) if self._document is not None else {}
+        emulated = content.get("emulated") or {}
+        assert isinstance(emulated, dict)
+        site = self._site.model_dump(mode="json", exclude_defaults=True)
+        return site | {"backend": "emulated", "emulated": emulated | {"wifi": self._options.wifi}}
 
     @property
     def lab_bytes(self) -> int:
@@ -129,7 +168,7 @@ class EmulatedBackend:
             and drives_by_topic(robot.profile, self._options)
             and drive.topic_conflict(robot, cast.values()) is None
         )
-        is_flown = mavlink_of(robot.profile) is not None and self._options.has_autopilots
+        is_flown = mavlink_of(robot.profile) is not None
         return frozenset({DRIVE} if is_driven else ()) | frozenset({MAVLINK} if is_flown else ())
 
     @contextmanager
@@ -176,6 +215,14 @@ class EmulatedBackend:
         if self._site.control is Control.RADIO:
             sink(Note("control: radio applies to trials; in a lab SSH bypasses the radio and reaches every robot"))
         members = self._members()
+        if self.must_relocate:
+            from sim_backends.emulated.linux_wifi import guest_lab  # noqa: PLC0415 (other labs need none of it)
+
+            sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
+            draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
+            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, draw=draw) as lab:
+                yield lab
+            return
         ros = self._checked_ros(members)
         _check_bridges(members, ros)
         self._note_simulators(sink)
@@ -195,13 +242,13 @@ class EmulatedBackend:
         from sim_backends.emulated import placement, simulator_choice  # noqa: PLC0415 (as in `open`)
         from sim_backends.gazebo.sdf import SdfRobot, world_sdf  # noqa: PLC0415 (as above)
 
-        members, options = self._members(), self._options.model_copy(update={"physics": simulator_choice.GAZEBO})
+        members = self._members()
         places_m = placement.square_m(members, self._world)
         robots = {
             name: SdfRobot(body.limits, placement.below_antenna_m(places_m[name]), 0.0)
-            for name, body in simulator_choice.bodies_of(members.values(), options).items()
+            for name, body in simulator_choice.bodies_of(members.values()).items()
         }
-        step_ns = simulator_choice.sync_of(options).step_ns
+        step_ns = simulator_choice.sync_of(self._options).step_ns
         return world_sdf(
             self._world, robots, step_ns=step_ns, version="garden" if version == "garden" else "fortress"
         )
@@ -215,23 +262,36 @@ class EmulatedBackend:
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for robot in robots.values():
+            self._check_flight(robot)
             _check_ros(robot, self._options)
             for sensor in sensors_of(robot):
                 sensor_specs.check(sensor)
 
+    def _check_flight(self, robot: "Robot | LabRobot") -> None:
+        """Raise ConfigurationError for a drone in Gazebo, whose robots have no thrust."""
+        if self._options.physics == "gazebo" and mavlink_of(robot.profile) is not None:
+            raise ConfigurationError(
+                f"an autopilot cannot fly the drone {robot.name} in Gazebo",
+                where=self._document.where(("emulated", "physics")) if self._document else "",
+                remedy="write physics: mujoco or physics: kinematic, or remove the drone from the site file",
+            )
+
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:
+            purposes = "the robots have:" if self._options.has_linux_wifi else "the robots run on the co-simulation:"
             texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
-            sink(Note(f"the robots run on the co-simulation: {', '.join(texts)}"))
+            sink(Note(f"{purposes} {', '.join(texts)}"))
 
     def _checked_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""
         from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
 
-        variants = self._options.robots
+        has_linux_wifi, variants = self._options.has_linux_wifi, self._options.robots
         robot_variants = (variants[name] for name in names if name in variants)
         mesh = set() if self._options.mesh is None else {self._options.mesh.daemon}
-        requirements.check({program for options in robot_variants for program in options.programs()} | mesh)
+        wifi = {"hostapd", "iw", "nft", "wpa_supplicant"} if has_linux_wifi else set()
+        programs = {program for options in robot_variants for program in options.programs()}
+        requirements.check(programs | mesh | wifi, needs_tun=not has_linux_wifi)
         return requirements.ros_in_use(self._options.ros)
 
 

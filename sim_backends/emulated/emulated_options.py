@@ -6,6 +6,7 @@ from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
+from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import RadioOptions
 
@@ -151,11 +152,13 @@ class EmulatedOptions(Strict):
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
         physics: The robots move [on the co-simulation](lab-cosim.md), by this physics: `kinematic`, `mujoco` or
-            `gazebo`. If only `network` is given, `kinematic`. In `gazebo` drones have no autopilot.
+            `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
         sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which
             adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event
             of ns-3 takes too long for real time.
+        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [that of Linux](linux-wifi.md), over the same radio, in
+            a virtual machine if this kernel has no mac80211_hwsim.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -170,16 +173,17 @@ class EmulatedOptions(Strict):
     physics: Literal["kinematic", "mujoco", "gazebo"] | None = None
     network: Literal["builtin", "ns3"] | None = None
     sync: SyncOptions | None = None
+    wifi: Literal["model", "linux"] = "model"
+
+    @property
+    def has_linux_wifi(self) -> bool:
+        """True if the robots have the Wi-Fi of Linux."""
+        return self.wifi == "linux"
 
     @property
     def is_cosimulated(self) -> bool:
         """True if the robots run on the co-simulation."""
         return self.physics is not None or self.network is not None
-
-    @property
-    def has_autopilots(self) -> bool:
-        """True if drones have an autopilot: Gazebo's robots have no thrust, so it cannot fly them."""
-        return self.physics != "gazebo"
 
     @schema.model_validator(mode="after")
     def _check_sync(self) -> "EmulatedOptions":
@@ -187,6 +191,33 @@ class EmulatedOptions(Strict):
             raise schema.validation_error(
                 "`sync` needs a co-simulation; write for example `physics: kinematic`", "sync"
             )
+        return self
+
+    def with_wifi(self, kind: str) -> "EmulatedOptions":
+        """Return a copy with another `wifi`.
+
+        Raises:
+            ConfigurationError: It cannot be combined with other options.
+        """
+        try:
+            return EmulatedOptions.model_validate(self.model_dump(mode="json") | {"wifi": kind})
+        except schema.ValidationError as error:
+            cause = error.errors()[0]["msg"]
+            raise ConfigurationError(cause, remedy="change emulated: in the site file") from error
+
+    @schema.model_validator(mode="after")
+    def _check_wifi(self) -> "EmulatedOptions":
+        excluded = {
+            "physics": self.physics,
+            "network": self.network,
+            "mesh": self.mesh,
+            "record_air": self.record_air,
+            "radio": self.radio.fixed,
+        }
+        for key, value in excluded.items():
+            if self.has_linux_wifi and value:
+                name = "a fixed link (loss, delay, rate or jitter)" if key == "radio" else f"`{key}`"
+                raise schema.validation_error(f"`wifi: linux` cannot be combined with {name}", key)
         return self
 
 

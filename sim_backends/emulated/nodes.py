@@ -5,8 +5,9 @@ import socket
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, field
-from typing import Final, Generic, Self
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final, Generic, Self
 
 from typing_extensions import override
 
@@ -22,13 +23,16 @@ from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
 from sim_backends.emulated.provisioning import LAPTOP_NAME, KeyPair, RobotKey, robot_spec
 from sim_backends.emulated.robot.init import START_S
-from sim_backends.emulated.robot.spec import HOME, RobotSpec
+from sim_backends.emulated.robot.spec import HOME, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.ros.laser import PlacesWriter
 from sim_backends.emulated.ros.own_motion import AssignedPath
 from sim_backends.emulated.ros.steered import Steered, SteeredRecord
 from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
+
+if TYPE_CHECKING:
+    from sim_backends.emulated.linux_wifi.radios import HwsimRadio
 
 # Equal to the robots' own radios, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
@@ -83,6 +87,11 @@ class Node:
         link = {"interface": self.interface, "address": self.address}
         request = {"do": "open radio", **link, "mesh": mesh, "guest_hello_s": guest_hello_s}
         _, (self._radio_fd,) = self._worker.request(request)
+
+    @property
+    def has_device(self) -> bool:
+        """True if its radio is a TUN or TAP device."""
+        return self._radio_fd is not None
 
     @property
     def radio_fd(self) -> int:
@@ -165,6 +174,13 @@ class EmulatedRobot(Node):
         _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
         self._record = SteeredRecord(fd)
         self.physics_fds = (fd, *others) if others else ()
+
+    def open_wifi(self, device: str) -> None:
+        """Bring up the Wi-Fi interface `device`, which was moved to the robot. Errors as `open_radio`."""
+        if self.spec.wifi is None:
+            raise RobotError("it has no Wi-Fi of Linux", where=self.name)
+        link = {"device": device, "interface": self.interface, "address": self.address}
+        self._worker.request({"do": "open wifi", "wifi": asdict(self.spec.wifi), **link})
 
     def steered(self) -> Steered | None:
         """Return the motion that the robot recorded last, or None if it never steered itself. Sends no request."""
@@ -279,8 +295,16 @@ def running_robots(
     login, host_keys = KeyPair.make(), {key: KeyPair.make() for key in robots}
     with ExitStack() as stack:
         framing = IP if options.mesh is None else ETHERNET
-        if options.is_cosimulated:
-            medium: MediumClient = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
+        wifi: Mapping[RobotKey, WifiSpec] = {}
+        radios: Mapping[str, HwsimRadio] = {}
+        if options.has_linux_wifi:
+            from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
+
+            wifi = lab.parts(robots)
+            radios = lab.radios_of(robots.values())
+            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios))
+        elif options.is_cosimulated:
+            medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
         else:
             medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
         places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
@@ -291,15 +315,16 @@ def running_robots(
             spec = robot_spec(
                 robots, key, ros=ros, login=login, host_key=host_keys[key], options=options, world=world
             )
+            spec = replace(spec, wifi=wifi.get(key))
             running[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
-        list(pool.map(_build, running.values()))
+        list(pool.map(partial(_build, radios=radios), running.values()))
         # Robots with a ROS master start first, because the other robots wait for it.
         started = pool.map(
             EmulatedRobot.start, sorted(running.values(), key=lambda robot: not robot.spec.runs_master)
         )
         for key, robot in running.items():
-            radio = robots[key].profile.radio
-            medium.attach(robot.name, robot.address, radio, robot.radio_fd, physics_fds=robot.physics_fds)
+            radio, fd = robots[key].profile.radio, robot.radio_fd if robot.has_device else None
+            medium.attach(robot.name, robot.address, radio, fd, physics_fds=robot.physics_fds)
         if any(robot.spec.waits_for_another for robot in running.values()):
             medium.place(placement.side_by_side_m(robot.name for robot in running.values()))
         list(started)
@@ -319,12 +344,17 @@ def _cosimulated(
     simulators = simulator_choice.resolve(options)
     sync = simulator_choice.sync_of(options)
     policy = {"name": sync.name, **sync.parameters}
-    bodies = simulator_choice.bodies_of(robots.values(), options)
+    bodies = simulator_choice.bodies_of(robots.values())
     return CosimulatedClient(
         options.radio, world, seed=seed, framing=framing, bodies=bodies, simulators=simulators, policy=policy
     )
 
 
-def _build(robot: EmulatedRobot) -> None:
+def _build(robot: EmulatedRobot, radios: "Mapping[str, HwsimRadio]") -> None:
     robot.build()
+    radio = radios.get(robot.name)
+    if radio is not None:
+        radio.move_to_namespace(robot.pid)
+        robot.open_wifi(radio.interface)
+        return
     robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)

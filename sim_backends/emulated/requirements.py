@@ -33,6 +33,10 @@ VARIANT_PACKAGE_OF: Final = {
     "dropbear": "dropbear-bin",
     "dropbearconvert": "dropbear-bin",
     "babeld": "babeld",
+    "hostapd": "hostapd",
+    "iw": "iw",
+    "nft": "nftables",
+    "wpa_supplicant": "wpasupplicant",
 }
 """Debian package per program that only an option of the lab needs."""
 
@@ -41,11 +45,12 @@ _MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/
 """Files that a ROS master for several robots needs in addition, and the Debian packages that contain them."""
 
 
-def check(programs: Iterable[str] = ()) -> None:
+def check(programs: Iterable[str] = (), *, needs_tun: bool = True) -> None:
     """Check permissions and programs.
 
     Args:
         programs: Programs that the options of this lab need: tool variants of its robots, a routing daemon.
+        needs_tun: True if the robots have TUN or TAP devices.
 
     Raises:
         ConfigurationError: A permission or a program is missing.
@@ -63,7 +68,8 @@ def check(programs: Iterable[str] = ()) -> None:
     if not namespaces.is_root():
         namespaces.check()
         _check_files()
-    os.close(network.open_device())
+    if needs_tun:
+        os.close(network.open_device())
 
 
 def _check_files() -> None:

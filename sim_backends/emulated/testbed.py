@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from typing_extensions import override
+
 from fieldkit.backends.protocols import Cast
 from fieldkit.core.model import (
     Control,
@@ -168,6 +170,15 @@ class EmulatedTestbed:
         return self._mobility.moving(move)
 
 
+class LinuxWifiTestbed(EmulatedTestbed):
+    """Robots with the Wi-Fi of Linux, whose radio is measured as that of real robots. Arguments as the base class."""
+
+    @property
+    @override
+    def oracle(self) -> None:  # type: ignore[override]  # the protocol permits None
+        return None
+
+
 def _apply_for(duration_s: float, apply: Callable[[], None], revert: Callable[[], None]) -> float:
     """Call `apply`, call `revert` after `duration_s` or on an interrupt, and return the seconds between both."""
     apply()
@@ -219,9 +230,8 @@ def bring_up(
         for role in running.robots:
             shell = _shell(running, role, laptop, patience_s, notice)
             shells[role] = stack.enter_context(closing(shell))
-        testbed = EmulatedTestbed(
-            cast, running, shells, options=options, world=world, laptop=laptop, operator=operator
-        )
+        kind = LinuxWifiTestbed if options.has_linux_wifi else EmulatedTestbed
+        testbed = kind(cast, running, shells, options=options, world=world, laptop=laptop, operator=operator)
         stack.enter_context(testbed.watching())
         yield testbed
 

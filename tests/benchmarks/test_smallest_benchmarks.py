@@ -12,7 +12,6 @@ NOT_RUN = {
     "firmware_flights": "needs simulated firmware, not available in CI; test_firmware_flights.py tests its rows",
     "ns3_versions": "downloads 1 GB per version of ns-3, and compiles with each",
     "studies.gallery": "run by tests/e2e/test_gallery.py",
-    "wifi_vm": "builds a virtual machine of Debian packages, which takes 8 minutes or more to boot",
 }
 """Benchmarks that need more than CI has, with their tests; only their help is printed here."""
 

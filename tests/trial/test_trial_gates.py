@@ -216,3 +216,19 @@ def test_evidence_disturbed_by_a_fault_may_be_incomplete(tmp_path: Path) -> None
     write_states(tmp_path)
     reasons = problems(plan, Protocol.TCP, tmp_path)
     assert [reason.partition(":")[0] for reason in reasons] == ["fault-link-down.txt", "fault-reboot.txt"]
+
+
+def test_times_are_withheld_if_the_clock_counts_instructions(folder: Path) -> None:
+    def measured(simulators: dict[str, str]) -> Measured:
+        plan = PLAN.model_copy(update={"simulators": simulators})
+        (repeat, *_) = plan.order()
+        return gates.judge(plan, repeat, AttemptEvidence(folder)).measured
+
+    plain, withheld = measured({}), measured({"wifi": "linux", "clock": "instructions"})
+    lost = plain.values.keys() - withheld.values.keys()
+    assert "bag_duration_s" in lost
+    assert all(name.endswith(("_s", "_ppm")) for name in lost)
+    assert {withheld.missing[name] for name in lost} == {
+        "its clock counts the instructions of a processor in software"
+    }
+    assert withheld.values["file_loss"] == plain.values["file_loss"]

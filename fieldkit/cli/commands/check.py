@@ -45,6 +45,8 @@ def run(arguments: argparse.Namespace) -> int:
     request = cli_options.request(arguments, _CLOSE)
     with showing_events(as_json=arguments.json) as sink:
         name, backend = cli_options.backend(arguments, sink)
+        if (code := cli_options.run_elsewhere(backend, arguments, Path("trials"))) is not None:
+            return code
         cast = backend.cast(request.chosen_topology)
         plan = make_plan(
             request,

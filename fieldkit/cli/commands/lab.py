@@ -41,6 +41,7 @@ def add(parser: Parser) -> None:
     )
     shared.add_robots(action)
     action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
+    action.add_choice("--wifi", ("model", "linux"), help="Wi-Fi of the robots (default: the site file's, or model)")
     action.add_argument("--foreground", action="store_true", help="keep this terminal; Ctrl-C takes the robots down")
     action.set_defaults(run=up)
     listing = actions.add_parser(
@@ -313,7 +314,13 @@ def _backend(arguments: argparse.Namespace) -> "LabBackend":
         site = (
             Site(robots=robots, roles={}) if site is None else site.model_copy(update={"robots": robots, "roles": {}})
         )
-    return protocol.as_lab_backend(name, load_backend(name, site, document))
+    backend = protocol.as_lab_backend(name, load_backend(name, site, document))
+    wifi = getattr(arguments, "wifi", None)
+    if wifi is not None:
+        if not isinstance(backend, protocol.ChoosesWifi):
+            raise ConfigurationError(f"--wifi: the backend {name} has one kind of Wi-Fi", remedy="remove --wifi")
+        backend.use_wifi(wifi)
+    return backend
 
 
 def _show_note(event: Event) -> None:

@@ -36,6 +36,9 @@ def run(arguments: argparse.Namespace) -> int:
     resumption.resumable(arguments.trial)  # raise errors of the trial before those of site files and backends
     with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
+        folder = arguments.trial.resolve().parent
+        if (code := cli_options.run_elsewhere(backend, arguments, folder)) is not None:
+            return code
         with cli_options.operator(arguments, sink) as operator:
             outcome = resumption.resume(
                 arguments.trial,

@@ -86,6 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
             else:
                 dry_run.print_commands(plans[0])
             return 0
+        if (code := cli_options.run_elsewhere(backend, arguments, arguments.out)) is not None:
+            return code
         # These modules import pyarrow, which a dry run does not need.
         from fieldkit.cli import results
         from fieldkit.trial import estimates

@@ -41,7 +41,9 @@ class CosimulatedClient(MediumClient):
         self._policy = policy
 
     @override
-    def attach(self, name: str, address: str, radio: Radio, fd: int, *, physics_fds: Sequence[int] = ()) -> None:
+    def attach(
+        self, name: str, address: str, radio: Radio, fd: int | None, *, physics_fds: Sequence[int] = ()
+    ) -> None:
         super().attach(name, address, radio, fd)
         if (body := self._bodies.get(name)) is not None:
             request = {"do": "body", "name": name, "body": body.to_json()}

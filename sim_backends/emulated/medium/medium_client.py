@@ -45,8 +45,12 @@ class MediumClient:
         self._options = options
         self._world = world
         self._configured = False
-        self._worker = Worker("medium", self.module, words=(str(seed), framing.name))
+        self._words = str(seed), framing.name
+        self._worker = self._start()
         self._robots: set[str] = set()
+
+    def _start(self) -> Worker:
+        return Worker("medium", self.module, words=self._words)
 
     def __enter__(self) -> Self:
         return self
@@ -64,7 +68,7 @@ class MediumClient:
         name: str,
         address: str,
         radio: Radio,
-        fd: int,
+        fd: int | None,
         *,
         physics_fds: Sequence[int] = (),  # noqa: ARG002 (see below)
     ) -> None:
@@ -75,7 +79,8 @@ class MediumClient:
             address: Its IPv4 address on the radio with the prefix length, `10.42.0.1/24`.
             radio: Its radio.
             fd: Descriptor of its device, or of a packet socket: each read returns one framed packet, and each write
-                accepts one. The medium gets a copy; the caller closes this descriptor.
+                accepts one. The medium gets a copy; the caller closes this descriptor. None for a radio of the
+                kernel, which has no device.
             physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics; others ignore it.
 
         Raises:
@@ -83,7 +88,10 @@ class MediumClient:
             RobotError: A robot with that name or address is attached already.
         """
         antenna = asdict(antenna_of(radio))
-        self._worker.request({"do": "attach", "name": name, "address": address, "antenna": antenna}, descriptors=[fd])
+        self._worker.request(
+            {"do": "attach", "name": name, "address": address, "antenna": antenna},
+            descriptors=[] if fd is None else [fd],
+        )
         self._robots.add(name)
 
     def place(

@@ -95,6 +95,7 @@ class Worker:
         name: Name for messages.
         module: The module; its arguments are the descriptor number of its socket, then `words`.
         words: More arguments.
+        descriptors: Descriptors of this process that the process inherits, with the same numbers.
         within: Command prefix that runs the interpreter, for example `unshare ... --`.
         home: Value of `HOME`.
 
@@ -103,7 +104,14 @@ class Worker:
     """
 
     def __init__(
-        self, name: str, module: str, *, words: Sequence[str] = (), within: Sequence[str] = (), home: str = "/"
+        self,
+        name: str,
+        module: str,
+        *,
+        words: Sequence[str] = (),
+        descriptors: Sequence[int] = (),
+        within: Sequence[str] = (),
+        home: str = "/",
     ) -> None:
         self.name = name
         self._lock = threading.Lock()
@@ -114,7 +122,7 @@ class Worker:
         try:
             self._process = subprocess.Popen(
                 argv,
-                pass_fds=[worker_end.fileno()],
+                pass_fds=[worker_end.fileno(), *descriptors],
                 stdin=subprocess.DEVNULL,
                 stdout=self._log,
                 stderr=self._log,

@@ -21,10 +21,10 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import FieldkitError, RobotError
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
-from sim_backends.emulated.robot import mounts, network, rootfs, services
+from sim_backends.emulated.robot import mounts, network, rootfs, services, wireless
 from sim_backends.emulated.robot.commanded import COMMANDED
 from sim_backends.emulated.robot.services import Service
-from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec
+from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec, WifiSpec
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.laser import Neighbourhood
 from sim_backends.emulated.ros.own_motion import AssignedPath
@@ -150,6 +150,7 @@ class Init:
         self._wake_fd = wake_fd
         self._supervisor = Supervisor()
         self._neighbourhood: Neighbourhood | None = None
+        self._wifi: WifiSpec | None = None
 
     def run(self) -> None:
         """Serve requests; return when the lab has closed the control socket."""
@@ -194,9 +195,8 @@ class Init:
                 return [_open_radio(request)]
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
-            case "switch off" | "switch on" as action:
-                switch = network.switch_on if action == "switch on" else network.switch_off
-                switch(request["interface"])
+            case "open wifi" | "switch off" | "switch on":
+                self._change_radio(request)
             case "move":
                 own_motion.append_path(services.MOTION, AssignedPath(**request["path"]))
             case "kill":
@@ -204,7 +204,7 @@ class Init:
             case "halt":
                 self._halt(request["interface"])
             case "boot":
-                network.switch_on(request["interface"])
+                self._switch_on(request["interface"])
                 self._spawn(RobotSpec.from_json(request["robot"]))
             case "socket":
                 return [socket.socket(socket.AF_INET, socket.SOCK_STREAM).detach()]
@@ -222,6 +222,21 @@ class Init:
         network.switch_off(interface)
         self._supervisor.halt()
         lose_memory()
+
+    def _change_radio(self, request: Message) -> None:
+        match request["do"]:
+            case "open wifi":
+                self._wifi = WifiSpec(**request["wifi"])
+                wireless.bring_up(request["device"], request["interface"], request["address"], self._wifi)
+            case "switch off":
+                network.switch_off(request["interface"])
+            case "switch on":
+                self._switch_on(request["interface"])
+
+    def _switch_on(self, interface: str) -> None:
+        network.switch_on(interface)
+        if self._wifi is not None:
+            wireless.rejoin(interface, self._wifi)
 
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them, because requests are served one at a time."""

@@ -162,24 +162,29 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
         FieldkitError: The interface cannot be created.
         RobotError: `ip` rejected a setting.
     """
-    _disable_ipv6()
+    disable_ipv6()
     fd = open_tun(interface, ethernet=mesh)
     if mesh:
         _prepare_mesh(interface)
         mac = mac_of(IPv4Interface(address).ip).hex(":")
-        _ip(f"link set {interface} address {mac}")
-    _ip(
+        run_ip(f"link set {interface} address {mac}")
+    configure(interface, address)
+    return fd
+
+
+def configure(interface: str, address: str) -> None:
+    """Bring up loopback and an interface with its address and routes. Errors as `run_ip`."""
+    run_ip(
         "link set lo up",
         f"link set {interface} mtu {MTU_BYTES} up",
         f"address add {address} broadcast + dev {interface}",
         *_routes(interface),
     )
-    return fd
 
 
 def switch_off(interface: str) -> None:
     """Take the radio interface down; it keeps its address. Errors as `switch_on`."""
-    _ip(f"link set {interface} down")
+    run_ip(f"link set {interface} down")
 
 
 def switch_on(interface: str) -> None:
@@ -188,7 +193,7 @@ def switch_on(interface: str) -> None:
     Raises:
         RobotError: `ip` rejected a setting.
     """
-    _ip(f"link set {interface} up", *_routes(interface))
+    run_ip(f"link set {interface} up", *_routes(interface))
 
 
 def _routes(interface: str) -> tuple[str, ...]:
@@ -196,7 +201,12 @@ def _routes(interface: str) -> tuple[str, ...]:
     return (f"route replace 224.0.0.0/4 dev {interface}", f"route replace 255.255.255.255/32 dev {interface}")
 
 
-def _ip(*commands: str) -> None:
+def run_ip(*commands: str) -> None:
+    """Run commands of `ip`.
+
+    Raises:
+        RobotError: `ip` rejected a setting.
+    """
     for command in commands:
         # Each command runs separately, because busybox's ip, which a robot may have, has no batch mode.
         result = subprocess.run(
@@ -234,7 +244,7 @@ def _prepare_mesh(interface: str) -> None:
         Path("/proc/sys/net", name).write_text(str(value), encoding="ascii")
 
 
-def _disable_ipv6() -> None:
+def disable_ipv6() -> None:
     """Disable IPv6, so that the kernel's neighbour discovery adds no packets to those of the robot's programs."""
     for scope in ("all", "default"):
         switch = Path(f"/proc/sys/net/ipv6/conf/{scope}/disable_ipv6")

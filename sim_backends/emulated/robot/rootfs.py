@@ -61,11 +61,15 @@ _KEPT_WITH_BUSYBOX: Final = (
     "bash",
     "busybox",
     "dropbear",
+    "hostapd",
     "iperf3",
+    "iw",
+    "nft",
     "python3*",
     "ros*",
     "sshd*",
     "tcpdump",
+    "wpa_supplicant",
 )
 _TIMEOUT_S: Final = 5.0
 

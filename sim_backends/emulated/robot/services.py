@@ -15,7 +15,7 @@ from fieldkit.core.model import BRIDGE_IS_UP, ROS_MASTER_PORT
 from fieldkit.remote.command import with_environment
 from sim_backends.emulated.autopilot import mavlink_server as autopilot
 from sim_backends.emulated.process import worker
-from sim_backends.emulated.robot import base_process, network, ssh_server
+from sim_backends.emulated.robot import base_process, network, ssh_server, wireless
 from sim_backends.emulated.robot.spec import ANTENNA_M, HOME, STATE, RobotSpec
 from sim_backends.emulated.ros import sensors, static_frames, tcpros
 from sim_backends.emulated.ros.laser import Neighbourhood
@@ -144,9 +144,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
         result.append(_motion_service("autopilot", partial(autopilot.serve, _drone(spec, spec.mavlink_port))))
     if spec.base is not None:
         result.append(_motion_service("base", partial(base_process.serve, spec.base)))
-    if spec.mesh_hello_s is not None:
-        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s)
-        result.append(_program("babeld", argv, {}, network.PID.exists))
+    result += _network_services(spec)
     if spec.ros == "debian":
         result += _debian_ros(spec, (*spec.registered, *([static_frames.TOPIC] if frames else [])))
     if spec.bridge:
@@ -161,6 +159,17 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
         words = (spec.ip, ros_node(spec), _velocities(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
         result.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return result
+
+
+def _network_services(spec: RobotSpec) -> Iterator[Service]:
+    """Yield the programs of the robot's radio: hostapd or wpa_supplicant, and the routing daemon of a mesh."""
+    wifi = spec.wifi
+    if wifi is not None and wifi.part in wireless.PROGRAMS:
+        argv = wireless.command(spec.interface, wifi)
+        yield _program(wireless.PROGRAMS[wifi.part], argv, {}, partial(wireless.is_connected, wifi))
+    if spec.mesh_hello_s is not None:
+        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s)
+        yield _program("babeld", argv, {}, network.PID.exists)
 
 
 def _motion_service(name: str, serve: Callable[..., None]) -> Service:

@@ -82,6 +82,19 @@ class Ros2Spec:
 
 
 @dataclass(frozen=True)
+class WifiSpec:
+    """The Wi-Fi of Linux on a robot.
+
+    Attributes:
+        part: `ad hoc`, `access point` or `station`.
+        passphrase: Passphrase of the access point; empty if `ad hoc`.
+    """
+
+    part: Literal["ad hoc", "access point", "station"]
+    passphrase: str = ""
+
+
+@dataclass(frozen=True)
 class RobotSpec:
     """One emulated robot.
 
@@ -121,6 +134,7 @@ class RobotSpec:
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
         ros2: Its ROS 2 over the radio; None if it has none.
         routes_zenoh: True if it runs the Zenoh router.
+        wifi: Its Wi-Fi of Linux; None for a robot whose radio is a TUN or TAP device.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """
 
@@ -160,6 +174,7 @@ class RobotSpec:
     ros2: Ros2Spec | None = None
     routes_zenoh: bool = False
     bridge: tuple[str, ...] = ()
+    wifi: WifiSpec | None = None
 
     @property
     def ip(self) -> str:
@@ -183,8 +198,9 @@ class RobotSpec:
 
     @property
     def waits_for_another(self) -> bool:
-        """True if its startup waits for another robot, which runs its ROS master or its Zenoh router."""
-        return self.shares_master or bool(self.ros2 and self.ros2.router)
+        """True if its startup waits for another robot: its ROS master, its Zenoh router or its access point."""
+        joins = self.wifi is not None and self.wifi.part == "station"
+        return self.shares_master or bool(self.ros2 and self.ros2.router) or joins
 
     @property
     def ros1_environment(self) -> dict[str, str]:
@@ -200,10 +216,11 @@ class RobotSpec:
         words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}
         base = data["base"] and Base(**data["base"])
         ros2 = data["ros2"] and Ros2Spec.from_json(data["ros2"])
+        wifi = data["wifi"] and WifiSpec(**data["wifi"])
         targets = tuple(_laser_target(target) for target in data["laser_targets"])
         neighbours = tuple(Neighbour(*body) for body in data["neighbours"])
         parts = {"laser_targets": targets, "sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
-        return cls(**{**data, **words, **parts, "neighbours": neighbours})
+        return cls(**{**data, **words, **parts, "neighbours": neighbours, "wifi": wifi})
 
 
 def unsupported_paths(paths: Iterable[str]) -> list[str]:

@@ -1,0 +1,298 @@
+"""The air between radios of Linux: each try of each frame, decided by the radio model.
+
+Every channel in use has a separate radio model: frames on different channels do not interfere. hwsim does not report
+the channel to which a radio listens, so a radio is on the channel of its last frame, and on all channels before its
+first frame. All channels have the path loss of the radio model, that of 2.4 GHz.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from typing_extensions import override
+
+from fieldkit.core.model import Vector
+from sim_backends.emulated.linux_wifi.hwsim_messages import FLAG_NO_ACK, SentFrame
+from sim_backends.emulated.linux_wifi.rate_chain import RateChain, rate_chain
+from sim_backends.radio.antennas import Antenna
+from sim_backends.radio.frames import HEADER_BYTES, TransmissionAttempt, decibel
+from sim_backends.radio.links import QUEUE_FULL, RADIO_OFF
+from sim_backends.radio.modes import G_MODES, SHORT_RETRY_LIMIT, WifiMode
+from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.rate_control import RateControl
+from sim_backends.radio.wifi import Wifi
+from sim_backends.radio.world_channel import WorldChannel
+from sim_backends.world.world import World
+
+_FCS_BYTES: Final = 4
+_LOWEST_SIGNAL_DBM: Final = -120
+_ABSENT: Final = ""
+"""Station without a position: the receiver of frames to an address that no radio has."""
+
+
+@dataclass(eq=False)
+class FrameOnAir:
+    """A frame from its transmission to its status.
+
+    Attributes:
+        sent: The frame.
+        source: Name of its transmitter.
+        receiver: Name of its receiver; None for a broadcast or multicast, `""` if no radio has the address.
+        chain: Its tries; one in the basic mode for a broadcast or multicast.
+        attempts: Tries made so far.
+        acknowledged: True if an ACK was received.
+        signal_dbm: Signal of that ACK, at the start of the try.
+        mode: Mode of the last try that a receiver decoded.
+        is_final: True if its status is known.
+    """
+
+    sent: SentFrame
+    source: str
+    receiver: str | None
+    chain: RateChain
+    attempts: int = 0
+    acknowledged: bool = False
+    signal_dbm: int = _LOWEST_SIGNAL_DBM
+    mode: WifiMode = G_MODES[0]
+    is_final: bool = False
+
+
+@dataclass(frozen=True)
+class FrameReception:
+    """A frame that arrived at a radio.
+
+    Attributes:
+        receiver: Name of the radio.
+        frame: The frame.
+        mode: Mode in which it was decoded.
+        signal_dbm: Received signal.
+    """
+
+    receiver: str
+    frame: FrameOnAir
+    mode: WifiMode
+    signal_dbm: int
+
+
+@dataclass
+class AirEvents:
+    """Events since the last call.
+
+    Attributes:
+        receptions: Frames that arrived, in order.
+        statuses: Frames whose status is known, in order.
+    """
+
+    receptions: list[FrameReception] = field(default_factory=list)
+    statuses: list[FrameOnAir] = field(default_factory=list)
+
+
+class _ChainRates(RateControl):
+    """Rate control of one link: the modes of the chain that mac80211 gave to each frame. Frames are sent in order."""
+
+    def __init__(self, channel: "_Channel", transmitter: int, receiver: int) -> None:
+        self._channel = channel
+        self._ends = transmitter, receiver
+        self._frame: FrameOnAir | None = None
+        self._now_ns = 0
+
+    @override
+    def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:
+        self._frame, self._now_ns = self._channel.frames[packet], now_ns
+        self._frame.attempts = attempt
+        return self._frame.chain.modes[attempt - 1]
+
+    @override
+    def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
+        frame = self._frame
+        assert frame is not None
+        frame.acknowledged = bool(acknowledged)
+        if acknowledged:
+            transmitter, receiver = self._ends
+            frame.signal_dbm = self._channel.signal_dbm(receiver, transmitter, self._now_ns)
+        if acknowledged or frame.attempts == len(frame.chain.modes):
+            self._channel.finish(frame)
+
+
+class _ChannelGains(WorldChannel):
+    """The links on one channel, with the rate chains of mac80211.
+
+    All stations count as associated: mac80211 decides about associations, and its frames need airtime even if the
+    receiver is out of range.
+    """
+
+    channel: "_Channel"
+
+    @override
+    def linked(self, transmitter: int, receiver: int) -> bool:
+        return True
+
+    @override
+    def rate_control(self, transmitter: int, receiver: int) -> RateControl:
+        return _ChainRates(self.channel, transmitter, receiver)
+
+
+class _Channel:
+    """The radio model of one channel.
+
+    Args:
+        seed: Seed of all random draws.
+        options: Radio options.
+        antennas: The stations.
+        world: Obstacles; None for open ground.
+
+    Attributes:
+        frames: Frames whose status is not known, by identity.
+        events: Events since the last call of `take_events`.
+    """
+
+    def __init__(
+        self, seed: int, options: RadioOptions, antennas: Mapping[str, Antenna], world: World | None
+    ) -> None:
+        self._gains = _ChannelGains(seed, {**antennas, _ABSENT: next(iter(antennas.values()))}, options, world)
+        self._gains.channel = self
+        self._index = {name: index for index, name in enumerate(self._gains.names)}
+        self._wifi: Wifi[FrameOnAir] = Wifi(self._gains, seed, queue_packets=options.queue_packets)
+        self._wifi.log_attempts(self._on_attempt)
+        self._wifi.log_losses(self._on_loss)
+        self._numbers = dict.fromkeys(antennas, 0)
+        self._identities: dict[FrameOnAir, PacketIdentity] = {}
+        self.frames: dict[PacketIdentity, FrameOnAir] = {}
+        self.events = AirEvents()
+
+    def place(self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector]) -> None:
+        self._wifi.advance(now_ns)
+        self._gains.move(now_ns, places_m, velocities_m_s)
+
+    def transmit(self, now_ns: int, frame: FrameOnAir) -> None:
+        number = self._numbers[frame.source]
+        self._numbers[frame.source] = number + 1
+        identity = frame.source, number
+        self.frames[identity], self._identities[frame] = frame, identity
+        tries = len(frame.chain.modes)
+        if not tries:
+            self.finish(frame)
+            return
+        size_bytes = len(frame.sent.frame) + _FCS_BYTES - HEADER_BYTES
+        self._wifi.send(now_ns, frame.source, frame, size_bytes, frame.receiver, packet=identity, max_attempts=tries)
+
+    def next_event_ns(self) -> int | None:
+        return self._wifi.next_event_ns()
+
+    def take_events(self, now_ns: int) -> AirEvents:
+        for at_ns, name, frame, source, _ in self._wifi.deliveries(now_ns):
+            signal_dbm = self.signal_dbm(self._index[source], self._index[name], at_ns)
+            self.events.receptions.append(FrameReception(name, frame, frame.mode, signal_dbm))
+        events, self.events = self.events, AirEvents()
+        return events
+
+    def signal_dbm(self, transmitter: int, receiver: int, now_ns: int) -> int:
+        power_mw = self._gains.powers_mw(transmitter, now_ns)[receiver]
+        return max(_LOWEST_SIGNAL_DBM, round(decibel(power_mw)))
+
+    def finish(self, frame: FrameOnAir) -> None:
+        """Report the status of a frame; a second call has no effect."""
+        if not frame.is_final:
+            frame.is_final = True
+            del self.frames[self._identities.pop(frame)]
+            self.events.statuses.append(frame)
+
+    def _on_attempt(self, attempt: TransmissionAttempt) -> None:
+        frame = attempt.payload
+        if not isinstance(frame, FrameOnAir):
+            return  # an ACK
+        if attempt.received:
+            frame.mode = attempt.mode
+        if attempt.receiver is None:
+            frame.attempts = 1
+            self.finish(frame)
+
+    def _on_loss(self, now_ns: int, frame: FrameOnAir, receiver: str, reason: str) -> None:  # noqa: ARG002 (LossLog)
+        if reason in {QUEUE_FULL, RADIO_OFF}:
+            self.finish(frame)
+
+
+class Air:
+    """The air between radios on any number of channels.
+
+    Args:
+        seed: Seed of all random draws.
+        options: Radio options; `mode` has no effect, because mac80211 selects the rates.
+        antennas: The radios, by name.
+        world: Obstacles; None for open ground.
+
+    Raises:
+        ValueError: There is no radio, or one has the empty name.
+    """
+
+    def __init__(
+        self, seed: int, options: RadioOptions, antennas: Mapping[str, Antenna], world: World | None = None
+    ) -> None:
+        if not antennas or _ABSENT in antennas:
+            raise ValueError("the air needs at least one radio, each with a name")
+        self._channel_arguments = seed, options, antennas, world
+        self._channels: dict[int, _Channel] = {}
+        self._tuned_mhz: dict[str, int] = {}
+        self._places_m: Mapping[str, Vector] = {}
+        self._velocities_m_s: Mapping[str, Vector] = {}
+
+    def place(
+        self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
+    ) -> None:
+        """Set the positions of the radios, metres east, north, up; a radio without one is out of range of all."""
+        self._places_m, self._velocities_m_s = dict(places_m), dict(velocities_m_s or {})
+        for frequency_mhz in self._channels:
+            self._place(now_ns, frequency_mhz)
+
+    def transmit(self, now_ns: int, sent: SentFrame, source: str, receiver: str | None) -> None:
+        """Send a frame at `now_ns`; times must not decrease.
+
+        Args:
+            now_ns: Current time.
+            sent: The frame.
+            source: Name of its radio.
+            receiver: Name of the radio with the receiver's address; None if no radio has it. Ignored for a broadcast
+                or multicast.
+        """
+        frequency_mhz = sent.frequency_mhz
+        if frequency_mhz not in self._channels:
+            self._channels[frequency_mhz] = _Channel(*self._channel_arguments)
+            self._place(now_ns, frequency_mhz)
+        left_mhz = self._tuned_mhz.get(source)
+        if left_mhz != frequency_mhz:
+            self._tuned_mhz[source] = frequency_mhz
+            others = self._channels if left_mhz is None else (left_mhz, frequency_mhz)
+            for other_mhz in others:
+                self._place(now_ns, other_mhz)
+        destination = None if sent.is_group else receiver if receiver not in {None, source} else _ABSENT
+        if sent.is_group:
+            chain = rate_chain((), frequency_mhz)
+        else:
+            max_tries = 1 if sent.flags & FLAG_NO_ACK else SHORT_RETRY_LIMIT
+            chain = rate_chain(sent.stages, frequency_mhz, max_tries=max_tries)
+        self._channels[frequency_mhz].transmit(now_ns, FrameOnAir(sent, source, destination, chain))
+
+    def next_event_ns(self) -> int | None:
+        """Return the time of the next event, or None if there is no frame on the air."""
+        times = [at_ns for channel in self._channels.values() if (at_ns := channel.next_event_ns()) is not None]
+        return min(times, default=None)
+
+    def take_events(self, now_ns: int) -> AirEvents:
+        """Return the events up to `now_ns` that were not returned before; receptions of a channel are in order."""
+        events = AirEvents()
+        for channel in self._channels.values():
+            new = channel.take_events(now_ns)
+            events.receptions += new.receptions
+            events.statuses += new.statuses
+        return events
+
+    def _place(self, now_ns: int, frequency_mhz: int) -> None:
+        """Place the radios that are on a channel, or may be."""
+        places_m = {
+            name: place_m
+            for name, place_m in self._places_m.items()
+            if self._tuned_mhz.get(name, frequency_mhz) == frequency_mhz
+        }
+        velocities_m_s = {name: velocity for name, velocity in self._velocities_m_s.items() if name in places_m}
+        self._channels[frequency_mhz].place(now_ns, places_m, velocities_m_s)

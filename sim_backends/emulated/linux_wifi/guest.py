@@ -1,0 +1,91 @@
+"""Commands of fieldkit in the virtual machine: the same command line, with its results in a folder of the host."""
+
+import os
+import shlex
+import shutil
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from sim_backends.emulated.linux_wifi.virtual_machine import (
+    INTERRUPT,
+    PACKAGE_OF,
+    find_program,
+    kernel_roots,
+    require_machine,
+    run_in_machine,
+)
+from sim_backends.emulated.process import worker
+
+_LONGEST_S: Final = 7 * 24 * 3600.0
+_PROLOGUE: Final = """\
+mkdir -p /usr/local/sbin
+{links}
+cd {folder} || exit
+export {variables}
+"""
+_COMMAND: Final = f"""\
+( while sleep 1; do if [ -e {INTERRUPT} ]; then rm {INTERRUPT}; kill -INT $$; fi; done ) &
+exec """
+
+
+def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
+    """Run a command of fieldkit in a new virtual machine; its output is that of this process.
+
+    Args:
+        argv: The words after `fieldkit`.
+        results: Folder of the host that the command may change; it is created. Other changes are lost.
+        radios: Number of radios.
+
+    Returns:
+        Exit code of the command.
+
+    Raises:
+        ConfigurationError: A program, or the kernel of the machine, is not installed.
+        TestbedLostError: The machine ended before the command.
+    """
+    kernel = require_machine()
+    results.mkdir(parents=True, exist_ok=True)
+    # Ctrl-C is for the command in the machine, which finishes its repeat. A second one ends the machine.
+    previous = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        ended = run_in_machine(
+            kernel,
+            prologue(Path.cwd()) + _COMMAND + shlex.join((*worker.command("fieldkit"), *argv)),
+            Deadline.after(_LONGEST_S),
+            radios=radios,
+            results=results.resolve(),
+            on_output=_write,
+        )
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    return ended.code
+
+
+def prologue(folder: Path) -> str:
+    """Return the part of a shell script that prepares the machine for programs of fieldkit in a folder."""
+    # Programs of a folder of extracted packages are not on the PATH of the robots.
+    links = [
+        shlex.join(("ln", "-sf", found, f"/usr/local/sbin/{name}"))
+        for name in PACKAGE_OF
+        if shutil.which(name, path=worker.PATH) is None and (found := find_program(name, kernel_roots())) is not None
+    ]
+    variables = {
+        "PATH": worker.PATH,
+        "HOME": os.environ.get("HOME", "/"),
+        "LANG": "C.UTF-8",
+        "PYTHONPATH": str(worker.PROJECT),
+    }
+    return _PROLOGUE.format(
+        links="\n".join(links),
+        folder=shlex.quote(str(folder)),
+        variables=" ".join(f"{name}={shlex.quote(value)}" for name, value in variables.items()),
+    )
+
+
+def _write(data: bytes) -> None:
+    sys.stdout.write(data.decode(errors="replace"))
+    sys.stdout.flush()

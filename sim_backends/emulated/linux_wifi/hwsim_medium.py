@@ -1,0 +1,159 @@
+"""The medium of mac80211_hwsim: frames from the kernel to the air, and results to the kernel.
+
+`HwsimMedium` has no socket: it maps messages to messages, so that recorded ones test it. `medium_program` runs it.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from sim_backends.emulated.linux_wifi.air import Air, FrameOnAir, FrameReception
+from sim_backends.emulated.linux_wifi.hwsim_messages import (
+    InterfaceAddress,
+    RadioAddress,
+    SentFrame,
+    decode_event,
+    encode_received,
+    encode_status,
+)
+from sim_backends.emulated.linux_wifi.netlink import NLMSG_ERROR, NetlinkFormatError, NetlinkMessage
+from sim_backends.emulated.linux_wifi.rate_chain import legacy_index
+from sim_backends.radio.links import Pair
+
+MAX_FREQUENCY_MHZ: Final = 7_125
+MIN_FREQUENCY_MHZ: Final = 2_412
+_MAX_ADDRESSES: Final = 64
+"""Addresses that a radio may have: a robot can change the address of its interface any number of times."""
+_RADIO_BIT: Final = 0x40
+
+
+@dataclass
+class LinkTotals:
+    """Totals of frames with an acknowledgement, of one directed link, for comparison with `iw station dump`.
+
+    Attributes:
+        frames: Frames whose status was reported.
+        acknowledged: Frames that were acknowledged.
+        tries: Tries on the air.
+        reported_tries: Tries reported to the kernel: also those in modes that the radio model does not have. Without
+            the frames they are the `tx retries` of `iw`.
+        signal_dbm: Signal of the last frame that arrived; None before the first.
+    """
+
+    frames: int = 0
+    acknowledged: int = 0
+    tries: int = 0
+    reported_tries: int = 0
+    signal_dbm: int | None = None
+
+
+@dataclass
+class MediumCounts:
+    """Counts of messages.
+
+    Attributes:
+        rejected: Messages that were malformed, or from a radio that is not part of the lab.
+        errors: Errors that the kernel returned, by number; EINVAL includes frames to a radio on another channel.
+    """
+
+    rejected: int = 0
+    errors: Counter[int] = field(default_factory=Counter)
+
+
+class HwsimMedium:
+    """Decides the frames of all radios.
+
+    Args:
+        air: The air.
+        radios: Name of each radio in the air, by its address.
+
+    Attributes:
+        counts: Counts of messages.
+        totals: Totals of each directed link.
+    """
+
+    def __init__(self, air: Air, radios: Mapping[RadioAddress, str]) -> None:
+        self.air = air
+        self.counts = MediumCounts()
+        self.totals: dict[Pair, LinkTotals] = {}
+        self._names = dict(radios)
+        self._radio_of = {name: radio for radio, name in radios.items()}
+        # The first interface of a radio has its permanent address, which differs in one bit.
+        self._by_address = {bytes((radio[0] & ~_RADIO_BIT,)) + radio[1:]: name for radio, name in self._names.items()}
+        self._address_counts = Counter(self._by_address.values())
+
+    def receive(self, now_ns: int, message: NetlinkMessage) -> None:
+        """Accept a message from the kernel at `now_ns`; a malformed one is counted."""
+        try:
+            if message.type == NLMSG_ERROR:
+                self.counts.errors[message.error_number] += 1
+                return
+            event = decode_event(message.payload)
+        except NetlinkFormatError:
+            self.counts.rejected += 1
+            return
+        match event:
+            case SentFrame():
+                self._transmit(now_ns, event)
+            case InterfaceAddress():
+                self._update_address(event)
+
+    def replies(self, now_ns: int) -> list[bytes]:
+        """Return the messages for the kernel that are due at `now_ns`, in order."""
+        events = self.air.take_events(now_ns)
+        messages = [self._received(reception) for reception in events.receptions]
+        messages += [self._status(frame) for frame in events.statuses]
+        return [message for message in messages if message is not None]
+
+    def _transmit(self, now_ns: int, sent: SentFrame) -> None:
+        name = self._names.get(sent.radio)
+        if name is None or not MIN_FREQUENCY_MHZ <= sent.frequency_mhz <= MAX_FREQUENCY_MHZ:
+            self.counts.rejected += 1
+            return
+        address = sent.transmitter
+        # An interface that existed before the medium started was not announced. An address of another radio is not
+        # taken from it.
+        if address is not None and not address[0] & 1 and address not in self._by_address:
+            self._add_address(address, name)
+        self.air.transmit(now_ns, sent, name, self._by_address.get(sent.receiver))
+
+    def _update_address(self, event: InterfaceAddress) -> None:
+        name = self._names.get(event.radio)
+        if name is None:
+            self.counts.rejected += 1
+        elif event.added:
+            self._remove_address(event.address)
+            self._add_address(event.address, name)
+        elif self._by_address.get(event.address) == name:
+            self._remove_address(event.address)
+
+    def _add_address(self, address: bytes, name: str) -> None:
+        if self._address_counts[name] < _MAX_ADDRESSES:
+            self._by_address[address] = name
+            self._address_counts[name] += 1
+
+    def _remove_address(self, address: bytes) -> None:
+        name = self._by_address.pop(address, None)
+        if name is not None:
+            self._address_counts[name] -= 1
+
+    def _received(self, reception: FrameReception) -> bytes | None:
+        frame = reception.frame
+        self._totals(frame.source, reception.receiver).signal_dbm = reception.signal_dbm
+        rate_index = legacy_index(reception.mode, frame.sent.frequency_mhz)
+        radio = self._radio_of[reception.receiver]
+        return encode_received(frame.sent, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
+
+    def _status(self, frame: FrameOnAir) -> bytes:
+        tries = frame.chain.tries_made(frame.attempts)
+        if frame.receiver:
+            totals = self._totals(frame.source, frame.receiver)
+            totals.frames += 1
+            totals.acknowledged += frame.acknowledged
+            totals.tries += frame.attempts
+            totals.reported_tries += sum(tries)
+        return encode_status(frame.sent, tries=tries, acknowledged=frame.acknowledged, signal_dbm=frame.signal_dbm)
+
+    def _totals(self, transmitter: str, receiver: str) -> LinkTotals:
+        return self.totals.setdefault((transmitter, receiver), LinkTotals())

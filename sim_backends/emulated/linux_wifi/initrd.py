@@ -1,0 +1,174 @@
+"""The initial file system of the virtual machine: busybox, kernel modules and a start script, in a cpio archive.
+
+Everything else is the root file system of the host, which the machine mounts read-only over 9p, below a layer in
+memory that has all changes. The archive has the
+format `newc` (Linux, Documentation/driver-api/early-userspace/buffer-format.rst). It is written here, because
+a program that creates it would have to be installed, and needs a copy of each file.
+"""
+
+import re
+import stat
+import subprocess
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.errors import ConfigurationError
+
+MODULES: Final = (
+    *(
+        "virtio_pci",
+        "9pnet_virtio",
+        "9p",
+        "overlay",
+        "virtio_rng",
+        "virtio_console",
+        "mac80211_hwsim",
+        "crc32c_generic",
+        "nf_tables",
+    ),
+    *("ccm", "ctr", "cmac", "gcm"),
+)
+"""Modules that the machine loads, after their dependencies.
+
+libcrc32c, on which nf_tables depends, needs crc32c_generic; ccm, cmac and gcm are the ciphers of WPA2 and WPA3.
+"""
+
+_SUFFIX: Final = ".ko"
+_DEPENDS: Final = re.compile(rb"\0depends=([^\0]*)\0")
+
+_SIGNED: Final = b"~Module signature appended~\n"
+_SIGNATURE_HEADER_BYTES: Final = 12
+"""After the signature; its last four bytes are the size of the signature."""
+
+_START: Final = """\
+#!/bin/busybox sh
+export PATH=/bin
+for name in mount insmod chroot poweroff mkdir cat; do /bin/busybox ln -s busybox /bin/$name; done
+mount -t proc proc /proc
+mount -t sysfs sys /sys
+mount -t devtmpfs dev /dev
+for name in $(cat /modules); do
+    options=
+    [ $name != mac80211_hwsim ] || options=radios={radios}
+    insmod /lib/$name.ko $options || poweroff -f
+done
+mkdir /memory
+mount -t 9p -o ro,trans=virtio,version=9p2000.L,msize=524288,cache=loose host /host || poweroff -f
+mount -t tmpfs memory /memory
+mkdir /memory/upper /memory/work
+mount -t overlay -o lowerdir=/host,upperdir=/memory/upper,workdir=/memory/work root /changed || poweroff -f
+mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 lab /changed/mnt || poweroff -f
+mount -t tmpfs run /changed/run
+for place in proc sys dev; do mount -o move /$place /changed/$place; done
+mkdir -p /changed/dev/pts /changed/dev/shm /changed/run/netns
+mount -t devpts devpts /changed/dev/pts
+mount -t tmpfs shm /changed/dev/shm
+chroot /changed /bin/sh /mnt/{job} </changed/dev/null >/changed/mnt/{output} 2>&1
+echo $? >/changed/mnt/{output}.code
+poweroff -f
+"""
+
+
+def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
+    """Return the archive.
+
+    Args:
+        modules: Folder of the kernel's modules, `/lib/modules/VERSION`.
+        radios: Number of radios of hwsim.
+        job: Name of a shell script in the folder that the machine shares; it runs on the host's files, and the
+            machine switches off at its end.
+        output: Name of the file in that folder with its output. A second one, with `.code` added to its name, has the
+            exit code; it is written last.
+
+    Raises:
+        ConfigurationError: A program, library or module is missing.
+    """
+    order = module_order(modules, MODULES)
+    files = {"init": (0o755, _START.format(radios=radios, job=job, output=output).encode())}
+    files["modules"] = 0o644, "\n".join(path.name.removesuffix(_SUFFIX) for path in order).encode()
+    files |= {f"lib/{path.name}": (0o644, without_signature(path.read_bytes())) for path in order}
+    busybox = _program("busybox")
+    files["bin/busybox"] = 0o755, busybox.read_bytes()
+    files |= {str(path).lstrip("/"): (0o755, path.read_bytes()) for path in shared_libraries(busybox)}
+    return cpio_archive(files, ("bin", "lib", "proc", "sys", "dev", "host", "changed"))
+
+
+def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
+    """Return the files of modules and of those on which they depend, each after its dependencies.
+
+    A name that is built into the kernel (`modules.builtin`) is left out.
+
+    Raises:
+        ConfigurationError: A module is missing.
+    """
+    paths = {path.name.removesuffix(_SUFFIX).replace("-", "_"): path for path in modules.rglob(f"*{_SUFFIX}")}
+    builtin_list = modules / "modules.builtin"
+    builtin = set()
+    if builtin_list.exists():
+        lines = builtin_list.read_text(encoding="ascii").split()
+        builtin = {Path(line).name.removesuffix(_SUFFIX).replace("-", "_") for line in lines}
+    order: dict[str, Path] = {}
+
+    def add(name: str) -> None:
+        if name in order or name in builtin:
+            return
+        if name not in paths:
+            raise ConfigurationError(
+                f"the kernel module {name} is missing in {modules}",
+                remedy="install the distribution's standard kernel, on Debian: apt-get install linux-image-amd64",
+            )
+        depends = _DEPENDS.search(paths[name].read_bytes())
+        for dependency in depends[1].decode().split(",") if depends else []:
+            if dependency:
+                add(dependency.replace("-", "_"))
+        order[name] = paths[name]
+
+    for name in names:
+        add(name.replace("-", "_"))
+    return list(order.values())
+
+
+def without_signature(module: bytes) -> bytes:
+    """Return a module without the signature at its end (Linux, scripts/sign-file.c): its check needs seconds."""
+    if not module.endswith(_SIGNED):
+        return module
+    end = len(module) - len(_SIGNED)
+    size = int.from_bytes(module[end - 4 : end], "big")
+    return module[: max(0, end - _SIGNATURE_HEADER_BYTES - size)]
+
+
+def shared_libraries(program: Path) -> list[Path]:
+    """Return the libraries of a program, including the dynamic linker, as `ldd` lists them; none if it is static."""
+    listed = subprocess.run(("/usr/bin/ldd", program), capture_output=True, text=True, check=False, timeout=60)
+    return [Path(match) for match in re.findall(r"(/\S+) \(0x", listed.stdout)]
+
+
+def cpio_archive(files: Mapping[str, tuple[int, bytes]], folders: Iterable[str]) -> bytes:
+    """Return a cpio archive in the format `newc`.
+
+    Args:
+        files: Permissions and content of each file, by path without a slash at the start.
+        folders: Additional folders; the folders of files are included.
+    """
+    parents = {str(parent) for path in (*files, *folders) for parent in (Path(path) / "x").parents}
+    parents -= {".", *files}
+    entries = [(path, stat.S_IFDIR | 0o755, b"") for path in sorted(parents)]
+    entries += [(path, stat.S_IFREG | mode, content) for path, (mode, content) in sorted(files.items())]
+    entries.append(("TRAILER!!!", 0, b""))
+    archive = bytearray()
+    for number, (path, mode, content) in enumerate(entries, start=1):
+        name = path.encode() + b"\0"
+        fields = (number, mode, 0, 0, 1, 0, len(content), 0, 0, 0, 0, len(name), 0)
+        archive += b"070701" + b"".join(b"%08X" % value for value in fields) + name
+        archive += bytes(-len(archive) % 4)
+        archive += content
+        archive += bytes(-len(archive) % 4)
+    return bytes(archive)
+
+
+def _program(name: str) -> Path:
+    for folder in ("/bin", "/usr/bin", "/sbin", "/usr/sbin"):
+        if (path := Path(folder, name)).exists():
+            return path.resolve()
+    raise ConfigurationError(f"{name} is missing", remedy=f"on Debian: apt-get install {name}")

@@ -1,0 +1,91 @@
+"""The radios of mac80211_hwsim in this kernel, and their way into the network namespaces of robots."""
+
+import os
+import shutil
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.errors import ConfigurationError, RobotError
+from sim_backends.emulated.process.worker import PATH
+
+_FOLDER: Final = Path("/sys/class/ieee80211")
+_CLASS: Final = "mac80211_hwsim"
+_MODULE: Final = Path("/sys/module/mac80211_hwsim")
+_RADIO_BIT: Final = 0x40
+_RETURN_S: Final = 5.0
+"""The kernel returns the radios of a network namespace some time after its last process has exited."""
+_POLL_S: Final = 0.05
+_TIMEOUT_S: Final = 60.0
+
+
+@dataclass(frozen=True)
+class HwsimRadio:
+    """A radio of hwsim.
+
+    Attributes:
+        phy: Name of its device, `phy0`.
+        interface: Name of its network interface, `wlan0`.
+        address: Address by which hwsim names it, which differs in one bit from that of the interface.
+    """
+
+    phy: str
+    interface: str
+    address: str
+
+    def move_to_namespace(self, pid: int) -> None:
+        """Move the radio into the network namespace of a process; it returns when the namespace ends.
+
+        Raises:
+            RobotError: The kernel refused it.
+        """
+        argv = (shutil.which("iw", path=PATH) or "iw", "phy", self.phy, "set", "netns", str(pid))
+        ended = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+        if ended.returncode:
+            cause = ended.stderr.strip()
+            raise RobotError(f"cannot move {self.phy} to a robot: {cause}", remedy="start the lab again")
+
+
+def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:
+    """Return the radios of hwsim in this network namespace that have an interface, in the order of their numbers.
+
+    Args:
+        folder: Folder of the kernel's wireless devices.
+    """
+    radios = []
+    for entry in sorted(folder.glob("phy*"), key=lambda entry: int(entry.name.removeprefix("phy"))):
+        interfaces = sorted(path.name for path in (entry / "device" / "net").glob("*"))
+        if interfaces and _CLASS in (entry / "device" / "subsystem").resolve().parts:
+            first, *others = (entry / "macaddress").read_text(encoding="ascii").strip().split(":")
+            address = ":".join((f"{int(first, 16) | _RADIO_BIT:02x}", *others))
+            radios.append(HwsimRadio(entry.name, interfaces[0], address))
+    return radios
+
+
+def runs_here() -> bool:
+    """Return True if this process can use radios of hwsim: it is root, and the kernel has the module."""
+    return os.geteuid() == 0 and _MODULE.exists()
+
+
+def require_radios(count: int, wait_s: float = _RETURN_S) -> list[HwsimRadio]:
+    """Return this number of radios.
+
+    Args:
+        count: The number.
+        wait_s: Maximum time to wait for radios of a lab that has just ended.
+
+    Raises:
+        ConfigurationError: There are fewer.
+    """
+    deadline = Deadline.after(wait_s)
+    while len(radios := find_radios()) < count and not deadline.expired:
+        time.sleep(_POLL_S)
+    if len(radios) < count:
+        raise ConfigurationError(
+            f"the lab has {count} robots, but mac80211_hwsim has {len(radios)} radios here",
+            remedy=f"as root: modprobe -r mac80211_hwsim; modprobe mac80211_hwsim radios={count}",
+        )
+    return radios[:count]

@@ -1,0 +1,93 @@
+"""Rate chains of mac80211: the mode of each try, and the tries that were made in each stage.
+
+The radio model has 802.11g and the modes of 802.11n with one stream in 20 MHz. Stages in other modes are mapped:
+
+- DSSS and CCK (802.11b) have the airtime and the robustness of 6 Mbit/s.
+- A short guard interval counts as a long one.
+- Two or more streams, 40 MHz and wider, and modes of 802.11ac above MCS 7 are never tried: they fail without airtime,
+  so minstrel_ht avoids them, as on a radio with one antenna.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from sim_backends.emulated.linux_wifi.hwsim_messages import (
+    RATE_40_MHZ,
+    RATE_80_MHZ,
+    RATE_160_MHZ,
+    RATE_MCS,
+    RATE_VHT,
+    RateStage,
+)
+from sim_backends.radio.modes import G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMode
+
+_DSSS_RATES: Final = 4
+"""1, 2, 5.5 and 11 Mbit/s, with which the list of the band at 2.4 GHz begins."""
+_FIRST_5_GHZ_MHZ: Final = 3_000
+_WIDE: Final = RATE_40_MHZ | RATE_80_MHZ | RATE_160_MHZ
+
+
+@dataclass(frozen=True)
+class RateChain:
+    """The tries of a frame.
+
+    Attributes:
+        modes: Mode of each try.
+        stages: For each try, the number of its stage.
+        skipped: For each stage, True if its mode is not in the radio model.
+        declared: Number of tries of each stage in the chain.
+    """
+
+    modes: tuple[WifiMode, ...]
+    stages: tuple[int, ...]
+    skipped: tuple[bool, ...]
+    declared: tuple[int, ...]
+
+    def tries_made(self, attempts: int) -> list[int]:
+        """Return the number of tries in each stage, after this number of attempts on the air.
+
+        Skipped stages before the last attempt count as tried and failed; all stages do if none is in the radio model.
+        """
+        last = self.stages[attempts - 1] if attempts else len(self.skipped) - 1
+        on_air = Counter(self.stages[:attempts])
+        return [self.declared[stage] if self.skipped[stage] else on_air[stage] for stage in range(last + 1)]
+
+
+def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: int = SHORT_RETRY_LIMIT) -> RateChain:
+    """Return the tries of a chain of stages, at most `max_tries`; without a stage there is one in the basic mode."""
+    used = list(stages) or [RateStage(0, 1)]
+    modes: list[WifiMode] = []
+    numbers: list[int] = []
+    skipped = []
+    for number, stage in enumerate(used):
+        mode = mode_of(stage, frequency_mhz)
+        skipped.append(mode is None)
+        if mode is not None:
+            tries = min(max(stage.tries, 1), max_tries - len(modes))
+            modes += [mode] * tries
+            numbers += [number] * tries
+    declared = tuple(max(stage.tries, 1) for stage in used)
+    return RateChain(tuple(modes), tuple(numbers), tuple(skipped), declared)
+
+
+def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
+    """Return the mode of a stage in the radio model, or None if the model does not have it."""
+    if stage.flags & _WIDE:
+        return None
+    if stage.flags & (RATE_MCS | RATE_VHT):
+        # VHT: the MCS is in the four lower bits, the number of streams minus one above; HT: MCS 8 has two streams.
+        return N_MODES[stage.index] if 0 <= stage.index < len(N_MODES) else None
+    index = stage.index if frequency_mhz >= _FIRST_5_GHZ_MHZ else stage.index - _DSSS_RATES
+    if index < 0:
+        return G_MODES[0]
+    return G_MODES[index] if index < len(G_MODES) else None
+
+
+def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
+    """Return the index of a mode in the list of the band; for an MCS, that of its modulation and code rate."""
+    coding = (mode.modulation, mode.code_rate)
+    indices = [index for index, g_mode in enumerate(G_MODES) if (g_mode.modulation, g_mode.code_rate) == coding]
+    index = indices[0] if indices else len(G_MODES) - 1
+    return index if frequency_mhz >= _FIRST_5_GHZ_MHZ else index + _DSSS_RATES

@@ -1,0 +1,68 @@
+"""The lab's client of the medium of hwsim: it has the socket that is registered at the kernel."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from typing_extensions import override
+
+from fieldkit.config.profiles import Radio
+from sim_backends.emulated.linux_wifi.hwsim_socket import open_registered
+from sim_backends.emulated.linux_wifi.radios import HwsimRadio
+from sim_backends.emulated.medium.medium_client import MediumClient
+from sim_backends.emulated.process.worker import Worker
+from sim_backends.radio.antennas import antenna_of
+from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.world.world import World
+
+
+class WifiClient(MediumClient):
+    """Starts the medium of hwsim's radios. Arguments as `MediumClient`.
+
+    This object keeps the registered socket open. If the medium is killed or suspended, no frame is delivered.
+
+    Args:
+        radios: Radio of each robot, by its name.
+
+    Raises:
+        ConfigurationError: The kernel has no hwsim, or a program of util-linux is missing.
+    """
+
+    module = "sim_backends.emulated.linux_wifi.medium_program"
+
+    def __init__(
+        self, options: RadioOptions, world: World | None = None, *, seed: int, radios: Mapping[str, HwsimRadio]
+    ) -> None:
+        self._kernel = open_registered()
+        self._seed = seed
+        self._radios = dict(radios)
+        self._setups: dict[str, dict[str, Any]] = {}
+        super().__init__(options, world, seed=seed)
+
+    @override
+    def _start(self) -> Worker:
+        descriptor = self._kernel.fileno()
+        return Worker("medium", self.module, words=("--fd", str(descriptor)), descriptors=(descriptor,))
+
+    @override
+    def attach(
+        self, name: str, address: str, radio: Radio, fd: int | None, *, physics_fds: Sequence[int] = ()
+    ) -> None:
+        antenna = antenna_of(radio)
+        self._setups[name] = {
+            "address": self._radios[name].address,
+            "standard": antenna.standard,
+            "tx_power_dbm": antenna.tx_power_dbm,
+            "sensitivity_dbm": antenna.sensitivity_dbm,
+        }
+        self._robots.add(name)
+
+    @override
+    def _configure(self) -> None:
+        world = None if self._world is None else self._world.model_dump(mode="json")
+        options = self._options.model_dump(mode="json")
+        self._worker.request({"seed": self._seed, "radios": self._setups, "options": options, "world": world})
+
+    @override
+    def close(self) -> None:
+        super().close()
+        self._kernel.close()

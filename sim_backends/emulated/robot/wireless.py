@@ -1,0 +1,119 @@
+"""Wi-Fi of Linux on an emulated robot: an ad hoc cell, an access point of hostapd, or a station of wpa_supplicant."""
+
+import shutil
+import subprocess
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.errors import RobotError
+from sim_backends.emulated.robot import network
+from sim_backends.emulated.robot.spec import STATE, WifiSpec
+
+SSID: Final = "fieldkit"
+
+_CHANNEL: Final = 1
+_FREQUENCY_MHZ: Final = 2412
+# Two radios that search for a cell at the same time would create two cells, so all of them join a fixed one.
+_CELL: Final = "02:66:69:65:6c:64"
+_TIMEOUT_S: Final = 15.0
+_PRIORITY_RULE: Final = """\
+table inet fieldkit {
+    chain output {
+        type filter hook output priority 0
+        meta priority set 0:0107
+    }
+}
+"""
+"""Sends all packets in access category VO.
+
+The other categories would use block-ACK sessions, in which mac80211 ignores the tries that hwsim reports. hwsim has
+no queues per category, so this changes nothing else.
+"""
+
+_ACCESS_POINT: Final = """\
+interface={interface}
+ssid={ssid}
+hw_mode=g
+channel={channel}
+ieee80211n=1
+wmm_enabled=1
+wpa=2
+wpa_key_mgmt=WPA-PSK
+rsn_pairwise=CCMP
+wpa_passphrase={passphrase}
+"""
+_STATION: Final = """\
+network={{
+    ssid="{ssid}"
+    psk="{passphrase}"
+    scan_freq={frequency_mhz}
+}}
+"""
+_CONFIGURATION: Final = Path(STATE, "wifi.conf")
+PROGRAMS: Final = {"access point": "hostapd", "station": "wpa_supplicant"}
+"""Program of each part that needs one."""
+_CONNECTED: Final = {"access point": "AP-ENABLED", "station": "CTRL-EVENT-CONNECTED"}
+
+
+def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
+    """Bring up loopback and a Wi-Fi interface in this process's network namespace.
+
+    Args:
+        device: Present name of the interface.
+        interface: Its new name.
+        address: Its address with the prefix length.
+        wifi: Part of the robot in the Wi-Fi network; its program is started later.
+
+    Raises:
+        RobotError: A tool rejected a setting.
+    """
+    network.disable_ipv6()
+    if device != interface:
+        network.run_ip(f"link set {device} name {interface}")
+    _run("nft", "-f", "-", text=_PRIORITY_RULE)
+    if wifi.part == "ad hoc":
+        _run("iw", "dev", interface, "set", "type", "ibss")
+    network.configure(interface, address)
+    rejoin(interface, wifi)
+
+
+def rejoin(interface: str, wifi: WifiSpec) -> None:
+    """Join the ad hoc cell again after the interface was down; hostapd and wpa_supplicant do this themselves.
+
+    Raises:
+        RobotError: The kernel rejected it.
+    """
+    if wifi.part == "ad hoc":
+        join = ("ibss", "join", SSID, str(_FREQUENCY_MHZ), "HT20", "fixed-freq", _CELL)
+        _run("iw", "dev", interface, *join)
+
+
+def command(interface: str, wifi: WifiSpec) -> tuple[str, ...]:
+    """Write the configuration of the robot's hostapd or wpa_supplicant, and return its command line."""
+    _CONFIGURATION.touch(mode=0o600)
+    template = _ACCESS_POINT if wifi.part == "access point" else _STATION
+    _CONFIGURATION.write_text(
+        template.format(
+            interface=interface,
+            ssid=SSID,
+            channel=_CHANNEL,
+            frequency_mhz=_FREQUENCY_MHZ,
+            passphrase=wifi.passphrase,
+        ),
+        encoding="ascii",
+    )
+    program = PROGRAMS[wifi.part]
+    options = () if wifi.part == "access point" else ("-i", interface, "-c")
+    return (shutil.which(program) or program, *options, str(_CONFIGURATION))
+
+
+def is_connected(wifi: WifiSpec) -> bool:
+    """Return True if the robot's program has reported that its access point is on, or that it is connected."""
+    log = Path(STATE, f"{PROGRAMS[wifi.part]}.log")
+    return log.exists() and _CONNECTED[wifi.part] in log.read_text(encoding="utf-8", errors="replace")
+
+
+def _run(*argv: str, text: str = "") -> None:
+    ended = subprocess.run(argv, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    if ended.returncode:
+        raise RobotError(f"{argv[0]} rejected a setting: {ended.stderr.strip()}", remedy=f"update {argv[0]}")

@@ -1,0 +1,44 @@
+"""Radios of hwsim among the wireless devices of a kernel."""
+
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.emulated.linux_wifi import radios
+from sim_backends.emulated.linux_wifi.radios import HwsimRadio, find_radios
+
+
+def add_device(root: Path, number: int, driver: str, interface: str | None) -> None:
+    device = root / "devices" / f"device{number}"
+    (device / "net").mkdir(parents=True)
+    if interface is not None:
+        (device / "net" / interface).mkdir()
+    (root / "class" / driver).mkdir(parents=True, exist_ok=True)
+    (device / "subsystem").symlink_to(root / "class" / driver)
+    phy = root / "ieee80211" / f"phy{number}"
+    phy.mkdir(parents=True)
+    (phy / "device").symlink_to(device)
+    (phy / "macaddress").write_text(f"02:00:00:00:{number:02x}:00\n")
+
+
+def test_only_radios_of_hwsim_with_an_interface_are_used_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    add_device(tmp_path, 0, "pci", "wlp1s0")
+    add_device(tmp_path, 10, "mac80211_hwsim", "wlan2")
+    add_device(tmp_path, 2, "mac80211_hwsim", "wlan1")
+    add_device(tmp_path, 3, "mac80211_hwsim", None)
+    assert find_radios(tmp_path / "ieee80211") == [
+        HwsimRadio("phy2", "wlan1", "42:00:00:00:02:00"),
+        HwsimRadio("phy10", "wlan2", "42:00:00:00:0a:00"),
+    ]
+    assert find_radios(tmp_path / "missing") == []
+
+
+def test_too_few_radios_are_an_error_with_the_command_that_adds_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(radios, "find_radios", lambda: [HwsimRadio("phy0", "wlan0", "42:00:00:00:00:00")])
+    assert len(radios.require_radios(1, wait_s=0.0)) == 1
+    with pytest.raises(ConfigurationError) as caught:
+        radios.require_radios(3, wait_s=0.0)
+    assert "radios=3" in caught.value.remedy
