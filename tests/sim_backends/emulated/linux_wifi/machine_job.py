@@ -33,7 +33,7 @@ CAST = {
 OPTIONS = {"fading": False, "shadowing_db": 0.0}
 NEAR = {"r0": (0.0, 0.0, 1.0), "r1": (10.0, 0.0, 1.0), "r2": (5.0, 5.0, 1.0)}
 FAR = {**NEAR, "r1": (9000.0, 0.0, 1.0)}
-JOIN_S = 240.0
+JOIN_S = 60.0
 
 
 def run(*argv: str, may_fail: bool = False) -> str:
