@@ -3,7 +3,9 @@
 Needs what `radio_vs_ns3` needs. All modes: airtimes, and packet errors of 1000 bytes. Known differences of
 airtimes are ns-3's: it does not end the data of short guard intervals at multiples of 4 us (19.4.3, 21.4.3), omits
 VHT-SIG-B (4 us) of frames to one station, and gives each HE-LTF 8 us at all guard intervals. Then goodput with A-MPDU
-in one mode, without RTS: one station at signal-to-noise ratios down to the end of its range, and several stations.
+in one mode: one station at signal-to-noise ratios down to the end of its range; several stations, also without ns-3's
+retry limit and BlockAckReq (`bare`: 3.37 counts the failed aggregates to a receiver across successful ones, and drops
+a whole aggregate at the seventh); with RTS; and with access categories.
 """
 
 import argparse
@@ -28,6 +30,7 @@ STREAMS: Final = (1, 2)
 HT20_7: Final = format_modes("HT", "2.4 GHz", 20, 1, 800)[7]
 RATIOS_DB: Final = (40.0, 26.0, 24.5, 24.0, 23.5, 23.0)
 STATIONS: Final = (2, 5, 10, 20)
+DSCPS: Final = {"background": 8, "video": 40, "voice": 48}
 QUEUED: Final = 300
 SECONDS: Final = 2.0
 HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
@@ -92,14 +95,26 @@ def error_curves(ns3: Ns3) -> dict[str, list[tuple[float, float, float]]]:
     return curves
 
 
-def goodput_mbit_s(mode: WifiMode, ratio_db: float, stations: int) -> float:
-    """Return the goodput of saturated stations with A-MPDU in the radio model, all at one signal-to-noise ratio."""
+def goodput_mbit_s(
+    mode: WifiMode, ratio_db: float, stations: int, *, rts: bool = False, dscp: int | None = None
+) -> float:
+    """Return the goodput of saturated stations with A-MPDU in the radio model, all at one signal-to-noise ratio.
+
+    Args:
+        mode: Their mode.
+        ratio_db: The ratio.
+        stations: Number of stations.
+        rts: True if they send RTS before each aggregate.
+        dscp: DSCP of all packets, for stations with access categories; None for stations without.
+    """
     phy = PhyCapability(
         "n" if mode.phy_format == "HT" else "ac" if mode.phy_format == "VHT" else "ax",
         mode.band.name,
         mode.width_mhz,
         mode.streams,
         mode.guard_interval_ns,
+        rts_threshold_bytes=0 if rts else None,
+        access_categories=None if dscp is None else "linux",
     )
     names = [*(f"s{number}" for number in range(stations)), "receiver"]
     antennas = {name: Antenna("802.11n", TX_POWER_DBM, SENSITIVITY_DBM, phy) for name in names}
@@ -108,7 +123,7 @@ def goodput_mbit_s(mode: WifiMode, ratio_db: float, stations: int) -> float:
     wifi: Wifi[str] = Wifi(channel, 1)
     for name in names[:-1]:
         for _ in range(QUEUED):
-            wifi.send(0, name, name, PAYLOAD_BYTES + 28, "receiver")
+            wifi.send(0, name, name, PAYLOAD_BYTES + 28, "receiver", dscp=dscp or 0)
     arrived = lost = 0
     while (now_ns := wifi.next_event_ns()) is not None and now_ns < SECONDS * 1e9:
         sources = [source for _, _, _, source, _ in wifi.deliveries(now_ns)]
@@ -117,7 +132,7 @@ def goodput_mbit_s(mode: WifiMode, ratio_db: float, stations: int) -> float:
         sources += names[:1] * (lost_now - lost)
         lost = lost_now
         for source in sources:
-            wifi.send(now_ns, source, source, PAYLOAD_BYTES + 28, "receiver")
+            wifi.send(now_ns, source, source, PAYLOAD_BYTES + 28, "receiver", dscp=dscp or 0)
     return arrived * PAYLOAD_BYTES * 8 / SECONDS / 1e6
 
 
@@ -134,6 +149,19 @@ def goodputs(ns3: Ns3) -> list[Row]:
         ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
         name = f"{HT20_7.name}, {ratio_db} dB, {stations} stations"
         rows.append((name, ns3_value, goodput_mbit_s(HT20_7, ratio_db, stations)))
+    common = ns3_options(HT20_7) | {"loss": _loss_db(50.0), "ampdu": 65_535, "bare": 1}
+    for stations in STATIONS:
+        for rts in (False, True):
+            options = common | {"stations": stations} | ({"rts": 0} if rts else {})
+            ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
+            name = f"bare, {'RTS, ' * rts}{stations} stations"
+            rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, rts=rts)))
+    for category, dscp in DSCPS.items():
+        for stations in (1, 2):
+            options = common | {"stations": stations, "classes": dscp << 2}
+            ns3_value = float(ns3(seconds=SECONDS, payload=PAYLOAD_BYTES, **options))
+            name = f"{category}, {stations} stations"
+            rows.append((name, ns3_value, goodput_mbit_s(HT20_7, 50.0, stations, dscp=dscp)))
     return rows
 
 

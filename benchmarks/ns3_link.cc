@@ -90,6 +90,7 @@ struct Options
     uint32_t rts = 4692480;
     bool bare = false;
     std::string classes = "0";
+    bool txop = true;
     std::string band = "BAND_2_4GHZ";
     bool relay = false;
     bool adapt = false;
@@ -201,12 +202,24 @@ std::vector<double> Goodputs(const Options& options)
     auto devices = Install(options, nodes);
     // ns-3 uses the long slot of 802.11b, but there are no such stations.
     Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Phy/Slot", TimeValue(MicroSeconds(9)));
+    if (!options.txop)
+    {
+        for (std::string category : {"VI", "VO"})
+        {
+            Config::Set("/NodeList/*/DeviceList/*/$ns3::WifiNetDevice/Mac/" + category + "_Txop/TxopLimit", TimeValue(Seconds(0)));
+        }
+    }
     MobilityHelper mobility;
     mobility.Install(nodes);
     InternetStackHelper internet;
     internet.Install(nodes);
     Ipv4AddressHelper addresses("10.0.0.0", "255.255.255.0");
     auto interfaces = addresses.Assign(devices);
+    if (options.classes != "0")
+    {
+        // ARP is best effort: saturated stations of a higher category would prevent it.
+        NeighborCacheHelper().PopulateNeighborCache(interfaces);
+    }
     std::vector<uint8_t> classes;
     std::istringstream words(options.classes);
     for (std::string word; std::getline(words, word, ',');)
@@ -453,6 +466,7 @@ int main(int argc, char** argv)
     command.AddValue("rts", "size of the largest frame without RTS, bytes", options.rts);
     command.AddValue("bare", "without BlockAckReq and without a retry limit", options.bare);
     command.AddValue("classes", "traffic classes (TOS) of the stations, by turns, comma-separated", options.classes);
+    command.AddValue("txop", "with the default TXOP limits of video and voice, instead of one exchange", options.txop);
     command.AddValue("band", "ns-3's name of the band", options.band);
     command.AddValue("relay", "send through an access point", options.relay);
     command.AddValue("adapt", "choose the mode by Minstrel", options.adapt);

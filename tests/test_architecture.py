@@ -391,6 +391,7 @@ FEDERATE_SEAMS = {
     "sim_backends/cosim/scenario/external.py": {
         "frames",
         "handshake",
+        "ip_radio",
         "named",
         "protocols",
         "remote",

@@ -2,9 +2,9 @@
 
 import inspect
 from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from pathlib import Path
-from typing import Final
+from typing import Final, get_args
 
 from docs.generator.commands import commands
 from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
@@ -20,7 +20,7 @@ from fieldkit.config import loops
 from fieldkit.config.documentation import attribute_meanings, class_description
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
-from fieldkit.core import campaign_events, errors, events, sweep_events
+from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.measure.transfers.fates import PACKET_COLUMNS
@@ -305,13 +305,10 @@ def json_events() -> str:
             "`event`, `utc_ns` and the fields below. How a program answers requests: [automation](../automation.md)."
         ),
     ]
-    for module in (events, campaign_events, sweep_events):
-        for name, record in vars(module).items():
-            if not (inspect.isclass(record) and is_dataclass(record) and record.__module__ == module.__name__):
-                continue
-            meanings = attribute_meanings(record)
-            lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
-            blocks += [f"## {_snake(name)}", class_description(record), table(("field", "meaning"), lines)]
+    for record in get_args(events.Event):
+        meanings = attribute_meanings(record)
+        lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
+        blocks += [f"## {_snake(record.__name__)}", class_description(record), table(("field", "meaning"), lines)]
     return page("JSON events", *blocks)
 
 

@@ -70,13 +70,14 @@ def read(folder: Path, declared: Mapping[str, Column]) -> tuple[dict[str, Number
     """
     partitions = pa.schema([(name, pa.string()) for name in dict(_metadata(folder, "partitions") or {})])  # type: ignore[call-overload]
     partitioning = pa.dataset.partitioning(partitions, flavor="hive")
+    base = folder.absolute()  # threads of pyarrow open the files, and may have another working folder than this one
     try:
         dataset = pa.dataset.dataset(
-            sorted(map(str, folder.rglob("*.parquet"))),
+            sorted(map(str, base.rglob("*.parquet"))),
             schema=pa.schema([*_schema(folder), *partitions]),
             format="parquet",
             partitioning=partitioning,
-            partition_base_dir=str(folder),
+            partition_base_dir=str(base),
         )
         table = dataset.to_table([name for name in dataset.schema.names if name in declared])
         present = {

@@ -328,6 +328,11 @@ class RobotProfile(catalog.Named, Sectioned):
     limits: Limits
 
     @property
+    def topics(self) -> tuple[PublishedTopic, ...]:
+        """The topics that the robot publishes; none without ROS."""
+        return self.ros.topics if self.ros else ()
+
+    @property
     def sections(self) -> Mapping[str, ProfileSection]:
         """Its sections of installed packages, by key."""
         extra = self.model_extra or {}

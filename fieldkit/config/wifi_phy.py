@@ -4,10 +4,11 @@ import re
 from typing import Annotated, Final, Literal, cast
 
 from fieldkit.config import schema
-from fieldkit.config.schema import Duration, Field, Int, Number, Strict
+from fieldkit.config.schema import Bool, Duration, Field, Int, Number, Strict
 
 WifiAmendment = Literal["n", "ac", "ax"]
 WifiBand = Literal["2.4 GHz", "5 GHz", "6 GHz"]
+DscpMapping = Literal["linux", "rfc8325"]
 WifiRateControl = Literal["minstrel", "minstrel_ht", "firmware"]
 
 _STANDARD: Final = re.compile(r"802\.11(n|ac|ax) (2\.4 GHz|5 GHz|6 GHz)")
@@ -43,6 +44,11 @@ class WifiPhy(Strict):
         firmware_interval: Rate control `firmware`: time between two selections of a rate, 1 ms to 10 s.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
             key it sends no RTS, as with `iw phy PHY set rts off`.
+        access_categories: It has the four access categories of EDCA, into which packets come by their DSCP: `linux`
+            (its upper three bits, Linux up to 6.10) or `rfc8325`. Without this key all packets are best effort.
+        power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
+            default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
+        power_save_timeout: Time after its last frame after which it dozes, 1 ms to 10 s; 100 ms in mac80211.
     """
 
     width_mhz: Int = 20
@@ -52,6 +58,9 @@ class WifiPhy(Strict):
     firmware_margin_db: Annotated[Number | Int, Field(ge=0, le=20)] = 3.0
     firmware_interval: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
     rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
+    access_categories: DscpMapping | None = None
+    power_save: Bool = False
+    power_save_timeout: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
 
     @schema.model_validator(mode="after")
     def _check(self) -> "WifiPhy":

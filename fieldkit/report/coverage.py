@@ -152,14 +152,10 @@ def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> I
         quantity: The quantity.
         evidence: The table and the available plans.
     """
-    measured_groups = {_group(cell) for cell in cells if quantity.name in cell.estimates}
+    measured_groups = {wording.group(cell) for cell in cells if quantity.name in cell.estimates}
     for cell in cells:
-        if _group(cell) in measured_groups and _is_measured(cell, quantity, cells, evidence):
+        if wording.group(cell) in measured_groups and _is_measured(cell, quantity, cells, evidence):
             yield from _absences_of(cell, quantity, evidence)
-
-
-def _group(cell: Cell) -> tuple[str, str]:
-    return wording.text(cell, "protocol"), wording.text(cell, "topology")
 
 
 def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence: Evidence) -> bool:

@@ -59,7 +59,7 @@ def is_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> b
     cells_without = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
     metres: dict[tuple[str, str], set[float]] = {}
     for cell in (*_placed(cells, quantity), *cells_without):
-        metres.setdefault(_group(cell), set()).add(wording.metres(cell))
+        metres.setdefault(wording.group(cell), set()).add(wording.metres(cell))
     return any(len(places) > 1 for places in metres.values())
 
 
@@ -78,9 +78,11 @@ def by_size(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Ma
 
 def with_missing(cells: Sequence[Cell], quantity: Quantity, group: Sequence[Cell]) -> list[Cell]:
     """Return the cells of a group, and the cells of the same protocols and topologies without the quantity."""
-    groups = {_group(cell) for cell in group}
+    groups = {wording.group(cell) for cell in group}
     return [
-        cell for cell in cells if cell in group or (_group(cell) in groups and quantity.name not in cell.estimates)
+        cell
+        for cell in cells
+        if cell in group or (wording.group(cell) in groups and quantity.name not in cell.estimates)
     ]
 
 
@@ -194,10 +196,6 @@ class _CurveDrawing:
                 if isinstance(place.content, Absence)
             ],
         )
-
-
-def _group(cell: Cell) -> tuple[str, str]:
-    return wording.text(cell, "protocol"), wording.text(cell, "topology")
 
 
 def _capital(label: str) -> str:

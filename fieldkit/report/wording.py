@@ -39,6 +39,11 @@ def text(cell: Cell, name: str) -> str:
     return str(cell.key[name] or "")
 
 
+def group(cell: Cell) -> tuple[str, str]:
+    """Return protocol and topology of a cell, or empty strings if they are missing."""
+    return text(cell, "protocol"), text(cell, "topology")
+
+
 def metres(cell: Cell) -> float:
     """Return a cell's distance in metres, or 0 if it is missing."""
     value_m = cell.key["distance_m"]

@@ -168,7 +168,7 @@ class EmulatedBackend:
             and drives_by_topic(robot.profile, self._options)
             and drive.topic_conflict(robot, cast.values()) is None
         )
-        is_flown = mavlink_of(robot.profile) is not None and self._options.has_autopilots
+        is_flown = mavlink_of(robot.profile) is not None
         return frozenset({DRIVE} if is_driven else ()) | frozenset({MAVLINK} if is_flown else ())
 
     @contextmanager
@@ -242,13 +242,13 @@ class EmulatedBackend:
         from sim_backends.emulated import placement, simulator_choice  # noqa: PLC0415 (as in `open`)
         from sim_backends.gazebo.sdf import SdfRobot, world_sdf  # noqa: PLC0415 (as above)
 
-        members, options = self._members(), self._options.model_copy(update={"physics": simulator_choice.GAZEBO})
+        members = self._members()
         places_m = placement.square_m(members, self._world)
         robots = {
             name: SdfRobot(body.limits, placement.below_antenna_m(places_m[name]), 0.0)
-            for name, body in simulator_choice.bodies_of(members.values(), options).items()
+            for name, body in simulator_choice.bodies_of(members.values()).items()
         }
-        step_ns = simulator_choice.sync_of(options).step_ns
+        step_ns = simulator_choice.sync_of(self._options).step_ns
         return world_sdf(
             self._world, robots, step_ns=step_ns, version="garden" if version == "garden" else "fortress"
         )
@@ -262,9 +262,19 @@ class EmulatedBackend:
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for robot in robots.values():
+            self._check_flight(robot)
             _check_ros(robot, self._options)
             for sensor in sensors_of(robot):
                 sensor_specs.check(sensor)
+
+    def _check_flight(self, robot: "Robot | LabRobot") -> None:
+        """Raise ConfigurationError for a drone in Gazebo, whose robots have no thrust."""
+        if self._options.physics == "gazebo" and mavlink_of(robot.profile) is not None:
+            raise ConfigurationError(
+                f"an autopilot cannot fly the drone {robot.name} in Gazebo",
+                where=self._document.where(("emulated", "physics")) if self._document else "",
+                remedy="write physics: mujoco or physics: kinematic, or remove the drone from the site file",
+            )
 
     def _note_simulators(self, sink: Sink) -> None:
         if self.simulators:

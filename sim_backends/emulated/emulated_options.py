@@ -152,7 +152,7 @@ class EmulatedOptions(Strict):
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
         physics: The robots move [on the co-simulation](lab-cosim.md), by this physics: `kinematic`, `mujoco` or
-            `gazebo`. If only `network` is given, `kinematic`. In `gazebo` drones have no autopilot.
+            `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
         sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which
             adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event
@@ -184,11 +184,6 @@ class EmulatedOptions(Strict):
     def is_cosimulated(self) -> bool:
         """True if the robots run on the co-simulation."""
         return self.physics is not None or self.network is not None
-
-    @property
-    def has_autopilots(self) -> bool:
-        """True if drones have an autopilot: Gazebo's robots have no thrust, so it cannot fly them."""
-        return self.physics != "gazebo"
 
     @schema.model_validator(mode="after")
     def _check_sync(self) -> "EmulatedOptions":

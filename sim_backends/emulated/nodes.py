@@ -344,7 +344,7 @@ def _cosimulated(
     simulators = simulator_choice.resolve(options)
     sync = simulator_choice.sync_of(options)
     policy = {"name": sync.name, **sync.parameters}
-    bodies = simulator_choice.bodies_of(robots.values(), options)
+    bodies = simulator_choice.bodies_of(robots.values())
     return CosimulatedClient(
         options.radio, world, seed=seed, framing=framing, bodies=bodies, simulators=simulators, policy=policy
     )

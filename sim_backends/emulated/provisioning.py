@@ -85,19 +85,15 @@ def definition(kind: str, text: str = "") -> Definition:
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
     """Return the sensors of a robot, one per published topic. Errors as `template_of`."""
-    return tuple(_sensor(topic) for topic in _topics(robot))
+    return tuple(_sensor(topic) for topic in robot.profile.topics)
 
 
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
     """Return the definitions of the message types that a robot publishes; errors as `template_of`."""
-    definitions = {topic.type: definition(topic.type, topic.definition) for topic in _topics(robot)}
+    definitions = {topic.type: definition(topic.type, topic.definition) for topic in robot.profile.topics}
     if static_frames.links(sensors_of(robot)):
         definitions[static_frames.TYPE] = definition(static_frames.TYPE)
     return definitions
-
-
-def _topics(robot: "Robot | LabRobot") -> tuple[PublishedTopic, ...]:
-    return robot.profile.ros.topics if robot.profile.ros else ()
 
 
 def _sensor(topic: PublishedTopic) -> Sensor:
@@ -154,7 +150,7 @@ def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) ->
     """
     registered: set[str] = set()
     for other in robots:
-        topics = [topic.name for topic in _topics(robots[other])]
+        topics = [topic.name for topic in robots[other].profile.topics]
         if other == key:
             return tuple(topic for topic in topics if topic not in registered)
         if ros_master_of(robots[other]) == ros_master_of(robots[key]) != LOOPBACK:
@@ -250,8 +246,8 @@ def robot_spec(
     is_ros2 = profile_ros is not None and profile_ros.variant == "ros2"
     ros2_over_radio = _ros2_spec(robots, robot, options)
     has_debian_ros1 = ros is RosChoice.DEBIAN and profile_ros is not None and not is_ros2
-    mavlink, limits = mavlink_of(robot.profile) if options.has_autopilots else None, robot.profile.limits
-    has_laser = any(topic.type == LASER_SCAN for topic in _topics(robot))
+    mavlink, limits = mavlink_of(robot.profile), robot.profile.limits
+    has_laser = any(topic.type == LASER_SCAN for topic in robot.profile.topics)
     return RobotSpec(
         name=robot.name,
         interface=robot.profile.radio.interface,

@@ -109,13 +109,9 @@ def _network(options: EmulatedOptions) -> str:
     return command_line(name, NETWORK)
 
 
-def bodies_of(robots: Iterable[Robot | LabRobot], options: EmulatedOptions) -> dict[str, RobotBody]:
-    """Return the bodies of robots, by name; a drone has one if the physics flies it."""
-    return {
-        robot.name: _body(robot.profile)
-        for robot in robots
-        if mavlink_of(robot.profile) is None or options.has_autopilots
-    }
+def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
+    """Return the bodies of robots, by name."""
+    return {robot.name: _body(robot.profile) for robot in robots}
 
 
 def _body(profile: RobotProfile) -> RobotBody:

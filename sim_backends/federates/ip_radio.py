@@ -71,8 +71,9 @@ class IpRadio:
         *,
         packet: PacketIdentity | None = None,
         before: Delay = 0,  # noqa: ARG002 (see RadioModel)
+        dscp: int = 0,  # noqa: ARG002
     ) -> None:
-        """Implement `RadioModel.send`."""
+        """Implement `RadioModel.send`; a federate has one access category."""
         if destination is not None:
             receivers, protocol, identity = [destination], UNICAST, packet or payload.identity
         else:
@@ -150,6 +151,6 @@ class IpRadio:
         parts = self._parts.pop(arrival.packet_id, None)
         if parts is None:
             return PACKET
-        queueing_ns, transmission_ns, propagation_ns = parts
-        times = QUEUING_NS * queueing_ns + TRANSMISSION_NS * transmission_ns + PROPAGATION_NS * propagation_ns
+        queuing_ns, transmission_ns, propagation_ns = parts
+        times = QUEUING_NS * queuing_ns + TRANSMISSION_NS * transmission_ns + PROPAGATION_NS * propagation_ns
         return PACKET + times

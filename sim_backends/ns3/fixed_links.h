@@ -219,7 +219,7 @@ class FixedLinks : public SimpleChannel
             at_ns += static_cast<int64_t>(Draw(hop, "jitter") * static_cast<double>(parameters.jitter_ns));
         }
         at_ns = link.last_ns = std::max(at_ns, link.last_ns); // packets do not overtake each other
-        hop.parts.queueing_ns += start_ns - now_ns;
+        hop.parts.queuing_ns += start_ns - now_ns;
         hop.parts.transmission_ns += transmission_ns;
         hop.parts.propagation_ns += at_ns - sent_ns;
         uint32_t context = (*m_stations)[hop.to].node->GetId();

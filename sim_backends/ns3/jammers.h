@@ -20,13 +20,28 @@ class RadioAccess : public WifiPhy
     static void AddNoise(WifiPhy& phy, Time duration, double power_w)
     {
         RxPowerWattPerChannelBand powers;
-        powers[phy.GetBand(kWidthMhz)] = power_w;
-        (phy.*&RadioAccess::m_interference)->AddForeignSignal(duration, powers);
+        powers[phy.GetBand(kWidthMhz)] = RxPowerWattPerChannelBand::mapped_type(power_w);
+        AddSignal(*(phy.*&RadioAccess::m_interference), duration, powers, phy, 0);
         (phy.*&RadioAccess::SwitchMaybeToCcaBusy)(nullptr);
     }
 
   private:
     static constexpr uint16_t kWidthMhz = 20;
+
+    // Versions after 3.37 need the range of frequencies.
+    template <typename Helper, typename Powers, typename Phy>
+    static auto AddSignal(Helper& helper, Time duration, Powers& powers, const Phy& phy, int)
+        -> decltype(helper.AddForeignSignal(duration, powers, phy.GetCurrentFrequencyRange()))
+    {
+        helper.AddForeignSignal(duration, powers, phy.GetCurrentFrequencyRange());
+    }
+
+    template <typename Helper, typename Powers, typename Phy>
+    static auto AddSignal(Helper& helper, Time duration, Powers& powers, const Phy&, long)
+        -> decltype(helper.AddForeignSignal(duration, powers))
+    {
+        helper.AddForeignSignal(duration, powers);
+    }
 };
 
 class Jammers

@@ -367,12 +367,13 @@ class Bodies:
             if overlaps(footprint, body, place_m):
                 appears = f" when it appears at {self._step * self._step_s:g} s" if self._step else ""
                 raise ConfigurationError(
-                    f"{name} starts within {footprint.name}, at {_metres(place_m)} m{appears}",
+                    f"{name} starts within {footprint.name}, at {coordinates_text(place_m)} m{appears}",
                     remedy=f"start it at least {body.radius_m:g} m away from obstacles and other bodies",
                 )
 
 
-def _metres(place_m: Vector) -> str:
+def coordinates_text(place_m: Vector) -> str:
+    """Return the coordinates of a position as text: `1, 2.5, 0`."""
     return ", ".join(f"{metres:g}" for metres in place_m)
 
 

@@ -9,7 +9,7 @@ frame that the originator has given up (a BlockAckReq reports this in the standa
 from collections import deque
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from typing import Final, Generic
 
 from sim_backends.radio.frames import HEADER_BYTES, Frame
@@ -23,7 +23,7 @@ TYPICAL_FRAMES: Final = 16
 """Length of aggregates for which rate control compares modes: our choice, between one frame and the window."""
 
 _DELIMITER_BYTES: Final = 4
-_MAX_PPDU_NS: Final = 5_484_000
+MAX_PPDU_NS: Final = 5_484_000
 """aPPDUMaxTime: tables 19-25, 21-28 and 27-54."""
 
 
@@ -85,14 +85,24 @@ class BlockAckSession(Generic[Payload]):
         self._frames_waiting: dict[int, Frame[Payload]] = {}
         self._skipped: set[int] = set()
 
+    @property
+    def block_ack_bytes(self) -> int:
+        """Size of a Block Ack."""
+        return self._limits.block_ack_bytes
+
     def build_aggregate(
-        self, queue: deque[Frame[Payload]], mode: WifiMode, *, is_single: bool = False
+        self,
+        queue: deque[Frame[Payload]],
+        mode: WifiMode,
+        *,
+        is_single: bool = False,
+        limit_ns: int = MAX_PPDU_NS,
     ) -> Aggregate[Payload]:
         """Return the aggregate of a queue's first frame and later frames to its receiver, up to the size limits.
 
-        With `is_single` it contains the first frame only.
+        With `is_single` it contains the first frame only; with `limit_ns` later frames are added up to that airtime.
         """
-        limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, _MAX_PPDU_NS))
+        limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, limit_ns))
         frames: list[Frame[Payload]] = []
         first, size_bytes, last_sequence = queue[0], 0, 0
         for frame in queue:
@@ -152,11 +162,11 @@ def remove_frames(queue: deque[Frame[Payload]], done: Set[Frame[Payload]]) -> No
     queue.extendleft(reversed(kept_frames))
 
 
-@cache
+@lru_cache(maxsize=4096)
 def _bytes_in(mode: WifiMode, time_ns: int) -> int:
     """Return the size of the largest PSDU with at most this airtime."""
-    symbols = (time_ns - mode.preamble_ns - mode.band.signal_extension_ns) // mode.symbol_ns
+    symbols = max(time_ns - mode.preamble_ns - mode.band.signal_extension_ns, 0) // mode.symbol_ns
     size_bytes = symbols * mode.bits_per_symbol // 8
-    while mode.airtime_ns(size_bytes) > time_ns:
+    while size_bytes > 0 and mode.airtime_ns(size_bytes) > time_ns:
         size_bytes -= 1
     return size_bytes

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from sim_backends.radio.aggregation import AmpduLimits
 from sim_backends.radio.modes import BAND_2_4, Band
@@ -47,6 +48,14 @@ class RadioChannel(Protocol):
 
     def rts_threshold_bytes(self, station: int) -> int | None:  # noqa: ARG002 (a default)
         """Return the size of the largest frame or aggregate that a station sends without RTS; None for all."""
+        return None
+
+    def dscp_mapping(self, station: int) -> DscpMapping | None:  # noqa: ARG002 (a default)
+        """Return how a station maps packets to its access categories; None if it has only one queue."""
+        return None
+
+    def power_save_timeout_ns(self, station: int) -> int | None:  # noqa: ARG002 (a default)
+        """Return the time after its last frame after which a station dozes; None if it never does."""
         return None
 
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)

@@ -22,6 +22,8 @@ class Contention:
     Args:
         draw: Returns a uniform random number on [0, 1) per call.
         ifs_ns: Inter-frame space before the backoff.
+        cw_min: Smallest contention window.
+        cw_max: Largest contention window.
 
     Attributes:
         busy_until_ns: End of the last frame or reservation that the station has sensed or sent.
@@ -29,12 +31,13 @@ class Contention:
         slots: Backoff slots that remain.
     """
 
-    __slots__ = ("_draw", "_window", "busy_until_ns", "count_from_ns", "ifs_ns", "slots")
+    __slots__ = ("_cw_max", "_cw_min", "_draw", "_window", "busy_until_ns", "count_from_ns", "ifs_ns", "slots")
 
-    def __init__(self, draw: Callable[[], float], ifs_ns: int) -> None:
+    def __init__(self, draw: Callable[[], float], ifs_ns: int, *, cw_min: int = CW_MIN, cw_max: int = CW_MAX) -> None:
         self._draw = draw
         self.ifs_ns = ifs_ns
-        self._window = CW_MIN
+        self._window = self._cw_min = cw_min
+        self._cw_max = cw_max
         self.busy_until_ns = 0
         self.count_from_ns = 0
         self.slots = 0
@@ -85,12 +88,12 @@ class Contention:
 
     def on_success(self) -> None:
         """Reset the contention window and draw a backoff, after a frame that was delivered or given up."""
-        self._window = CW_MIN
+        self._window = self._cw_min
         self._draw_backoff()
 
     def on_failure(self) -> None:
         """Double the contention window and draw a backoff, after a frame that was not acknowledged."""
-        self._window = min(2 * self._window + 1, CW_MAX)
+        self._window = min(2 * self._window + 1, self._cw_max)
         self._draw_backoff()
 
     def _draw_backoff(self) -> None:

@@ -212,6 +212,7 @@ class FixedLinks(Generic[Payload]):
         *,
         packet: PacketIdentity | None = None,
         before: Delay = 0,
+        dscp: int = 0,  # noqa: ARG002 (see RadioModel)
     ) -> None:
         """Implement `RadioModel.send`."""
         if self._in_flight and self._in_flight[0][0] <= now_ns:

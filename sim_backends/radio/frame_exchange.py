@@ -4,10 +4,17 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, Generic
 
-from sim_backends.radio.aggregation import QOS_HEADER_BYTES, Aggregate, BlockAckSession, remove_frames
+from sim_backends.radio.aggregation import (
+    MAX_PPDU_NS,
+    QOS_HEADER_BYTES,
+    Aggregate,
+    BlockAckSession,
+    remove_frames,
+)
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
 from sim_backends.radio.driver_statistics import RadioMeter
+from sim_backends.radio.edca import AccessCategories
 from sim_backends.radio.frames import (
     HEADER_BYTES,
     Frame,
@@ -67,6 +74,10 @@ class FrameExchange(Generic[Payload]):
             Station(index, PacketDraws(seed, name, "backoff"), channel.ifs_ns(index), _rts_threshold(channel, index))
             for index, name in enumerate(channel.names)
         ]
+        for station in self.stations:
+            mapping = channel.dscp_mapping(station.index)
+            if mapping is not None:
+                station.use_categories(mapping, band)
         self.events = EventQueue(self._start)
         self.delivery: PacketDelivery[Payload] = PacketDelivery(channel, self.stations, self.events, queue_packets)
         self.reception = Reception(channel, seed, self.stations, self.events)
@@ -83,7 +94,7 @@ class FrameExchange(Generic[Payload]):
 
     def retry_when_idle(self, now_ns: int, station: Station[Payload]) -> None:
         """Schedule the next exchange of a station that may have waited for the end of jammer noise."""
-        if not station.queue or station.exchange_id & 1 or station.index in self.events.starts:
+        if not _has_frames(station) or station.exchange_id & 1 or station.index in self.events.starts:
             return
         if self.reception.is_jammed(station.index):
             self.events.at(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
@@ -100,9 +111,11 @@ class FrameExchange(Generic[Payload]):
         if self.reception.is_jammed(index):
             self.events.at(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
             return
+        if station.categories is not None:
+            station.queue = station.categories.select(now_ns)
         station.exchange_id += 1
         frame = station.queue[0]
-        peer = None if frame.receiver is None else self.delivery.peer(index, frame.receiver)
+        peer = None if frame.receiver is None else self.delivery.peer(index, frame.receiver, frame.category)
         if peer is not None and peer.session is not None:
             self._start_aggregate(now_ns, station, peer, peer.session)
         else:
@@ -171,7 +184,7 @@ class FrameExchange(Generic[Payload]):
         for index in received:
             self._receive(now_ns, station, self.delivery.peer(station.index, index), frame)
         self.delivery.count_broadcast(now_ns, station.index, frame, received)
-        self._end_exchange(now_ns, station, done=True)
+        self._end_exchange(now_ns, station, None, done=True)
 
     def _receive(self, now_ns: int, station: Station[Payload], peer: Peer[Payload], frame: Frame[Payload]) -> None:
         if peer.last_frame is not frame:
@@ -184,7 +197,13 @@ class FrameExchange(Generic[Payload]):
         first = station.queue[0]
         # Hardware repeats an aggregate in the next mode of the chain only if the Block Ack is missing.
         mode = peer.mode = peer.rate.choose(now_ns, first.packet, min(peer.failed_exchanges + 1, SHORT_RETRY_LIMIT))
-        aggregate = station.aggregate = session.build_aggregate(station.queue, mode, is_single=peer.rate.is_probing)
+        limit_ns = MAX_PPDU_NS
+        if station.categories is not None:
+            answer_ns = self._sifs_ns + response_ns(mode, session.block_ack_bytes)
+            limit_ns = min(station.categories.remaining_ns(now_ns) - answer_ns, MAX_PPDU_NS)
+        aggregate = station.aggregate = session.build_aggregate(
+            station.queue, mode, is_single=peer.rate.is_probing, limit_ns=limit_ns
+        )
         for frame in aggregate.frames:
             if not frame.attempts:
                 frame.first_attempt_ns = now_ns
@@ -325,7 +344,10 @@ class FrameExchange(Generic[Payload]):
     ) -> None:
         """End an attempt; `is_sent` is False if there was no CTS before the data, which says nothing about modes."""
         if not acknowledged:
-            station.contention.set_busy_until(now_ns)
+            if station.categories is None:
+                station.contention.set_busy_until(now_ns)
+            else:
+                station.categories.wait_until(now_ns)
         if peer.session is not None:
             self._finish_aggregate(now_ns, station, peer, peer.session, acknowledged=acknowledged, is_sent=is_sent)
             return
@@ -340,16 +362,20 @@ class FrameExchange(Generic[Payload]):
                 self.meter.on_failures(station.index, peer.receiver, 1)
             if not is_received:
                 self.delivery.lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
-        self._end_exchange(now_ns, station, done=done)
+        self._end_exchange(now_ns, station, peer, done=done)
 
-    def _end_exchange(self, now_ns: int, station: Station[Payload], *, done: bool) -> None:
+    def _end_exchange(
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None, *, done: bool
+    ) -> None:
         station.exchange_id += 1
         if done:
             station.contention.on_success()
             station.queue.popleft()
         else:
             station.contention.on_failure()
-        if station.queue:
+        if station.categories is not None:
+            self._start_next(now_ns, station, station.categories, peer)
+        elif station.queue:
             self._contend(now_ns, station)
 
     def _finish_aggregate(
@@ -385,8 +411,31 @@ class FrameExchange(Generic[Payload]):
             self.delivery.pass_up(now_ns, station.index, peer, session.skip(lost))
         remove_frames(station.queue, confirmed | given_up)
         station.exchange_id += 1
-        if station.queue:
+        if station.categories is not None:
+            self._start_next(now_ns, station, station.categories, peer)
+        elif station.queue:
             self._contend(now_ns, station)
+
+    def _start_next(
+        self,
+        now_ns: int,
+        station: Station[Payload],
+        categories: AccessCategories[Payload],
+        peer: Peer[Payload] | None,
+    ) -> None:
+        """Schedule the next exchange of a station: in its transmission opportunity, or after contention."""
+        if peer is not None and station.queue and (frame := station.queue[0]).receiver == peer.receiver:
+            data_ns = peer.mode.airtime_ns(frame.size_bytes + QOS_HEADER_BYTES)
+            start_ns = categories.continue_ns(now_ns, data_ns + self._sifs_ns + ack_ns(peer.mode))
+            if start_ns is not None:
+                self.events.schedule_start(start_ns, station.index)
+                return
+        if categories.has_frames():
+            self._contend(now_ns, station)
+
+
+def _has_frames(station: Station[Payload]) -> bool:
+    return bool(station.queue) if station.categories is None else station.categories.has_frames()
 
 
 def _rts_threshold(channel: RadioChannel, station: int) -> int:

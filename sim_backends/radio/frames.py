@@ -145,6 +145,8 @@ class Frame(Generic[Payload]):
         sequence: Its number in a Block Ack session; -1 before its first attempt, or without a session.
         is_received: True if the receiver of a Block Ack session has decoded it.
         max_attempts: Number of attempts after which it is given up.
+        dscp: DSCP of the packet.
+        category: Its access category at the station that sends it; 0 (best effort) without access categories.
     """
 
     payload: Payload
@@ -161,6 +163,8 @@ class Frame(Generic[Payload]):
     sequence: int = -1
     is_received: bool = False
     max_attempts: int = SHORT_RETRY_LIMIT
+    dscp: int = 0
+    category: int = 0
 
     def total_delay(self, now_ns: int, propagation_ns: int) -> Delay:
         """Return the delay over all hops so far, for a frame decoded at `now_ns`."""
@@ -170,7 +174,9 @@ class Frame(Generic[Payload]):
 
     def for_second_hop(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":
         """Return the packet as a frame of its second hop, which the relay queues at `now_ns`."""
-        return Frame(self.payload, self.size_bytes, self.source, receiver, (), True, self.packet, now_ns, before)
+        onward = Frame(self.payload, self.size_bytes, self.source, receiver, (), True, self.packet, now_ns, before)
+        onward.dscp = self.dscp
+        return onward
 
 
 @dataclass(frozen=True)

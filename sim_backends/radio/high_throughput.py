@@ -11,7 +11,7 @@ from functools import cache
 from itertools import product
 from typing import Final, Literal
 
-from fieldkit.config.wifi_phy import WifiAmendment, WifiPhy, WifiRateControl
+from fieldkit.config.wifi_phy import DscpMapping, WifiAmendment, WifiPhy, WifiRateControl
 from sim_backends.radio.modes import (
     BAND_2_4,
     BANDS,
@@ -78,6 +78,8 @@ class PhyCapability:
         firmware_margin_db: Margin of `firmware` below the measured signal.
         firmware_interval_ns: Time between two selections of `firmware`.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS; None for all.
+        access_categories: How it maps packets to its access categories; None if it sends all as best effort.
+        power_save_timeout_ns: Time after its last frame after which it dozes; None if it never does.
     """
 
     amendment: WifiAmendment
@@ -89,6 +91,8 @@ class PhyCapability:
     firmware_margin_db: float = 3.0
     firmware_interval_ns: int = 100_000_000
     rts_threshold_bytes: int | None = None
+    access_categories: DscpMapping | None = None
+    power_save_timeout_ns: int | None = None
 
     @property
     def band(self) -> Band:
@@ -122,6 +126,8 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
         float(phy.firmware_margin_db),
         round(phy.firmware_interval * 1e9),
         phy.rts_threshold_bytes,
+        phy.access_categories,
+        round(phy.power_save_timeout * 1e9) if phy.power_save else None,
     )
 
 

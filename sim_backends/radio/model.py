@@ -49,6 +49,7 @@ class RadioModel(Protocol[Payload]):
         *,
         packet: PacketIdentity | None = None,
         before: Delay = 0,
+        dscp: int = 0,
     ) -> None:
         """Send a packet at `now_ns`.
 
@@ -61,6 +62,7 @@ class RadioModel(Protocol[Payload]):
             packet: Identity from which its random numbers are derived; None to number the packets of the source in
                 order.
             before: Delay of the packet until now.
+            dscp: Its DSCP, for stations with access categories.
 
         Raises:
             KeyError: There is no link from `source` towards `destination`.

@@ -6,6 +6,7 @@ from typing import Generic
 from sim_backends.radio.aggregation import BlockAckSession
 from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.contention import EventQueue
+from sim_backends.radio.edca import category_of
 from sim_backends.radio.frames import Frame
 from sim_backends.radio.links import (
     NOT_DECODED,
@@ -17,7 +18,8 @@ from sim_backends.radio.links import (
     LossLog,
     Payload,
 )
-from sim_backends.radio.stations import Peer, Station
+from sim_backends.radio.power_save import PowerSave
+from sim_backends.radio.stations import CategoryPeer, Peer, Station
 
 
 class PacketDelivery(Generic[Payload]):
@@ -33,6 +35,7 @@ class PacketDelivery(Generic[Payload]):
         peers: State of each link that was used, by indices of transmitter and receiver.
         arrived: Delivered packets, in order of arrival.
         log_loss: Called for every loss; None without a log.
+        power_save: The dozing stations; None if no station uses power save.
     """
 
     def __init__(
@@ -47,12 +50,22 @@ class PacketDelivery(Generic[Payload]):
         self._events = events
         self._queue_packets = queue_packets
         self.peers: dict[tuple[int, int], Peer[Payload]] = {}
+        self._category_peers: dict[tuple[int, int, int], CategoryPeer[Payload]] = {}
         self.arrived: list[Delivery[Payload]] = []
         self.log_loss: LossLog | None = None
+        self.power_save: PowerSave[Payload] | None = None
 
     def enqueue(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
         """Queue a frame for its next hop, or drop it if the queue is full or the receiver is out of range."""
+        if self.power_save is None or not self.power_save.buffer(now_ns, station, frame):
+            self.enqueue_now(now_ns, station, frame)
+
+    def enqueue_now(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        """Queue a frame whose receiver is awake."""
         queue = station.queue
+        if station.categories is not None:
+            frame.category = category_of(frame.dscp, station.categories.mapping)
+            queue = station.categories.queue_of(frame)
         peer = None if frame.receiver is None else self.peer(station.index, frame.receiver)
         if peer is not None and not self._channel.linked(station.index, peer.receiver):
             peer.count(delivered=False)
@@ -64,18 +77,27 @@ class PacketDelivery(Generic[Payload]):
             self.lose(now_ns, station.index, frame, QUEUE_FULL)
             return
         queue.append(frame)
-        if len(queue) == 1 and not station.exchange_id & 1:
-            self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
+        if len(queue) == 1:
+            if station.categories is not None:
+                station.categories.arrive(now_ns, frame, in_exchange=bool(station.exchange_id & 1))
+            if not station.exchange_id & 1:
+                self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
 
     def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:
         """Empty the queue of a station whose radio was switched off; frames that were not received are lost."""
-        while station.queue:
-            frame = station.queue.popleft()
-            peer = None if frame.receiver is None else self.peer(station.index, frame.receiver)
-            if peer is None or not peer.has_received(frame):
-                self.lose(now_ns, station.index, frame, RADIO_OFF)
-                if peer is not None and peer.session is not None:
-                    self.pass_up(now_ns, station.index, peer, peer.session.skip([frame]))
+        if self.power_save is not None:
+            for frame in self.power_save.discard(station):
+                self._discard(now_ns, station, frame)
+        for queue in (station.queue,) if station.categories is None else station.categories.queues:
+            while queue:
+                self._discard(now_ns, station, queue.popleft())
+
+    def _discard(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        peer = None if frame.receiver is None else self.peer(station.index, frame.receiver, frame.category)
+        if peer is None or not peer.has_received(frame):
+            self.lose(now_ns, station.index, frame, RADIO_OFF)
+            if peer is not None and peer.session is not None:
+                self.pass_up(now_ns, station.index, peer, peer.session.skip([frame]))
 
     def pass_up(self, now_ns: int, transmitter: int, peer: Peer[Payload], frames: Iterable[Frame[Payload]]) -> None:
         """Deliver frames at a receiver, or queue them for their second hop."""
@@ -118,12 +140,22 @@ class PacketDelivery(Generic[Payload]):
             return [name for name in names if name not in {frame.source, names[transmitter]}]
         return [names[index] for index in ends if index is not None]
 
-    def peer(self, transmitter: int, receiver: int) -> Peer[Payload]:
-        """Return the state of a link, which is created when it is first used."""
+    def peer(self, transmitter: int, receiver: int, category: int = 0) -> Peer[Payload]:
+        """Return the state of a link in an access category, which is created when it is first used."""
         pair = transmitter, receiver
         peer = self.peers.get(pair)
         if peer is None:
-            limits = self._channel.ampdu_limits(*pair)
-            session: BlockAckSession[Payload] | None = None if limits is None else BlockAckSession(limits)
-            peer = self.peers[pair] = Peer(receiver, self._channel.rate_control(*pair), session)
+            peer = self.peers[pair] = Peer(receiver, self._channel.rate_control(*pair), self._session(*pair))
+        return self._category_peer(transmitter, peer, category) if category else peer
+
+    def _category_peer(self, transmitter: int, link: Peer[Payload], category: int) -> Peer[Payload]:
+        key = transmitter, link.receiver, category
+        peer = self._category_peers.get(key)
+        if peer is None:
+            session = self._session(transmitter, link.receiver)
+            peer = self._category_peers[key] = CategoryPeer(link, session)
         return peer
+
+    def _session(self, transmitter: int, receiver: int) -> BlockAckSession[Payload] | None:
+        limits = self._channel.ampdu_limits(transmitter, receiver)
+        return None if limits is None else BlockAckSession(limits)

@@ -1,13 +1,18 @@
 """State of the stations, and of their links to the peers to which they send."""
 
 from collections import deque
+from functools import partial
 from typing import Generic
 
+from typing_extensions import override
+
+from fieldkit.config.wifi_phy import DscpMapping
 from sim_backends.radio.aggregation import Aggregate, BlockAckSession
 from sim_backends.radio.contention import Contention
+from sim_backends.radio.edca import AccessCategories
 from sim_backends.radio.frames import Frame, Transmission
 from sim_backends.radio.links import LinkCounters, Payload
-from sim_backends.radio.modes import SHORT_RETRY_LIMIT, WifiMode
+from sim_backends.radio.modes import SHORT_RETRY_LIMIT, Band, WifiMode
 from sim_backends.radio.random_streams import PacketDraws, PacketIdentity
 from sim_backends.radio.rate_control import RateControl
 
@@ -31,6 +36,7 @@ class Station(Generic[Payload]):
         offered: Number of packets that were passed to it for sending.
         aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
+        categories: Its access categories, of which `queue` is the active one; None if it has only one queue.
     """
 
     __slots__ = (
@@ -38,6 +44,7 @@ class Station(Generic[Payload]):
         "_redraws",
         "_redraws_of",
         "aggregate",
+        "categories",
         "contention",
         "exchange_id",
         "index",
@@ -53,17 +60,25 @@ class Station(Generic[Payload]):
         self._draws = draws
         self._redraws_of: tuple[PacketIdentity, int] | None = None
         self._redraws = 0
-        self.contention = Contention(self._backoff, ifs_ns)
         self.queue: deque[Frame[Payload]] = deque()
+        self.contention: Contention | AccessCategories[Payload] = Contention(
+            partial(self._backoff, self.queue), ifs_ns
+        )
+        self.categories: AccessCategories[Payload] | None = None
         self.receiving: Transmission | None = None
         self.aggregate: Aggregate[Payload] | None = None
         self.sending_until_ns = 0
         self.rts_threshold_bytes = rts_threshold_bytes
         self.exchange_id = self.offered = 0
 
-    def _backoff(self) -> float:
-        """Return the next random draw for the first frame in the queue after its current number of attempts."""
-        frame = self.queue[0]
+    def use_categories(self, mapping: DscpMapping, band: Band) -> None:
+        """Replace the queue and the contention by those of the access categories."""
+        self.contention = self.categories = AccessCategories(mapping, band, self._backoff)
+        self.queue = self.categories.active.frames
+
+    def _backoff(self, queue: deque[Frame[Payload]]) -> float:
+        """Return the next random draw for the first frame in a queue after its current number of attempts."""
+        frame = queue[0]
         attempt = frame.packet, frame.attempts
         # A station that drew 0 slots and finds the channel busy draws again.
         self._redraws = self._redraws + 1 if attempt == self._redraws_of else 0
@@ -127,3 +142,26 @@ class Peer(Generic[Payload]):
     def counters(self) -> LinkCounters:
         """The counters so far."""
         return LinkCounters(self.sent, self.queue_dropped, self.lost, self.delivered)
+
+
+class CategoryPeer(Peer[Payload]):
+    """The state of a link in one access category other than best effort.
+
+    Args:
+        link: State of the link, which has the counters and the rate control.
+        session: Block Ack session of the category; None if its frames are not aggregated.
+    """
+
+    __slots__ = ("_link",)
+
+    def __init__(self, link: Peer[Payload], session: BlockAckSession[Payload] | None) -> None:
+        super().__init__(link.receiver, link.rate, session)
+        self._link = link
+
+    @override
+    def count_frames(self, *, delivered: int, lost: int) -> None:
+        self._link.count_frames(delivered=delivered, lost=lost)
+
+    @override
+    def count(self, *, delivered: bool) -> None:
+        self._link.count(delivered=delivered)

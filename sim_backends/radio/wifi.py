@@ -1,8 +1,8 @@
 """802.11 stations on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
 
 An event-driven engine on integer nanoseconds that uses no clock and no socket; its interface is `model.RadioModel`.
-Frames between stations with `phy` are aggregated. It does not model RTS/CTS (drivers switch it off below 2347 bytes),
-other access categories than best effort, beacons of the access point, power save and fragmentation.
+Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories. Power save delays
+frames to stations of an access point. Beacons have no airtime; fragmentation is not modelled.
 """
 
 from collections.abc import Callable, Mapping, Set
@@ -16,7 +16,8 @@ from sim_backends.radio.frame_exchange import FrameExchange
 from sim_backends.radio.frames import Emission, Frame, TransmissionAttempt
 from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
 from sim_backends.radio.modes import SHORT_RETRY_LIMIT
-from sim_backends.radio.random_streams import PacketIdentity
+from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD, PowerSave
+from sim_backends.radio.random_streams import PacketIdentity, RandomStream
 
 
 class Wifi(Generic[Payload]):
@@ -36,6 +37,14 @@ class Wifi(Generic[Payload]):
         self._exchange: FrameExchange[Payload] = FrameExchange(channel, seed, queue_packets)
         self._stations, self._events = self._exchange.stations, self._exchange.events
         self._delivery = self._exchange.delivery
+        timeouts_ns = {
+            index: timeout_ns
+            for index in range(len(channel.names))
+            if (timeout_ns := channel.power_save_timeout_ns(index)) is not None
+        }
+        if timeouts_ns:
+            phase_ns = int(RandomStream(seed, "beacon").draw(0) * DTIM_PERIOD * BEACON_INTERVAL_NS)
+            self._delivery.power_save = PowerSave(timeouts_ns, phase_ns, self._events, self._delivery.enqueue_now)
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
         """Pass every transmission attempt that ends from now on to `log`; None stops logging."""
@@ -80,6 +89,8 @@ class Wifi(Generic[Payload]):
     def set_relay(self, name: str | None) -> None:
         """Set the station that is the access point from now on; None for direct links."""
         self._relay = None if name is None else self._index[name]
+        if self._delivery.power_save is not None:
+            self._delivery.power_save.access_point = self._relay
 
     def counters(self) -> dict[Pair, LinkCounters]:
         """Return the counters of each hop so far; a broadcast counts as one frame per station in range."""
@@ -101,6 +112,7 @@ class Wifi(Generic[Payload]):
         packet: PacketIdentity | None = None,
         before: Delay = 0,
         max_attempts: int = SHORT_RETRY_LIMIT,
+        dscp: int = 0,
     ) -> None:
         """Implement `RadioModel.send`; after `max_attempts` on its first hop the packet is given up."""
         self.advance(now_ns)
@@ -115,6 +127,8 @@ class Wifi(Generic[Payload]):
             is_broadcast = receiver is None
             frame = Frame(payload, size_bytes, source, relay, (receiver,), is_broadcast, identity, now_ns, before)
         frame.max_attempts = max_attempts
+        if dscp:
+            frame.dscp = dscp
         self._delivery.enqueue(now_ns, station, frame)
 
     def next_event_ns(self) -> int | None:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from typing_extensions import override
 
+from fieldkit.config.wifi_phy import DscpMapping
 from fieldkit.core.model import Vector
 from sim_backends.radio import propagation
 from sim_backends.radio.aggregation import AMPDU_LIMITS, TYPICAL_FRAMES, AmpduLimits
@@ -356,6 +357,16 @@ class WorldChannel(RadioChannel):
     def rts_threshold_bytes(self, station: int) -> int | None:
         phy = self._antennas[station].phy
         return None if phy is None else phy.rts_threshold_bytes
+
+    @override
+    def dscp_mapping(self, station: int) -> DscpMapping | None:
+        phy = self._antennas[station].phy
+        return None if phy is None else phy.access_categories
+
+    @override
+    def power_save_timeout_ns(self, station: int) -> int | None:
+        phy = self._antennas[station].phy
+        return None if phy is None else phy.power_save_timeout_ns
 
     @override
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:

@@ -1,8 +1,11 @@
 """Many tables of repeats read as one."""
 
+import ctypes
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -20,6 +23,9 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.trial.columns import trial_columns
 from fieldkit.trial.rows import to_csv
 from tests.helpers.tables import ROW, parsed, repeats, replace, write
+
+CLONE_FS: Final = 0x200
+"""linux/sched.h"""
 
 
 def are_equal(first: Repeats, second: Repeats) -> bool:
@@ -41,6 +47,25 @@ def test_a_missing_text_of_a_dataset_is_empty(tmp_path: Path) -> None:
     ]
     pd.DataFrame(rows).to_parquet(tmp_path / "part-0.parquet", index=False)
     assert list(read([tmp_path], trial_columns()).texts["reason"]) == ["late", "", "dead"]
+
+
+def test_a_dataset_is_read_from_a_thread_with_another_working_folder(tmp_path: Path) -> None:
+    """Threads of pyarrow have the working folder of the process, for example after a test in a mount namespace."""
+    (tmp_path / "results").mkdir()
+    row = {"schema_version": 1, "trial": "t", "protocol": "udp", "attempt": 1, "status": "valid"}
+    for number in range(8):
+        path = tmp_path / "results" / f"part-{number}.parquet"
+        pd.DataFrame([row | {"repeat": number}]).to_parquet(path, index=False)
+    read([tmp_path / "results"], trial_columns())  # starts the threads
+
+    def read_relative() -> int:
+        assert ctypes.CDLL(None).unshare(CLONE_FS) == 0
+        os.chdir(tmp_path)  # of this thread only
+        return len(read([Path("results")], trial_columns()))
+
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(read_relative).result() == 8
+    assert Path.cwd() != tmp_path
 
 
 def test_tables_of_other_versions_are_in_the_order_of_the_paths(tmp_path: Path) -> None:

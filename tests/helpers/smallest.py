@@ -282,6 +282,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
             "STREAMS": (1,),
             "RATIOS_DB": (40.0,),
             "STATIONS": (2,),
+            "DSCPS": {"voice": 48},
             "QUEUED": 150,
             "SECONDS": 0.1,
         },

@@ -1,4 +1,4 @@
-"""The fixtures `lab`, `robots` and `trial` in realistic tests, on emulated robots."""
+"""The fixtures `lab`, `robots` and `trial` in realistic tests, on emulated robots, also on the co-simulation."""
 
 import re
 import signal
@@ -15,6 +15,7 @@ from tests.helpers.suites import SuiteRun
 
 pytestmark = pytest.mark.emulated
 
+COSIMULATED = suites.SITE.replace("ros: builtin", "ros: builtin, physics: kinematic, sync: sliding_window")
 SUITE = """
 import pytest
 
@@ -186,7 +187,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def suite_run(folder: Path) -> SuiteRun:
-    suites.write(folder, test_robots=SUITE)
+    suites.write(folder, site=COSIMULATED, test_robots=SUITE)
     (folder / "procedures").mkdir()
     for name, text in (("short", SHORT), ("slow", SLOW)):
         (folder / "procedures" / f"{name}.yaml").write_text(text, encoding="utf-8")

@@ -130,6 +130,10 @@ class Packets(Table):
         """Return a mask of the packets with this IPv4 or IPv6 destination address."""
         return _equals(self.dst, text)
 
+    def icmp(self, source: str, destination: str) -> "Packets":
+        """Return the ICMP packets from one address to another."""
+        return self.where((self.protocol == ICMP) & self.are_from(source) & self.are_to(destination))
+
 
 _STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
     {

@@ -15,7 +15,6 @@ import numpy as np
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Ints
-from fieldkit.measure.captures.headers import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.evidence.ping import Ping, Reply
 
@@ -44,7 +43,7 @@ def captured_pings(packets: Packets, source: str, destination: str, payload_byte
         destination: Destination address of the requests.
         payload_bytes: Payload of a request; echoes of another size belong to another ping.
     """
-    outgoing, returning = _icmp(packets, source, destination), _icmp(packets, destination, source)
+    outgoing, returning = packets.icmp(source, destination), packets.icmp(destination, source)
     requests = outgoing.where((outgoing.echo != NO_ECHO) & (outgoing.echo < ECHO_REPLY))
     requests = requests.where(_sizes(outgoing, requests) == payload_bytes + ICMP_HEADER_BYTES)
     replies = returning.where(returning.echo >= ECHO_REPLY)
@@ -56,10 +55,6 @@ def captured_pings(packets: Packets, source: str, destination: str, payload_byte
             _first(requests.echo_seq[matches], requests.time_ns[matches]),
             _first(replies.echo_seq[answered], complete_ns[answered]),
         )
-
-
-def _icmp(packets: Packets, source: str, destination: str) -> Packets:
-    return packets.where((packets.protocol == ICMP) & packets.are_from(source) & packets.are_to(destination))
 
 
 def _sizes(packets: Packets, first: Packets) -> Ints:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.config.profiles import PublishedTopic
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.measure.evidence.recordings import RecordingContents
@@ -92,13 +91,9 @@ def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
     return tuple(dict.fromkeys(topics))
 
 
-def _topics(robot: Robot) -> tuple[PublishedTopic, ...]:
-    return robot.profile.ros.topics if robot.profile.ros else ()
-
-
 def battery_of(robot: Robot) -> str:
     """Return the topic of the robot's battery state; empty if its profile has none."""
-    return next((topic.name for topic in _topics(robot) if topic.type == _BATTERY), "")
+    return next((topic.name for topic in robot.profile.topics if topic.type == _BATTERY), "")
 
 
 def has_shared_battery(plan: Plan, role: Role) -> bool:
@@ -112,7 +107,7 @@ def has_shared_battery(plan: Plan, role: Role) -> bool:
 
 def rate_of(robot: Robot, topic: str) -> float | None:
     """Return the rate in Hz that the robot's profile gives for a topic, or None if it has no such topic."""
-    return next((entry.rate for entry in _topics(robot) if entry.name == topic), None)
+    return next((entry.rate for entry in robot.profile.topics if entry.name == topic), None)
 
 
 def recording(role: Role, robot: Robot, topics: Sequence[str]) -> RecordStep:

@@ -15,7 +15,6 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import NO_TIME, Mask
-from fieldkit.measure.captures.headers import ICMP
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
 from fieldkit.measure.checks import ping_checks
 from fieldkit.measure.evidence import ping
@@ -231,8 +230,8 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         packets = capture.packets
         echoes = packets.where((packets.echo != NO_ECHO) & _has_payload(packets, result.payload_bytes))
         counts = (
-            (len(result.replies), "answer", _max_count(_icmp(echoes, destination, source))),
-            (len(result.answers), "answered request", _max_count(_icmp(echoes, source, destination))),
+            (len(result.replies), "answer", _max_count(echoes.icmp(destination, source))),
+            (len(result.answers), "answered request", _max_count(echoes.icmp(source, destination))),
         )
         for printed, what, captured in counts:
             if printed > captured:
@@ -249,8 +248,8 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         if sender is None or receiver is None:
             return 0
         source, destination = (view.scene.robot(role).address for role in (self.sender, self.receiver))
-        sent, received = (_icmp(capture.packets, source, destination) for capture in (sender, receiver))
-        returned = _icmp(sender.packets, destination, source)
+        sent, received = (capture.packets.icmp(source, destination) for capture in (sender, receiver))
+        returned = sender.packets.icmp(destination, source)
         is_request = (received.echo != NO_ECHO) & (received.echo < ECHO_REPLY)
         was_sent = np.isin(received.echo, sent.echo)
         earlier = int((is_request & ~was_sent).sum())
@@ -309,8 +308,3 @@ def _max_count(echoes: Packets) -> int:
     """Return the number of packets of the identifier with the most packets."""
     _, counts = np.unique(echoes.echo, return_counts=True)
     return int(counts.max(initial=0))
-
-
-def _icmp(packets: Packets, source: str, destination: str) -> Packets:
-    """Return the ICMP packets from one address to another."""
-    return packets.where((packets.protocol == ICMP) & packets.are_from(source) & packets.are_to(destination))

@@ -160,7 +160,7 @@ def read_parts(folder: Path, table: str, count: int) -> dict[str, list[Any]]:
     for number in range(count):
         path = folder / part_path(table, number)
         try:
-            part = pa.parquet.read_table(path, partitioning=None)
+            part = pa.parquet.read_table(path.absolute(), partitioning=None)
             if not part.schema.equals(SCHEMAS[table]):
                 raise EvidenceError(f"its columns are not those of {table}", where=str(path), remedy=RUN_AGAIN)
             for name in columns:

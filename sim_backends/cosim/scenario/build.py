@@ -22,11 +22,10 @@ from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
 from sim_backends.cosim.scenario.checks import check
-from sim_backends.cosim.scenario.external import open_network, open_physics, writes_captures
+from sim_backends.cosim.scenario.external import carried_radio, open_network, open_physics, writes_captures
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
-from sim_backends.federates.ip_radio import IpRadio
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
@@ -71,7 +70,7 @@ def radio_network(
     stations = antennas(scenario)
     radio: RadioModel[Fragment]
     if carrier is not None:
-        radio = IpRadio(carrier, tuple(stations))
+        radio = carried_radio(carrier, tuple(stations))
     elif scenario.radio.fixed:
         radio = UniformLinks(seed, scenario.radio)
     else:

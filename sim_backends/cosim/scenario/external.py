@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
@@ -12,13 +12,16 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, FederateCapability, Hello
+from sim_backends.federates.ip_radio import IpRadio
 from sim_backends.federates.named import ProgramFederate, PythonFederate, federates, named
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
 from sim_backends.federates.simulator_options import SimulatorOptions, options_json
 from sim_backends.federates.transports.transport_table import parse_address
 from sim_backends.network.bare_ip import BROADCAST, UNICAST
+from sim_backends.network.ip import Fragment
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Body
+from sim_backends.radio.model import RadioModel
 from sim_backends.world.world import World
 
 _BUILT_IN_SUMMARIES: Final = {
@@ -199,6 +202,11 @@ def open_network(
             remedy="remove transports: builtin",
         )
     return network
+
+
+def carried_radio(network: NetworkFederate, names: Sequence[str]) -> RadioModel[Fragment]:
+    """Return the radio of built-in transports whose IP packets an external network carries between stations."""
+    return IpRadio(network, names)
 
 
 def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)

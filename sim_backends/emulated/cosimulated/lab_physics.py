@@ -12,7 +12,7 @@ from sim_backends.emulated.cosimulated.clock import RealTime
 from sim_backends.emulated.cosimulated.steering import Command, FlightSteering, Steering
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates.protocols import PhysicsFederate
-from sim_backends.physics.bodies import Bodies
+from sim_backends.physics.bodies import Bodies, coordinates_text
 from sim_backends.physics.quadrotor import FlightStatus
 from sim_backends.world.motion import STILL, State
 
@@ -240,7 +240,7 @@ class LabPhysics:
         for name in moved:
             if self._assigned[name].velocity_m_s == STILL and (other := self._physics.overlap(name)):
                 raise ConfigurationError(
-                    f"{name} would be within {other}, at {_metres(self._assigned[name].position_m)} m",
+                    f"{name} would be within {other}, at {coordinates_text(self._assigned[name].position_m)} m",
                     remedy="put it at a free place, or choose another world or distance",
                 )
 
@@ -266,10 +266,6 @@ class LabPhysics:
 
 def _differs(place: tuple[Vector, float], other: tuple[Vector, float] | None) -> bool:
     return other is None or math.dist(place[0], other[0]) > _MOVED_M or place[1] != other[1]
-
-
-def _metres(place_m: Vector) -> str:
-    return ", ".join(f"{metres:g}" for metres in place_m)
 
 
 class _Limits(Mapping[str, float]):

@@ -205,12 +205,8 @@ def _hello(settings: LabSettings, role: int, states: Mapping[str, State]) -> Hel
 
 
 def _configuration(settings: LabSettings, states: Mapping[str, State]) -> dict[str, Any]:
-    """Return the configuration that a scenario with the same radio, world and robots would have.
-
-    The relay is omitted if it has no state: a drone has none in the physics.
-    """
-    relay = settings.relay if settings.relay in states else None
-    topology = Topology.MASTERLESS if relay is None else Topology.MASTER
+    """Return the configuration that a scenario with the same radio, world and robots would have."""
+    topology = Topology.MASTERLESS if settings.relay is None else Topology.MASTER
     scenario = CosimScenario.model_validate(
         {
             "name": "lab",
@@ -218,7 +214,7 @@ def _configuration(settings: LabSettings, states: Mapping[str, State]) -> dict[s
             "world": "open" if settings.world is None else settings.world.name,
             "duration": "1s",
             "topology": topology.value,
-            "relay": relay,
+            "relay": settings.relay,
             "agents": {
                 name: {"robot": "turtlebot3_burger", "at_m": [*state.position_m[:2]]}
                 for name, state in states.items()

@@ -41,6 +41,7 @@ class Medium(MediumServer):
         super().__init__(seed, framing, channel)
         self._model: RadioModel[bytes] = UniformLinks(seed, self._options)
         self._modelled_ports = 0
+        self._prioritized = False
         # A device with packets was empty at the earlier time, if the previous round read all of them.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._armed_ns: int | None = None
@@ -83,7 +84,7 @@ class Medium(MediumServer):
         if port.backlog <= 0:
             port.backlog, port.backlog_since_ns = DEVICE_PACKETS, self._arrived_after_ns
         flows, requested = self._flows, self._flows.counted
-        framing = self._framing
+        framing, prioritized = self._framing, self._prioritized
         carries, destination_of, header_bytes = framing.carries, framing.destination, framing.header_bytes
         # Added to the time of reading, this is the delay of one packet that has waited since `backlog_since_ns`.
         waited = PACKET - port.backlog_since_ns
@@ -109,6 +110,10 @@ class Medium(MediumServer):
             if requested and (inner := framing.ipv4(packet)) is not None:
                 flows.note_first_fragment(inner)
             now_ns = clock_ns()
+            if prioritized and (inner := framing.ipv4(packet)) is not None:
+                dscp = inner[1] >> 2
+                send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns, dscp=dscp)
+                continue
             send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns)
         port.backlog -= BURST
 
@@ -143,6 +148,9 @@ class Medium(MediumServer):
             # A robot that is attached later gets a new model; packets on the air of the old model are lost.
             self._modelled_ports = len(self._ports)
             self._model = self._new_model()
+            self._prioritized = any(
+                antenna.phy is not None and antenna.phy.access_categories for antenna in self._antennas.values()
+            )
             self._model.use_meter()
             self._model.log_attempts(None if self._air_log is None else self._air_log.write)
         self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)

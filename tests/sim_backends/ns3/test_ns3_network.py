@@ -119,7 +119,7 @@ def test_the_parts_of_each_delay_add_up_to_it(changes: dict[str, Any], simulated
         # Only a message of TCP waits in its host: for the handshake, and for its window.
         assert min(parts_ns) >= 0
         assert identity[0] == "log/ann" or processing_ns < 25_000_000
-    assert any(int(row["queuing_ns"]) > 100_000 for row in rows.values())
+    assert any(int(row["queueing_ns"]) > 100_000 for row in rows.values())
 
 
 def test_losses_have_reasons(simulated: Simulated) -> None:

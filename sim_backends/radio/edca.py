@@ -1,0 +1,259 @@
+"""EDCA: four access categories with their own queue and contention in each station (IEEE 802.11-2020, 10.23.2).
+
+Parameters are those that Linux's mac80211 sets by default: table 9-155 with the TXOP limits of IEEE 802.11-2012 for
+voice and video, and without TXOPs of more than one exchange for the others.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, Generic
+
+from typing_extensions import override
+
+from fieldkit.config.wifi_phy import DscpMapping
+from sim_backends.radio.contention import Contention
+from sim_backends.radio.frames import Frame
+from sim_backends.radio.links import Payload
+from sim_backends.radio.modes import CW_MAX, CW_MIN, SLOT_NS, Band
+
+BEST_EFFORT, BACKGROUND, VIDEO, VOICE = range(4)
+
+
+@dataclass(frozen=True)
+class CategoryParameters:
+    """Parameters of an access category.
+
+    Attributes:
+        aifsn: Number of slots after SIFS before the backoff.
+        cw_min: Smallest contention window.
+        cw_max: Largest contention window.
+        txop_ns: Limit of a transmission opportunity; 0 for one exchange.
+    """
+
+    aifsn: int
+    cw_min: int
+    cw_max: int
+    txop_ns: int
+
+
+PARAMETERS: Final = (
+    CategoryParameters(3, CW_MIN, CW_MAX, 0),
+    CategoryParameters(7, CW_MIN, CW_MAX, 0),
+    CategoryParameters(2, (CW_MIN + 1) // 2 - 1, CW_MIN, 3_008_000),
+    CategoryParameters(2, (CW_MIN + 1) // 4 - 1, (CW_MIN + 1) // 2 - 1, 1_504_000),
+)
+"""By access category."""
+
+_UNLIMITED_NS: Final = 1 << 62
+_PRIORITY: Final = (VOICE, VIDEO, BEST_EFFORT, BACKGROUND)
+
+# Access category by user priority: table 10-1.
+_OF_USER_PRIORITY: Final = (
+    *(BEST_EFFORT, BACKGROUND, BACKGROUND, BEST_EFFORT),
+    *(VIDEO, VIDEO, VOICE, VOICE),
+)
+# User priorities of DSCPs by RFC 8325, 4.3 (figure 1); all others are 0.
+_RFC_8325: Final = {
+    **dict.fromkeys((46, 44), 6),
+    40: 5,
+    **dict.fromkeys((32, 34, 36, 38, 24, 26, 28, 30), 4),
+    **dict.fromkeys((18, 20, 22), 3),
+    8: 1,
+    1: 1,
+}
+
+
+def category_of(dscp: int, mapping: DscpMapping) -> int:
+    """Return the access category of packets with a DSCP.
+
+    Args:
+        dscp: Differentiated services code point, 0 to 63.
+        mapping: `linux`: its three upper bits are the user priority (cfg80211 up to Linux 6.10). `rfc8325`: that RFC;
+            there the classes for network control (CS6, CS7) are best effort.
+    """
+    return _OF_USER_PRIORITY[dscp >> 3 if mapping == "linux" else _RFC_8325.get(dscp, 0)]
+
+
+class CategoryContention(Contention):
+    """Contention of one access category: a backoff of 0 slots is kept if the channel becomes busy (10.23.2.4)."""
+
+    __slots__ = ("_has_backoff",)
+
+    def __init__(self, draw: Callable[[], float], ifs_ns: int, *, cw_min: int, cw_max: int) -> None:
+        super().__init__(draw, ifs_ns, cw_min=cw_min, cw_max=cw_max)
+        self._has_backoff = False
+
+    def arrive(self, now_ns: int) -> None:
+        """Record that a frame arrived at an empty queue: a backoff that has ended does not count for it."""
+        self._count_down(now_ns)
+        if not self.slots:
+            self._has_backoff = False
+
+    def require_backoff(self) -> None:
+        """Draw a backoff if there is none, because the station itself uses the channel."""
+        if not self.slots:
+            self._draw_backoff()
+
+    @override
+    def on_success(self) -> None:
+        self._has_backoff = False
+        super().on_success()
+
+    @override
+    def on_failure(self) -> None:
+        self._has_backoff = False
+        super().on_failure()
+
+    @override
+    def _draw_backoff(self) -> None:
+        if not self._has_backoff:
+            super()._draw_backoff()
+            self._has_backoff = True
+
+
+class CategoryQueue(Generic[Payload]):
+    """Queue and contention of one access category of a station.
+
+    Args:
+        category: The access category.
+        band: Band of the station.
+        draw: Returns the next random draw for the backoff of the first frame in a queue.
+    """
+
+    __slots__ = ("category", "contention", "frames", "parameters")
+
+    def __init__(self, category: int, band: Band, draw: Callable[[deque[Frame[Payload]]], float]) -> None:
+        self.category = category
+        self.parameters = parameters = PARAMETERS[category]
+        self.frames: deque[Frame[Payload]] = deque()
+        ifs_ns = band.sifs_ns + parameters.aifsn * SLOT_NS
+        self.contention = CategoryContention(
+            partial(draw, self.frames), ifs_ns, cw_min=parameters.cw_min, cw_max=parameters.cw_max
+        )
+
+
+class AccessCategories(Generic[Payload]):
+    """The access categories of one station, with the methods of `Contention` for all of them together.
+
+    Args:
+        mapping: Mapping of DSCPs.
+        band: Band of the station.
+        draw: As for `CategoryQueue`.
+
+    Attributes:
+        active: The category of the current or last exchange.
+        ifs_ns: 0; each category adds its own inter-frame space.
+    """
+
+    ifs_ns: Final = 0
+
+    def __init__(self, mapping: DscpMapping, band: Band, draw: Callable[[deque[Frame[Payload]]], float]) -> None:
+        self.mapping: Final = mapping
+        self._queues = [CategoryQueue(category, band, draw) for category in range(len(PARAMETERS))]
+        self._by_priority = [self._queues[category] for category in _PRIORITY]
+        self.active = self._queues[BEST_EFFORT]
+        self._sifs_ns = band.sifs_ns
+        self._txop_end_ns = self._continue_ns = 0
+
+    @property
+    def queues(self) -> Iterable[deque[Frame[Payload]]]:
+        """The queues of all categories."""
+        return [queue.frames for queue in self._queues]
+
+    @property
+    def busy_until_ns(self) -> int:
+        """End of the last frame or reservation that the station has sensed or sent."""
+        return self.active.contention.busy_until_ns
+
+    def queue_of(self, frame: Frame[Payload]) -> deque[Frame[Payload]]:
+        """Return the queue of a frame."""
+        return self._queues[frame.category].frames
+
+    def has_frames(self) -> bool:
+        """Return True if any queue has frames."""
+        return any(queue.frames for queue in self._queues)
+
+    def arrive(self, now_ns: int, frame: Frame[Payload], *, in_exchange: bool) -> None:
+        """Prepare the contention of a frame that arrived at an empty queue, perhaps during the station's exchange."""
+        contention = self._queues[frame.category].contention
+        contention.arrive(now_ns)
+        if in_exchange:
+            contention.require_backoff()
+
+    def earliest_start_ns(self, now_ns: int) -> int:
+        """Return the earliest start time of a category with frames, if the channel stays idle."""
+        return min(queue.contention.earliest_start_ns(now_ns) for queue in self._queues if queue.frames)
+
+    def on_busy(self, now_ns: int, until_ns: int) -> None:
+        """Implement `Contention.on_busy` for a station that is not scheduled to send."""
+        for queue in self._queues:
+            if queue.frames:
+                queue.contention.postpone(now_ns, until_ns)
+            else:
+                queue.contention.on_busy(now_ns, until_ns)
+
+    def postpone(self, now_ns: int, until_ns: int) -> int:
+        """Implement `Contention.postpone`."""
+        self.on_busy(now_ns, until_ns)
+        return self.earliest_start_ns(now_ns)
+
+    def defer_until(self, until_ns: int) -> None:
+        """Implement `Contention.defer_until`; each category adds its inter-frame space."""
+        for queue in self._queues:
+            queue.contention.defer_until(until_ns + queue.contention.ifs_ns)
+
+    def wait_until(self, now_ns: int) -> None:
+        """Start the countdown not before the end of the wait for a response, during which the channel was idle."""
+        for queue in self._queues:
+            queue.contention.defer_until(now_ns)
+
+    def set_busy_until(self, until_ns: int) -> None:
+        """Implement `Contention.set_busy_until`."""
+        for queue in self._queues:
+            queue.contention.set_busy_until(until_ns)
+
+    def on_success(self) -> None:
+        """Implement `Contention.on_success` for the active category."""
+        self.active.contention.on_success()
+
+    def on_failure(self) -> None:
+        """Implement `Contention.on_failure` for the active category, and end its transmission opportunity."""
+        self._txop_end_ns = 0
+        self.active.contention.on_failure()
+
+    def select(self, now_ns: int) -> deque[Frame[Payload]]:
+        """Return the queue whose first frame starts now; it becomes the active one.
+
+        Of several that could start, the one with the highest priority does, and others behave as after a collision:
+        10.23.2.4. All others count down until now.
+        """
+        if now_ns == self._continue_ns and self.active.frames and now_ns < self._txop_end_ns:
+            return self.active.frames
+        winner: CategoryQueue[Payload] | None = None
+        for queue in self._by_priority:
+            contention = queue.contention
+            if not queue.frames:
+                contention.on_busy(now_ns, now_ns)
+            elif contention.earliest_start_ns(now_ns) <= now_ns:
+                if winner is None:
+                    winner = queue
+                else:
+                    contention.on_failure()
+        assert winner is not None
+        self.active = winner
+        self._txop_end_ns = now_ns + winner.parameters.txop_ns if winner.parameters.txop_ns else 0
+        return winner.frames
+
+    def remaining_ns(self, now_ns: int) -> int:
+        """Return the rest of the transmission opportunity; a long time if it has no limit."""
+        return self._txop_end_ns - now_ns if self._txop_end_ns else _UNLIMITED_NS
+
+    def continue_ns(self, now_ns: int, exchange_ns: int) -> int | None:
+        """Return the start time of another exchange in the same transmission opportunity; None if it does not fit."""
+        start_ns = now_ns + self._sifs_ns
+        if start_ns + exchange_ns > self._txop_end_ns:
+            return None
+        self._continue_ns = start_ns
+        return start_ns

@@ -1,0 +1,97 @@
+"""Power save of stations of an access point (IEEE 802.11-2020, 11.2.3), as a delay of the frames to them.
+
+A station dozes when it has sent and received nothing for a time. The access point buffers frames for it until the
+next beacon; the station, which hears every beacon, then wakes. If it sends a frame, which announces that it is awake,
+it gets the buffered ones immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for
+the next DTIM as long as any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every
+beacon is received, and waking takes no time.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final, Generic
+
+from sim_backends.radio.contention import EventQueue
+from sim_backends.radio.frames import Frame
+from sim_backends.radio.links import Payload
+from sim_backends.radio.stations import Station
+
+BEACON_INTERVAL_NS: Final = 102_400_000
+"""100 time units of 1.024 ms: the default of access points."""
+
+DTIM_PERIOD: Final = 2
+"""The default of hostapd."""
+
+Release = Callable[[int, Station[Payload], Frame[Payload]], None]
+
+
+class PowerSave(Generic[Payload]):
+    """The dozing stations, and the frames that the access point buffers for them.
+
+    Args:
+        timeouts_ns: Time after the last frame after which a station dozes, by index; others never doze.
+        beacon_phase_ns: Time of the first beacon, which has a DTIM.
+        events: Scheduled events.
+        release: Queues a frame at its transmitter.
+    """
+
+    def __init__(
+        self,
+        timeouts_ns: Mapping[int, int],
+        beacon_phase_ns: int,
+        events: EventQueue,
+        release: Release[Payload],
+    ) -> None:
+        self._timeouts_ns = timeouts_ns
+        self._phase_ns = beacon_phase_ns
+        self._events = events
+        self._release = release
+        self._awake_until_ns = dict.fromkeys(timeouts_ns, 0)
+        self._buffers: dict[int | None, list[tuple[Station[Payload], Frame[Payload]]]] = {}
+        self.access_point: int | None = None
+
+    def buffer(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> bool:
+        """Buffer a frame that its transmitter must not send yet; return False if it may be sent."""
+        if self.access_point is None:
+            return False
+        if station.index != self.access_point:
+            self._wake(now_ns, station.index)
+            return False
+        receiver = frame.receiver
+        if receiver is not None and now_ns < self._awake_until_ns.get(receiver, now_ns + 1):
+            self._wake(now_ns, receiver)
+            return False
+        waiting = self._buffers.setdefault(receiver, [])
+        waiting.append((station, frame))
+        if len(waiting) == 1:
+            self._events.at(
+                self._beacon_ns(now_ns, DTIM_PERIOD if receiver is None else 1), self._on_beacon, receiver
+            )
+        return True
+
+    def discard(self, station: Station[Payload]) -> Sequence[Frame[Payload]]:
+        """Return the frames that a station has buffered, and remove them."""
+        frames = [frame for waiting in self._buffers.values() for holder, frame in waiting if holder is station]
+        for receiver, waiting in self._buffers.items():
+            self._buffers[receiver] = [entry for entry in waiting if entry[0] is not station]
+        return frames
+
+    def _beacon_ns(self, now_ns: int, period: int) -> int:
+        interval_ns = period * BEACON_INTERVAL_NS
+        return now_ns + (self._phase_ns - now_ns) % interval_ns
+
+    def _on_beacon(self, now_ns: int, receiver: int | None) -> None:
+        if receiver is None:
+            self._flush(now_ns, None)
+        elif self._buffers.get(receiver):
+            self._wake(now_ns, receiver)
+
+    def _wake(self, now_ns: int, index: int) -> None:
+        timeout_ns = self._timeouts_ns.get(index)
+        if timeout_ns is not None:
+            self._awake_until_ns[index] = now_ns + timeout_ns
+            if self._buffers.get(index):
+                self._flush(now_ns, index)
+
+    def _flush(self, now_ns: int, receiver: int | None) -> None:
+        for station, frame in self._buffers.pop(receiver, []):
+            self._release(now_ns, station, frame)
