@@ -151,6 +151,7 @@ class Init:
         self._supervisor = Supervisor()
         self._neighbourhood: Neighbourhood | None = None
         self._wifi: WifiSpec | None = None
+        self._interface = ""
 
     def run(self) -> None:
         """Serve requests; return when the lab has closed the control socket."""
@@ -163,6 +164,9 @@ class Init:
                 self._supervisor.reap()
             if self._channel.fileno() in readable:
                 is_connected = self._serve()
+        # hwsim keeps frames without a status, and these keep this network namespace, until the interface is down.
+        if self._wifi is not None:
+            network.switch_off(self._interface)
 
     def _serve(self) -> bool:
         received = worker.receive(self._channel, Deadline.after(_MESSAGE_S))
@@ -226,7 +230,7 @@ class Init:
     def _change_radio(self, request: Message) -> None:
         match request["do"]:
             case "open wifi":
-                self._wifi = WifiSpec(**request["wifi"])
+                self._wifi, self._interface = WifiSpec(**request["wifi"]), request["interface"]
                 wireless.bring_up(request["device"], request["interface"], request["address"], self._wifi)
             case "switch off":
                 network.switch_off(request["interface"])

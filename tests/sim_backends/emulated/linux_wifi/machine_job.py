@@ -19,7 +19,7 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Role
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.linux_wifi import medium_program
-from sim_backends.emulated.linux_wifi.radios import require_radios
+from sim_backends.emulated.linux_wifi.radios import find_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.world.world import load_world
@@ -33,7 +33,7 @@ CAST = {
 OPTIONS = {"fading": False, "shadowing_db": 0.0}
 NEAR = {"r0": (0.0, 0.0, 1.0), "r1": (10.0, 0.0, 1.0), "r2": (5.0, 5.0, 1.0)}
 FAR = {**NEAR, "r1": (9000.0, 0.0, 1.0)}
-JOIN_S = 240.0
+JOIN_S = 60.0
 
 
 def run(*argv: str, may_fail: bool = False) -> str:
@@ -139,7 +139,11 @@ def main() -> None:
             note("error", str(error))
         start_medium(lab.medium)
         note("restarted", lab.wait_for_link())
-    note("radios", [radio.interface for radio in require_radios(3)])
+    note("ended", True)
+    end_s = time.monotonic() + JOIN_S
+    while len(find_radios()) < 3 and time.monotonic() < end_s:
+        time.sleep(0.2)
+    note("radios", [radio.interface for radio in find_radios()])
     sys.stdout.write(f"RESULTS {json.dumps(results)}\n")
 
 

@@ -10,7 +10,7 @@ from fieldkit.cli import main
 from sim_backends.emulated.linux_wifi.virtual_machine import ROOT_VARIABLE
 from tests.helpers.paths import ROOT
 
-pytestmark = [pytest.mark.emulated, pytest.mark.nightly, pytest.mark.flaky(reruns=0)]
+pytestmark = [pytest.mark.emulated, pytest.mark.nightly]
 
 SITE = """\
 backend: emulated

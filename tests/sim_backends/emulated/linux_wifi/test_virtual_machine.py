@@ -17,8 +17,7 @@ from sim_backends.emulated.linux_wifi import guest
 from sim_backends.emulated.linux_wifi.virtual_machine import ROOT_VARIABLE, Kernel, require_machine, run_in_machine
 from tests.helpers.paths import ROOT
 
-# A second boot after a failure would show nothing new.
-pytestmark = [pytest.mark.emulated, pytest.mark.flaky(reruns=0)]
+pytestmark = pytest.mark.emulated
 
 # Without KVM a minute on an idle machine; the clock of the machine does not depend on it.
 BOOT_S = 1800.0
