@@ -1,4 +1,4 @@
-"""Protocols of backends: `Backend` provides robots, `Testbed` controls them, `Oracle` has a modelled radio's data."""
+"""Protocols of backends: `Backend` provides robots, `Testbed` controls them, `Oracle` has data of a radio model."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -30,7 +30,7 @@ from fieldkit.core.prompts import Answer, Operator
 from fieldkit.remote.shell import Shell
 
 _FORMER_KEYS: Final = MappingProxyType({"drives": "drive", "flies": "mavlink"})
-"""Section by the key of the ability in plans of earlier versions."""
+"""Section for each ability, by the key of the ability in plans of earlier versions."""
 
 
 class Robot(Strict):
@@ -127,7 +127,9 @@ class Oracle(Protocol):
         ...
 
     def links(self, *, continue_sampling: bool) -> Mapping[Role, Sequence[LinkSample]]:
-        """Return the samples of the robots' links since the last call, five per second, and one of now.
+        """Return the samples of the robots' links since the last call, and a sample of the current state.
+
+        Five samples are taken per second.
 
         Args:
             continue_sampling: Whether sampling continues after this call; it starts with the first such call.
@@ -252,9 +254,9 @@ class Attended(Protocol):
 
 
 CLOCK: Final = "clock"
-"""Purpose of the simulator of time, in `Simulating.simulators`."""
+"""Key in `Simulating.simulators` of the simulator that provides the clock."""
 INSTRUCTIONS: Final = "instructions"
-"""A clock that counts the instructions of a processor in software: times are no durations."""
+"""A clock that counts the instructions of an emulated processor; differences of its times are not real durations."""
 
 
 class Backend(Protocol):
@@ -321,8 +323,8 @@ class Simulating(Protocol):
     """Optional capability of a `Backend` whose robots run on simulators.
 
     Attributes:
-        simulators: What each simulator is, by its purpose: `physics`, `network`, and `sync`, the policy between them;
-            `wifi`; `CLOCK`. Empty if there are none.
+        simulators: Description of each simulator by its purpose: `physics`, `network`, `sync` (the policy between
+            physics and network), `wifi` or `CLOCK`. Empty if there are none.
     """
 
     simulators: Mapping[str, str]
@@ -354,7 +356,7 @@ class Relocating(Protocol):
 
 
 def simulators_of(backend: Backend) -> dict[str, str]:
-    """Return the simulators of a backend, empty if its robots are real or on a radio model only."""
+    """Return the simulators of a backend; empty if its robots are real, or use only a radio model."""
     return dict(backend.simulators) if isinstance(backend, Simulating) else {}
 
 
@@ -362,5 +364,5 @@ class BackendFactory(Protocol):
     """The object of an entry point of the group `fieldkit.backends`, usually the backend's class."""
 
     def __call__(self, site: Site | None, document: Document | None) -> Backend:
-        """Return the backend for a site file, or without one."""
+        """Return the backend for a site file, or for a lab without a site file."""
         ...

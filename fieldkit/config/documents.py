@@ -261,7 +261,7 @@ _REMEDIES: Final = {
     "expected <block end>": "indent this line with as many spaces as the other lines of its list or mapping",
     "mapping values are not allowed": "put text that has a colon in quotes; indent all keys of a mapping equally",
 }
-"""Remedies by the message of PyYAML."""
+"""Remedy for each error message of PyYAML."""
 
 
 def _configuration_error(error: Exception, text: str, source: str, line: int) -> ConfigurationError:

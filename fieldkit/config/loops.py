@@ -161,7 +161,7 @@ class _Expander:
         return value
 
     def _copy_line(self, at: Location, to: Location) -> None:
-        """Store the line of a location for the new location."""
+        """Store the line of a location in the document as the line of its location in the result."""
         if at in self._document.lines:
             self.lines[to] = self._document.lines[at]
 

@@ -84,8 +84,8 @@ class RecordCommand(Strict):
         setup: Shell files to source first: an SSH session without a terminal skips `.bashrc`.
         record: Argument list of the record command. `{duration_s}` and `{name}` are filled in; the word `{topics}`
             becomes one word per topic.
-        ends: `itself`: it exits after its duration. `sigint`: fieldkit stops it by SIGINT (`ros2 bag record` has no
-            duration).
+        ends: `itself`: the command exits after its duration. `sigint`: fieldkit stops it by SIGINT (`ros2 bag record`
+            has no duration).
         writes: The file that contains the messages, with `{name}` filled in: `{name}.bag`, for ROS 2
             `{name}/{name}_0.db3` or `.mcap`.
         rmw: Middleware of ROS 2, `cyclonedds` (DDS) or `zenoh`, unless `RMW_IMPLEMENTATION` names one.
@@ -214,8 +214,8 @@ class Tools(Strict):
 
     Attributes:
         netcat: Its netcat: traditional, OpenBSD, ncat or busybox. The variant is
-            [detected](method-loss.md#tools-that-differ) before each trial; a dry run derives it from the name, with
-            `nc` as the traditional one.
+            [detected](method-loss.md#tools-that-differ) before each trial; a dry run derives it from the name and
+            treats `nc` as the traditional one.
         capture: Its tcpdump.
         ping: Its ping: iputils (old or new) or busybox.
         python: Its Python, 3.8 or later, for the step `topics`; searched after the setup files of ROS are sourced.
@@ -267,7 +267,7 @@ class Limits(Strict):
             drone.
         fence_m: Maximum horizontal distance from the robot's start, in metres; required by steps that fly or drive
             it.
-        battery_min: Approximate running time on one charge, in minutes; a trial that takes longer reports it.
+        battery_min: Approximate running time on one charge, in minutes; a longer trial prints a warning.
     """
 
     max_speed_m_s: Number | Int
@@ -280,10 +280,10 @@ class ProfileSection(Strict):
     """Base of the sections of a robot profile that installed packages add.
 
     Attributes:
-        permission: Permission (`fieldkit.core.permissions`) that steps need to move a real robot by this section;
-            empty if they do not move it.
-        placement: What the operator must observe when a robot is placed that steps move by this section. `{robot}`
-            and `{other}`, the robot at the other end of its link, are filled in. Empty if there is nothing.
+        permission: Permission (`fieldkit.core.permissions`) that steps need to move a real robot by means of this
+            section; empty if they do not move it.
+        placement: Instruction to the operator who places a robot that steps move by means of this section. `{robot}`
+            and `{other}`, the robot at the other end of its link, are filled in. Empty without an instruction.
     """
 
     permission: ClassVar[str] = ""

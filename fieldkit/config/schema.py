@@ -216,7 +216,7 @@ class Strict(BaseModel):
 
     @classmethod
     def missing_package(cls, key: str) -> str:  # noqa: ARG003 (most mappings have no keys of packages)
-        """Return the package without which a key is unknown; empty if no package is known."""
+        """Return the package that must be installed for a key to be valid; empty if no such package is known."""
         return ""
 
     @model_validator(mode="before")
@@ -280,7 +280,7 @@ def _unknown(key: str, hint: str, outer: Iterable[str] = ()) -> Exception:
 
 
 def is_empty(value: object) -> bool:
-    """Return True if a value is empty, for `exclude_if` of fields that are not written then."""
+    """Return True if a value is empty; the `exclude_if` of fields that are omitted if they are empty."""
     return not value
 
 

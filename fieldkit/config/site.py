@@ -49,8 +49,8 @@ class SiteRobot(Strict):
         port: SSH port.
         user: SSH user; required by the field backend.
         key: Path of the private key; without it, keys of the SSH agent are used.
-        password: In place of a key: `ask` requests it at the terminal once per run, `keyring` reads it from the
-            system's keyring. The password itself is never written into the file.
+        password: Login by password instead of a key: `ask` requests the password at the terminal once per run,
+            `keyring` reads it from the system's keyring. The password itself is never written into the file.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
         address: Its IPv4 address on the radio under test; without it, `host`.
     """
@@ -80,8 +80,8 @@ class Site(Strict):
     The emulated backend ignores `host`, `port`, `user`, `key`, `host_key` and `address`: its robots have addresses
     from 10.42.0.1 on, in the order of the file, and generated keys. With `control: radio` the operator's laptop is a
     station too, `laptop` at 10.42.0.254: it is 2 m from the relay in `master` and from the receiver in `masterless`,
-    never behind the wall, with the same radio as the robots, and every packet of SSH is subject to the radio model.
-    In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply twice.
+    and never behind the wall. It has the same radio as the robots, and every packet of SSH is subject to the radio
+    model. In `master`, packets from sender to receiver cross two links, so `loss` and `delay` apply twice.
     [Method](method-radio.md#the-emulated-radio) describes the radio model.
 
     Attributes:

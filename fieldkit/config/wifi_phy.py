@@ -39,16 +39,18 @@ class WifiPhy(Strict):
         guard_interval_ns: Shortest guard interval: 400 or 800 ns for 802.11n and ac, 800, 1600 or 3200 ns for
             802.11ax.
         rate_control: Algorithm that selects its rates: `minstrel_ht` of Linux (SoftMAC drivers), `firmware` for
-            radios whose firmware selects them (brcmfmac, iwlwifi, ath10k), or `minstrel`, Linux's for 802.11g.
+            radios whose firmware selects them (brcmfmac, iwlwifi, ath10k), or `minstrel`, the algorithm of Linux for
+            802.11g.
         firmware_margin_db: Rate control `firmware`: margin in dB below the measured signal, 0 to 20.
         firmware_interval: Rate control `firmware`: time between two selections of a rate, 1 ms to 10 s.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS and CTS; without this
             key it sends no RTS, as with `iw phy PHY set rts off`.
-        access_categories: It has the four access categories of EDCA, into which packets come by their DSCP: `linux`
-            (its upper three bits, Linux up to 6.10) or `rfc8325`. Without this key all packets are best effort.
+        access_categories: Mapping of the DSCP of a packet to one of the four access categories of EDCA: `linux` (by
+            the upper three bits, as Linux up to 6.10 does) or `rfc8325`. Without this key all packets are best
+            effort.
         power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
             default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
-        power_save_timeout: Time after its last frame after which it dozes, 1 ms to 10 s; 100 ms in mac80211.
+        power_save_timeout: Time from its last frame until it dozes, 1 ms to 10 s; 100 ms in mac80211.
     """
 
     width_mhz: Int = 20

@@ -53,7 +53,7 @@ def misplaced_hint(key: str, data: Mapping[Any, Any], fields: Fields, outer: Seq
 
 
 def _inner_keys(kind: Any, depth: int = 0) -> Iterator[Sequence[str]]:  # noqa: ANN401 (any type)
-    """Yield the valid keys of each model that a type allows, without lists of mappings and mappings by name."""
+    """Yield the valid keys of each model that a type allows; models in lists and in mappings by name are omitted."""
     fields = getattr(kind, "model_fields", None)
     if fields is not None:
         yield [field.alias or name for name, field in fields.items()]
@@ -179,7 +179,7 @@ def _choice_message(text: str, choices: Sequence[str]) -> str:
 
 
 def _type_message(kind: str, message: str, value: object) -> str:
-    """Return the message about a value of another type than its key has; `message` for other kinds of problem."""
+    """Return the message about a value whose type is wrong for its key; `message` for other kinds of problem."""
     match kind:
         case "string_type" if isinstance(value, bool | int | float):
             return f"{message}; put it in quotes"

@@ -12,11 +12,11 @@ class CampaignPlanned:
         trials: The remaining trials, in order.
         done: Number of finished trials.
         total: Number of all trials.
-        walk_m: Distance for which robots must be carried, in metres.
+        walk_m: Distance over which robots must be carried, in metres.
         left_s: Estimated time.
         needed_bytes: Disk space on this machine that the evidence may need.
         free_bytes: Free disk space on this machine.
-        left_most_s: Upper estimate of `left_s`, without repeats that must be run again.
+        left_most_s: Upper estimate of `left_s`. It does not include repeats that must be run again.
     """
 
     name: str
@@ -54,7 +54,7 @@ class CampaignWent:
         done: Number of finished trials.
         total: Number of all trials.
         left_s: Estimated remaining time.
-        left_most_s: Upper estimate of the remaining time, without repeats that must be run again.
+        left_most_s: Upper estimate of the remaining time. It does not include repeats that must be run again.
     """
 
     trial: str

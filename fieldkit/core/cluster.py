@@ -20,7 +20,7 @@ except ImportError as error:
         f"a Dask cluster needs the package distributed: {error}", remedy='pip install "fieldkit[cluster]"'
     ) from error
 
-# It warns of lost workers, which `tasks` reports.
+# Its warnings about lost workers are suppressed, because `tasks` reports lost workers.
 logging.getLogger("distributed").setLevel(logging.ERROR)
 
 Parameters = ParamSpec("Parameters")
@@ -40,7 +40,7 @@ class ClusterExecutor(WorkerExecutor):
         LinkError: The scheduler does not answer.
     """
 
-    MIN_SUBMITTED: ClassVar[int] = 100  # they hide the delay of the network; the scheduler holds them back
+    MIN_SUBMITTED: ClassVar[int] = 100  # enough to hide the network delay; the scheduler queues them
 
     def __init__(self, address: str) -> None:
         if address.endswith(".json") and not Path(address).is_file():

@@ -170,7 +170,7 @@ class Column:
         return "the unit of a counted figure must be share" if is_counted and self.unit != "share" else None
 
     def invalid_value_reason(self, text: str) -> str | None:
-        """Return the reason why a text is not a possible value: `not a number`; None if it is possible or missing."""
+        """Return why a text is not a possible value, such as `not a number`; None if it is possible or missing."""
         if self.type is str or text in MISSING:
             return None
         if self.type is bool:
@@ -200,7 +200,7 @@ def columns(
     Raises:
         TypeError: `rank` is not a number.
     """
-    if not isinstance(rank, int):  # without a rank, the first column would be lost without an error
+    if not isinstance(rank, int):  # otherwise a call without a rank would lose its first column silently
         raise TypeError("the first argument of columns is the rank, for example 100")
     return tuple(_make_column(rank, *parts) for parts in declared)
 

@@ -60,7 +60,9 @@ class Deadline:
 
 
 class ExpiredError(TimeoutError):
-    """A fieldkit deadline has passed, in contrast to a `TimeoutError` of the operating system for a connection.
+    """A fieldkit deadline has passed.
+
+    A plain `TimeoutError` is instead the time-out of a connection, reported by the operating system.
 
     Args:
         what: What did not happen in time, for messages: `start`.

@@ -67,7 +67,10 @@ class MotionHeldError(RobotError):
 
 
 class HostKeyError(RobotError):
-    """The robot's SSH host key has changed, by another machine or a new installation; a person must check it."""
+    """The robot's SSH host key is not the pinned one; a person must check it.
+
+    The key changes if another machine has the address, or after a new installation.
+    """
 
     ends_trial = True
 
@@ -97,9 +100,9 @@ class EvidenceError(FieldkitError):
 def describe_exception(error: BaseException) -> str:
     """Return an exception in one line with the place in the code: `KeyError: 'a' (hops_step.py, line 28)`.
 
-    The place is the last traceback entry in the outermost file that is not part of this distribution, because a step
-    or policy of another package may call a library that raises the error. Without such a file, it is the last
-    entry.
+    The place is the last traceback entry in the outermost file that is not part of this distribution. This file can
+    be a step or policy of another package, which may call a library that raises the error. If there is no such file,
+    the place is the last entry of the traceback.
     """
     first_line = next(iter(str(error).splitlines()), "")
     text = type(error).__name__ + (f": {first_line}" if first_line else "")

@@ -179,7 +179,7 @@ class RepeatEnded:
         total: Number of planned repeats.
         left_s: Estimated remaining time.
         remedy: What to do about a failed step, if the step states it.
-        left_most_s: Upper estimate of the remaining time, without repeats that must be run again.
+        left_most_s: Upper estimate of the remaining time. It does not include repeats that must be run again.
     """
 
     repeat: str

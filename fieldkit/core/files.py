@@ -101,7 +101,7 @@ def _remove_unlocked(path: Path) -> None:
 
 
 def write(path: Path, content: bytes) -> None:
-    """Write a file atomically, as `replacing`.
+    """Write a file atomically, as `replacing` does.
 
     Raises:
         OSError: The file cannot be written; an existing file is unchanged.

@@ -108,7 +108,7 @@ class Status(StrEnum):
 
 
 MAX_REPEATS: Final = 100_000
-"""Largest number of repeats per protocol of one trial; they would take weeks."""
+"""Maximum number of repeats per protocol of one trial. So many repeats would take weeks."""
 
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """Final states of an attempt."""
@@ -315,8 +315,8 @@ class DelayParts:
         processing_ns: Processing time in the stations.
         transmission_ns: Transmission time of the bits at the rate of the link.
         propagation_ns: Propagation time on the medium.
-        queuing_ns: Time for which they waited for earlier packets.
-        undivided_ns: Delay of which the network does not report the components.
+        queuing_ns: Time that the packets waited for earlier packets.
+        undivided_ns: Delay whose components the network does not report.
         policy_ns: Time added by the sync policy of a co-simulation, not part of the delay; None without one.
     """
 
@@ -331,13 +331,13 @@ class DelayParts:
 
 @dataclass(frozen=True, kw_only=True)
 class Lateness:
-    """Lateness with which an emulator delivered packets, compared with the delivery times of its radio model.
+    """Lateness of the packets that an emulator delivered, relative to the delivery times of its radio model.
 
     Attributes:
         bound_ns: Maximum lateness. If any packet is later, the emulation did not follow the model.
         packets: Number of packets by lateness in ns (a histogram); a lateness is rounded up by at most an eighth.
-        windows: Number of windows of a co-simulation by lateness in ns, the time by which their results were later
-            than their end in real time; None without a co-simulation.
+        windows: Number of windows of a co-simulation by lateness in ns (a histogram). The lateness of a window is the
+            time from its end in real time to the arrival of its results. None without a co-simulation.
     """
 
     bound_ns: int

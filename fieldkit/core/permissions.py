@@ -1,4 +1,4 @@
-"""Permissions that the operator gives by options `--allow-NAME`, and that installed packages define.
+"""Permissions that installed packages define, and that the operator gives by options `--allow-NAME`.
 
 An entry point of the group `fieldkit.permissions` has the name of the permission, and names a `Permission`.
 """
@@ -38,12 +38,12 @@ def installed() -> Mapping[str, Permission]:
 
 
 def repeated(names: Iterable[str]) -> list[str]:
-    """Return those of the installed permissions with these names that commands in remedies repeat, sorted."""
+    """Return the permissions among `names` that commands in remedies repeat, sorted."""
     permissions = installed()
     return sorted(name for name in names if permissions[name].is_repeated)
 
 
 def granted(arguments: argparse.Namespace) -> frozenset[str]:
-    """Return the names of the permissions that the operator gave; commands without these options give none."""
+    """Return the names of the permissions that the operator gave; empty for a command without these options."""
     names = (point.name for point in plugins.entry_points(plugins.PERMISSIONS))
     return frozenset(name for name in names if getattr(arguments, f"allow_{name.replace('-', '_')}", False))

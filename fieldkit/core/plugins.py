@@ -66,7 +66,7 @@ def owner(group: str, section: str) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the version of each package that adds backends, steps or sections, fieldkit included."""
+    """Return the version of fieldkit and of each package that adds backends, steps or sections."""
     groups = (BACKENDS, STEPS, PROFILE_SECTIONS, PROCEDURE_SECTIONS)
     packages = dict.fromkeys(point.dist for group in groups for point in entry_points(group))
     return {package.name: package.version for package in packages if package is not None}
@@ -96,7 +96,7 @@ def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another packa
 
 @cache
 def _selector(search_path: tuple[str, ...]) -> Callable[..., EntryPoints]:  # noqa: ARG001 (the key of the cache)
-    """Return the function that selects entry points of the installed packages, whose metadata takes 10 ms to read."""
+    """Return the function that selects entry points of the installed packages. Reading their metadata takes 10 ms."""
     return metadata.entry_points().select
 
 

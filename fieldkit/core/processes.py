@@ -40,7 +40,7 @@ class WorkerExecutor(Executor):
 
     @abstractmethod
     def stop(self) -> None:
-        """Release the workers. Tasks that run or wait are given up."""
+        """Release the workers. Running and waiting tasks are abandoned."""
 
 
 class LocalProcesses(ProcessPoolExecutor, WorkerExecutor):

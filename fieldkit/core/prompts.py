@@ -42,7 +42,7 @@ class Question:
         unit: Unit of the number; empty if it has none.
         choices: The possible words; empty for a number.
         bounds: Smallest and largest possible number.
-        usual: Answer that an empty line means; empty if there is no default.
+        usual: Default answer, which an empty line selects; empty if there is no default.
     """
 
     text: str
@@ -95,7 +95,7 @@ class Operator(Protocol):
         ...
 
     def enter(self, question: Question) -> str:
-        """Show a question and return its answer, as `Question.read`; raises as `ask`."""
+        """Show a question and return its answer in the form of `Question.read`; raises as `ask`."""
         ...
 
 

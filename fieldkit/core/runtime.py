@@ -44,9 +44,9 @@ def user_at_host() -> str:
 def base_folder() -> Path:
     """Return the base folder for this user's files that exist only while a process runs.
 
-    This is the first of `XDG_RUNTIME_DIR`, `/run/user/UID` (freedesktop.org Base Directory Specification), `/run` for
-    root, and `~/.cache`, that belongs to this user and to which no other user can write; otherwise the folder of
-    temporary files.
+    The candidates are, in this order, `XDG_RUNTIME_DIR`, `/run/user/UID` (freedesktop.org Base Directory
+    Specification), `/run` for root, and `~/.cache`. The first folder that belongs to this user and to which no other
+    user can write is used. If there is none, the folder of temporary files is used.
     """
     user = os.geteuid()
     names = filter(None, (os.environ.get("XDG_RUNTIME_DIR"), f"/run/user/{user}", "/run" if user == 0 else ""))

@@ -34,7 +34,7 @@ class WorkerDiedError(FieldkitError):
 
 @dataclass(frozen=True)
 class TaskEnd(Generic[Result]):
-    """The end of a task.
+    """Result or error of a finished task.
 
     Attributes:
         number: Index of the task.

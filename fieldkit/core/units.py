@@ -18,7 +18,7 @@ BYTES_PER_UNIT: Final = {"B": 1.0, "kB": 1e3, "MB": 1e6, "GB": 1e9, "KiB": 1024.
 FRACTION_PER_UNIT: Final = {"%": 0.01}
 
 _MAX_VALUE: Final = 1e11
-"""Upper bound of any quantity, in its unit of factor 1: larger times, above 3,000 years, make timers overflow."""
+"""Upper bound of any quantity, in the unit whose factor is 1. Times above 3,000 years make timers overflow."""
 
 _QUANTITY: Final = re.compile(
     # Possessive quantifiers prevent backtracking over long runs of blanks.
@@ -34,7 +34,7 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
 
     Args:
         text: For example `15s`, `0.2 s`, `30ft`.
-        units: Factor per unit symbol; the shortest decimal of a factor counts as its exact value.
+        units: Factor per unit symbol; the shortest decimal text of a factor is used as its exact value.
         what: The kind of quantity, for the message.
 
     Raises:
@@ -120,7 +120,7 @@ class TimeEstimate:
 
     Attributes:
         likely_s: Expected duration.
-        most_s: Upper estimate, without repeats that must be run again.
+        most_s: Upper estimate. It does not include repeats that must be run again.
     """
 
     likely_s: float

@@ -27,7 +27,7 @@ class Connection:
         address: Address of the robot.
         connect: Opens the stream.
         credentials: Host key and login.
-        patience_s: Time, from its loss, for which a lost link is reopened.
+        patience_s: Time after the loss of a link during which attempts to reopen it are made.
         notice: Called with one line when the link is lost, and when it is restored.
         on_air: Whether the link crosses the radio under test.
         timing: Timeouts of the link.
@@ -57,8 +57,9 @@ class Connection:
         self._on_air = on_air
         self._timing = timing
         self._connecting = threading.Lock()  # held by the thread that logs in
-        self._lock = threading.Lock()  # of the attributes below; no thread waits while it holds this lock
-        self._close_event = threading.Event()  # `close` sets and replaces it; each wait uses the event of its start
+        self._lock = threading.Lock()  # protects the attributes below; no thread waits while it holds this lock
+        # `close` sets this event and replaces it by a new one. A wait uses the event that was present at its start.
+        self._close_event = threading.Event()
         self._link: Link | None = None
         self._was_up = False
         self._lost_at_s: float | None = None
@@ -108,8 +109,8 @@ class Connection:
         """Return the result of `attempt`, which is repeated after each loss of the link.
 
         Only a link that was open before is reopened, so that a wrong address is reported immediately. A repeated
-        attempt has at least `Timing.reply_s`. The total time is limited to that of `deadline`, `patience_s`, one
-        login, and `Timing.reply_s`.
+        attempt has at least `Timing.reply_s`. The total time is limited to the sum of the times of `deadline`,
+        `patience_s`, one login, and `Timing.reply_s`.
 
         Raises:
             LinkError: The deadline passed with an open link, the link was not restored, or `close` was called.
@@ -130,7 +131,7 @@ class Connection:
     def _wait_for_link(
         self, error: LinkLostError | LoginRefusedError, final: Deadline, close_event: threading.Event
     ) -> None:
-        """Return when the link is open again; raise the last error after `patience_s`, or at `final`.
+        """Wait until the link is open again; raise the last error after `patience_s`, or at `final`.
 
         A robot that refuses the login although it accepted it before is treated as a robot that boots.
         """
@@ -177,7 +178,7 @@ class Connection:
             self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
 
     def _wait_for_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
-        """Wait until the radio is not measured any more; return the maximum seconds that this could take."""
+        """Wait until the radio is no longer measured; return the expected maximum of this time, in seconds."""
         initial_s = self._silence_s()
         if initial_s and notify:
             wait = format_duration(initial_s)
@@ -208,8 +209,8 @@ class Connection:
     def silence(self, seconds: float) -> Iterator[None]:
         """Keep the link silent during the body, as `Shell.silence`.
 
-        A link without answers is not closed during this time, since keepalive probes would send packets. Channels
-        that are being opened are awaited first.
+        A link without answers is not closed during this time, since keepalive probes would send packets. The body
+        starts after the channels that are being opened are open.
         """
         if not self._on_air:
             yield
@@ -229,7 +230,7 @@ class Connection:
 
     @contextmanager
     def _block_opening(self, seconds: float) -> Iterator[Deadline]:
-        """Allow no thread to open a link, channel or shell during the body, at most for `seconds`.
+        """Prevent all threads from opening a link, channel or shell during the body, for at most `seconds`.
 
         Several steps may measure at the same time; the latest end applies.
         """

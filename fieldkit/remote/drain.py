@@ -34,7 +34,7 @@ def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, 
         if not chunk:
             if not channel.status_event.wait(deadline.remaining_s):
                 break
-            _exit_code(channel, b"", robot)  # raises if the link has ended, not the command
+            _exit_code(channel, b"", robot)  # raises an error if the link has ended, and not only the command
             return False
     if remaining:
         raise ExpiredError("report")

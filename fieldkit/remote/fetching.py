@@ -57,7 +57,7 @@ class NoFolderError(RobotError):
 
 
 class LateJobError(RobotError):
-    """All evidence was fetched, but a job failed after `jobs.stop`, which did not wait for its end, had returned."""
+    """All evidence was fetched, but a job failed after `jobs.stop` had returned without waiting for the job's end."""
 
 
 class FetchProgress:
@@ -289,7 +289,7 @@ def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str |
 
 
 def _require_own(name: str, robot: str, foreign: Callable[[str], str | None]) -> None:
-    """Check that the laptop or another robot does not write a file of this name.
+    """Check that this name is not reserved for a file that the laptop or another robot writes.
 
     Raises:
         EvidenceError: The laptop or another robot writes it.

@@ -139,7 +139,7 @@ def ready_when_bound(protocol: Protocol, port: int) -> str:
 
 
 def command(verb: str, job: Job) -> tuple[str, ...]:
-    """Return the remote command line for a job: the function `start`, `run` or `serve` describes each verb."""
+    """Return the remote command line for a job; the functions `start`, `run` and `serve` describe the verbs."""
     files = (job.stdin or "/dev/null", job.stdout or job.log, job.log)
     options = (f"{job.limit_s:.15g}", job.ready or "-", str(job.ready_s), *files)
     return (*_script(job), verb, job.folder, job.name, *options, *limited_argv(job))

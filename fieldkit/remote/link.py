@@ -255,7 +255,8 @@ class Link:
     def open_spares(self) -> None:
         """Start to open channels in advance, so that later commands need not wait for a channel.
 
-        Must be called after a command has ended. At its start the answers would collide with its packets.
+        Must be called after a command has ended. At the start of a command, the answers would collide with its
+        packets.
         """
         _, transport = self._connection()
         if _closes_spares(transport):
@@ -265,7 +266,7 @@ class Link:
             self._spares += [self._open_in_background(transport) for _ in range(missing)]
 
     def wait_until_opened(self, deadline: Deadline) -> None:
-        """Wait until all channels are opened that are opened in advance, or the deadline has passed."""
+        """Wait until all channels that are being opened in advance are open, or the deadline has passed."""
         with self._lock:
             spares = list(self._spares)
         wait(spares, timeout=deadline.remaining_s)

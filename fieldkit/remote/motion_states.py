@@ -6,7 +6,7 @@ from typing import Final
 
 
 class MotionState(StrEnum):
-    """State of a robot after the order to stop, the worst last; `job.sh` uses the same names for each program.
+    """States of a robot after the order to stop, from best to worst; `job.sh` uses the same names for each program.
 
     Attributes:
         NOTHING: No program of fieldkit moves it; nothing is sent to it.
@@ -14,7 +14,7 @@ class MotionState(StrEnum):
         LANDED: Its motors have stopped.
         ENDED: The program has ended without a report about the robot: it had not started to move it.
         LAND: A drone is landing at its position.
-        RETURN: A drone is returning, and will land then.
+        RETURN: A drone is returning, and will then land.
         SILENT: The program received a signal and has not confirmed anything. A driving program was killed.
         ALARM: The program cannot land its drone now: the autopilot sends no heartbeat, or another party flies it.
     """

@@ -32,7 +32,7 @@ class ShellPool:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()  # of the attributes below
+        self._lock = threading.Lock()  # protects the attributes below
         self._link: Link | None = None
         self._shells: list[PersistentShell] = []
         self._opening = False
@@ -117,7 +117,7 @@ class PersistentShell:
 
     @property
     def alive(self) -> bool:
-        """Whether no end of the shell was received."""
+        """Whether the shell is running, as far as the received data shows."""
         return not (self._channel.closed or self._channel.eof_received)
 
     def reserve(self) -> bool:

@@ -68,7 +68,7 @@ def install(shell: Shell, deadline: Deadline) -> None:
         RobotError: Its home cannot be written, a program is missing, or its login shell prints a greeting.
     """
     checked = shell.run(("sh", "-c", _CHECK_SCRIPT, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False)
-    if checked.stdout:  # it would be mixed with the output of jobs, and with evidence
+    if checked.stdout:  # a greeting would be mixed with the output of jobs, and with evidence
         raise RobotError(
             f"its login shell answers every command with {printable(checked.stdout[:_GREETING_BYTES])!r}",
             where=shell.robot,

@@ -70,7 +70,7 @@ class _Pair:
     within: tuple[Nest, ...]
 
     def prefixes(self, nest: Nest) -> tuple[str, ...]:
-        """Return the names of flow and fault without that of `nest`, which is added to its columns later."""
+        """Return the names of flow and fault, without the name of `nest`, which is added to the columns later."""
         return tuple(step.prefix for step in (self.flow, self.fault) if step is not nest)
 
 
@@ -106,7 +106,7 @@ def measure(nest: Nest, view: View) -> Measured:
 
 
 def _pairs(nest: Nest) -> Iterator[_Pair]:
-    """Yield the pairs of a fault and a flow of which one is `nest` and the other is inside it."""
+    """Yield the pairs of a fault and a flow. One of them is `nest`, and the other is inside it."""
     inside = [step_within for entry in nest.during for step_within in _walk(entry.step, (nest,))]
     if isinstance(nest, CausesFault):
         yield from (_Pair(nest, step, within) for step, within in inside if isinstance(step, SendsFlow))

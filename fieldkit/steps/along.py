@@ -20,7 +20,7 @@ class AlongStep(Step, DependsOnCast, ChecksPlacement):
     Attributes:
         duration_key: The key that sets its duration without `along`: `duration` or `count`.
         along: Whether the step lasts as long as the path of the `move` that contains it, instead of its duration or
-            count. Inside `fly` it is not possible.
+            count. It cannot be used inside `fly`.
     """
 
     duration_key: ClassVar[str] = "duration"

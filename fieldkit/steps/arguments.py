@@ -1,8 +1,8 @@
 """Variables in the arguments of a program: `{address.ROLE}`, `{distance}`, `{repeat}` and `{put}`.
 
-Programs such as awk, jq and Go templates use braces, too. So only these names are replaced. `{{distance}}` is written
-for the text `{distance}`; all other braces stay unchanged, also `${distance}`, a variable of a shell. A name that
-resembles one of these variables is refused, because it is most likely a typing error.
+Programs such as awk, jq and Go templates also use braces. Therefore only these names are replaced. `{{distance}}`
+becomes the text `{distance}`. All other braces are unchanged, including `${distance}`, a variable of a shell. A name
+that resembles one of these variables is refused, because it is most likely a typing error.
 """
 
 import difflib

@@ -53,7 +53,7 @@ class DescribesActions(Capability):
 
     @abstractmethod
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
-        """Yield a line for each such action, without those of the steps inside; `--dry-run` prints them."""
+        """Yield a line for each such action, without the actions of the steps inside; `--dry-run` prints them."""
 
 
 class Moves(Capability):
@@ -65,7 +65,7 @@ class Moves(Capability):
 
     @abstractmethod
     def abort_notes(self, scene: Scene) -> Iterator[str]:
-        """Yield a sentence for each of them on what it does if the attempt is stopped immediately."""
+        """Yield a sentence for each of these robots: what it does if the attempt is stopped immediately."""
 
 
 class Restarts(Capability):
@@ -129,7 +129,7 @@ class HasRefusals(Capability):
 
     @abstractmethod
     def refusals(self, scene: Scene) -> Iterator[Refusal]:
-        """Yield the reasons why the step cannot work on its robots, without those of the steps inside."""
+        """Yield the reasons why the step cannot work on its robots, without the reasons of the steps inside."""
 
 
 class HasNeeds(Capability):
@@ -180,7 +180,7 @@ class SendsTraffic(Capability):
 
     @abstractmethod
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """Yield the traffic of the step on the radio, without that of the steps inside."""
+        """Yield the traffic of the step on the radio, without the traffic of the steps inside."""
 
 
 class SendsFile(Capability):
@@ -217,7 +217,7 @@ class Records(Capability):
 
     @abstractmethod
     def with_record(self, duration_s: float) -> Self:
-        """Return this step with every recording of it `duration_s` long."""
+        """Return this step with recordings of the duration `duration_s`."""
 
 
 class WritesOnLaptop(Capability):
@@ -225,7 +225,10 @@ class WritesOnLaptop(Capability):
 
     @abstractmethod
     def laptop_files(self) -> tuple[str, ...]:
-        """Return those of `Step.files` that the laptop writes; their names are in `fieldkit.core.laptop_files`."""
+        """Return the names in `Step.files` of files that the laptop writes.
+
+        `fieldkit.core.laptop_files` defines these names.
+        """
 
 
 # Measurements.

@@ -10,7 +10,10 @@ from contextlib import contextmanager
 from typing import Final, Protocol
 
 STOPPED: Final = "stopped by the operator"
-"""Reason for which, after the order to stop, the repeat is void and no robot may move until a person permits it."""
+"""Reason that is stored after the order to stop.
+
+The repeat is void for this reason, and no robot may move until a person permits it.
+"""
 
 _SIGNAL_S: Final = 0.5
 

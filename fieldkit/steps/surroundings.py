@@ -1,4 +1,4 @@
-"""What a step sees of the steps before it and around it."""
+"""The information that a step has about the steps before it and around it."""
 
 from collections.abc import Mapping
 from typing import ClassVar, Protocol

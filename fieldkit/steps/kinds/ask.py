@@ -51,11 +51,11 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         column: Name of the column.
         question: The question, without a question mark.
         unit: Unit of the number; the operator need not type it.
-        choices: Possible words, for an answer that is not a number: 2 to 20 of up to 31 characters. The operator
-            types a word or its position in the list.
+        choices: Possible words, for an answer that is not a number: 2 to 20 words of up to 31 characters. The
+            operator types a word or its position in the list.
         least: Smallest possible number.
         most: Largest possible number.
-        usual: Default answer: for Enter alone, and if no operator is asked.
+        usual: Default answer. It is used if the operator only presses Enter, and if no operator is asked.
         each: `trial`: asked once, before the first repeat that contains the step; `repeat`: asked in each.
     """
 

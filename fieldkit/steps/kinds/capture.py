@@ -59,13 +59,14 @@ STAMP_NS: Final = 1_000
 
 
 class CaptureStep(Nest, HasNeeds, UsesSpace):
-    """Runs tcpdump on each robot, from before the steps in `during` begin until they have ended.
+    """Runs tcpdump on each robot. It starts before the steps in `during` and ends after them.
 
-    The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between their ends (a port
-    filter matches first fragments only). Losses and delays of a transfer need a capture on both of its ends around
-    it; otherwise these columns are empty. With a `ping` inside, after the transfer, the captures give the offset
-    between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP transfer has no
-    answer, and the offset needs packets in both directions. Writes `ROLE.pcap` and `ROLE-capture.log`.
+    The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between the robots of these
+    steps (a port filter matches first fragments only). The columns on losses and delays of a transfer are empty
+    unless the transfer is inside a capture on both of its robots. With a `ping` inside, after the transfer, the
+    captures give the offset between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP
+    transfer has no answer, and the offset needs packets in both directions. Writes `ROLE.pcap` and
+    `ROLE-capture.log`.
 
     Attributes:
         robots: Roles that capture.
@@ -142,7 +143,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
 
     @property
     def _needs_all_packets(self) -> bool:
-        """Whether a packet dropped before tcpdump falsifies a measurement of a step inside."""
+        """Whether a packet dropped before tcpdump makes a measurement of a step inside wrong."""
         return any(step.needs_complete_capture for step in self._leaves())
 
     def _leaves(self) -> Iterator[Step]:

@@ -52,14 +52,15 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     asked to cause it; with `--yes` no operator is asked, and the attempts are void.
 
     - `link-down`: the radio interface is down for `for`, then up again.
-    - `out-of-range`: no other robot receives the robot for `for`; without the relay, no robot receives another.
+    - `out-of-range`: no other robot receives the robot for `for`. If it is the relay, no robot receives any other.
     - `reboot`: every process ends at the same moment, data in memory is lost, and the robot boots.
     - `kill`: every process named `process` ends at the same moment.
 
-    An observer records when the robot answers, from before the fault until it has answered for a second again: a ping
-    every 100 ms from the other end of the pair (200 ms if an old iputils requires it), or for `kill` a poll of the
-    robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`, `fault-KIND.txt` (duration of the cause
-    and its interval) and `fault-KIND-times.txt` (its start and end, see [recovery](method-delay.md#recovery)).
+    An observer records when the robot answers. It starts before the fault, and ends when the robot has answered for a
+    second again. It sends a ping every 100 ms from the other end of the pair (200 ms if an old iputils requires it),
+    or for `kill` polls the robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`,
+    `fault-KIND.txt` (duration of the cause and its interval) and `fault-KIND-times.txt` (its start and end, see
+    [recovery](method-delay.md#recovery)).
 
     Attributes:
         robot: Role of the robot with the fault.
@@ -163,7 +164,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             raise
         finally:
             inner.halt.set()
-            pool.shutdown(wait=False)  # after Ctrl-C its handler stops the jobs for which the steps wait
+            pool.shutdown(wait=False)  # after Ctrl-C the signal handler stops the jobs for which the steps wait
 
     def _clocks(self, testbed: Testbed) -> dict[Role, Offset]:
         """Return the offset of each robot's clock.
@@ -209,7 +210,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
                 entry.step.run(scene, testbed, announce)
 
     def _lead_in(self, steps: "Future[None]") -> None:
-        """Let the steps inside run before the fault; an error now is not caused by the fault and is raised."""
+        """Let the steps inside run before the fault. An error in this time is not due to the fault and is raised."""
         from concurrent.futures import wait  # noqa: PLC0415 (as above)
 
         until = Deadline.after(self.after)

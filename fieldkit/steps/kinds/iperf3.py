@@ -49,7 +49,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     """Measures with iperf3, 3.1 or later, which both robots need: `sudo apt-get install iperf3`.
 
     The server ends with the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
-    `capture` there are also the captures' figures of the same packets: [columns](method-loss.md#iperf3),
+    `capture`, figures of the same packets are also computed from the captures: [columns](method-loss.md#iperf3),
     [stalls](method-delay.md#stalls-of-a-flow).
 
     Attributes:

@@ -242,7 +242,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         """Return the number of received packets of pings that sent no request during the captures.
 
         Packets of another ping of this attempt do not count, since its requests were captured. Fragments without
-        their first fragment count only if they are of requests, because the captures end after the ping.
+        their first fragment count only if they belong to requests, because the captures end after the ping.
         """
         sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
         if sender is None or receiver is None:

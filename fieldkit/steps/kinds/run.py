@@ -49,8 +49,8 @@ class PrintedColumn(Strict):
         name: Name of the column.
         unit: Any unit, `V`, `dBm`, `%`; `text`, `bool` or `count` for values without one.
         meaning: Meaning of the values, for `fieldkit columns`.
-        path: Where the value is in JSON output, `battery.cells[0].mV`: a [JMESPath](https://jmespath.org). Of
-            duplicate keys the last one counts.
+        path: Where the value is in JSON output, `battery.cells[0].mV`: a [JMESPath](https://jmespath.org). If a key
+            occurs twice, the last one is used.
         expression: In place of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
             one group; its first match is the value. `^` and `$` match at ends of a line.
         optional: Whether the value may be missing in a valid repeat.
@@ -103,7 +103,7 @@ class PrintedColumn(Strict):
 
 
 class Bounds(Strict):
-    """Bounds of a value, outside of which the repeat is void.
+    """Bounds of a value. If a value is outside of them, the repeat is void.
 
     Attributes:
         min: Minimum.
@@ -123,7 +123,7 @@ class Bounds(Strict):
 
 
 class Expected(Strict):
-    """Conditions on exit code and values, without which the repeat is void.
+    """Conditions on exit code and values. If one of them is not met, the repeat is void.
 
     Attributes:
         code: Permitted exit codes, 0 to 125.
@@ -138,13 +138,13 @@ class RunStep(Step, UsesSpace, Summarizes):
     """Runs a program on a robot, keeps its output, and reads columns from the output.
 
     The program is found in the PATH of a session without a terminal, or by its absolute path; it runs in the folder
-    of the attempt. No shell is involved: for one, write `sh -c '...'`. At most 1 MiB each of output and of errors is
-    kept; a program that prints more is stopped. Writes `run.txt` and `ROLE-run.log`.
+    of the attempt. No shell is involved; to use one, write `sh -c '...'`. At most 1 MiB of standard output and 1 MiB
+    of standard error are kept; a program that prints more is stopped. Writes `run.txt` and `ROLE-run.log`.
 
     Variables in `command` and `argv`: `{address.ROLE}` is the address of a robot on the radio, `{distance}` the
     distance as typed (`30ft`), `{repeat}` the number of the repeat of its protocol, from 1, and `{put}` the path of
     the copied program. `{{distance}}` is the text `{distance}`; other braces, and `${distance}`, are not changed, but
-    a name that is almost one of these is refused. Inside `for`, write `{{distance}}`.
+    a name that resembles one of these is refused. Inside `for`, write `{{distance}}`.
 
     Attributes:
         robot: Role of the robot on which it runs.
@@ -152,14 +152,15 @@ class RunStep(Step, UsesSpace, Summarizes):
             variables.
         argv: The command as a list of words, instead of `command`.
         put: A program of the lab, at most 8.4 MB, which is copied to the robot before the first step: a path relative
-            to the folder of the procedure, else of the lab; links must not point outside. `{put}` is its path on
-            the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it is a path.
+            to the folder of the procedure or, if it does not exist there, of the lab; links must not point outside.
+            `{put}` is its path on the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it
+            is a path.
         takes: Approximate duration, for the estimate of the time left.
         limit: A program that runs longer is stopped, and the repeat is void.
         output: File for its standard output.
         prints: Approximate size of the output, for the estimate of disk space.
         figures: Columns of `trial.csv`, each read from the output.
-        expect: Conditions without which the repeat is void.
+        expect: Conditions; if one of them is not met, the repeat is void.
     """
 
     robot: Role

@@ -43,11 +43,11 @@ _FLOWS: Final = (
 class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
     """Loads the radio while the steps in `during` run: iperf3 sends until the last of them has ended.
 
-    Of the load only [stalls](method-delay.md#stalls-of-a-flow) are measured. Its robots need iperf3, 3.1 or later. A
-    load that ends early makes the repeat void. Writes `ROLE-soak.log`.
+    Only the [stalls](method-delay.md#stalls-of-a-flow) of the load are measured. Its robots need iperf3, 3.1 or
+    later. A load that ends early makes the repeat void. Writes `ROLE-soak.log`.
 
     Attributes:
-        port: Port that the receiver listens on; it must differ from that of an `iperf3` inside.
+        port: Port that the receiver listens on; it must differ from the port of an `iperf3` inside.
         during: Steps that run at the same time.
     """
 

@@ -67,7 +67,10 @@ BagName = Annotated[
 _LISTEN: Final = "listen"
 _SEND: Final = "send"
 MAX_LATE_SHARE: Final = 0.1
-"""Maximum share of its limit that a listener may have waited for its sender if it was then stopped at the limit."""
+"""Maximum waiting time of a listener for its sender, as a share of the listener's limit.
+
+It applies if the listener was stopped at its limit.
+"""
 
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
@@ -93,8 +96,8 @@ class TransferStep(
     Attributes:
         sender: Role that sends; columns with "sender" in their name refer to it.
         receiver: Role that receives.
-        file: The file to send: name of a recording on the sender (`scan`) or of its file (`scan.bag`). Without it,
-            the only recording on the sender.
+        file: The file to send: name of a recording on the sender (`scan`) or of its file (`scan.bag`). Without this
+            key, the only recording on the sender is sent.
         into: The file written by the receiver.
         port: Port that the receiver listens on.
         idle: A UDP listener ends after this time without a datagram; at least `1s`, rounded up to whole seconds.
@@ -133,7 +136,10 @@ class TransferStep(
         return None
 
     def _sent(self, scene: Scene) -> RecordedFile:
-        """Return the recording to send; the first one if none has the name, which `refusals` reports."""
+        """Return the recording to send.
+
+        If none has the name, return the first one, because `refusals` reports this error.
+        """
         recordings = scene.recorded[self.sender]
         return next((file for file in recordings if self.file in {file.name, file.alias}), recordings[0])
 
@@ -245,7 +251,7 @@ class TransferStep(
             )
 
     def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
-        """Return the error of a sender that started so late that its loss is not caused by the radio."""
+        """Return the error if a sender started so late that the radio is not the cause of its loss."""
         return RobotError(
             f"sending started up to {waited_s:.1f} s after listening, but {listener}",
             where=scene.robot(self.sender).name,

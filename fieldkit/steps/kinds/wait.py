@@ -21,7 +21,7 @@ class WaitStep(AlongStep, DescribesActions, AsksOperator):
     With `--yes` no operator is asked.
 
     Attributes:
-        duration: How long to wait; exactly one of this, `until` and `along` is given.
+        duration: How long to wait. Exactly one of `duration`, `until` and `along` is given.
         until: What the operator must do, in the imperative: `open the door`.
     """
 
