@@ -46,7 +46,7 @@ class Estimate:
         n: Number of valid repeats that have a value.
         value: The point estimate, by the quantity's kind: share of all counted items, mean or median.
         low: Lower end of the 95 % interval, with repeats as sampling units; None for a single repeat.
-        high: Upper end; None for a single repeat, and if censored repeats leave it open.
+        high: Upper end; None for a single repeat, and if it is open because of censored repeats.
         assured: Coverage of the interval for any distribution of the repeats; None unless it is a median of at least
             two repeats.
         p_order: p-value of the independence of the repeats in time (`independence.p_values`), corrected for the
@@ -62,7 +62,7 @@ class Estimate:
         minimum: Smallest value of a repeat.
         maximum: Largest value of a repeat.
         n_censored: Number of repeats among `n` with a right-censored value.
-        is_lower_bound: Whether `value` is a lower bound because of them.
+        is_lower_bound: Whether `value` is a lower bound because of censored values.
         missing: Number of valid repeats of the cell without a value.
         high_of_sent: Upper end of the interval if the value of lost items is infinite; None if it is
             open. It equals `high` for quantities that are not computed from received items only.
@@ -106,9 +106,9 @@ class Cell:
         n_valid: Number of valid repeats, from which all estimates are computed.
         n_void: Number of attempts with incomplete evidence.
         n_failed: Number of attempts that failed.
-        estimates: Estimates by name of the quantity, in the order of quantities; only those that any valid repeat
-            has.
-        tallies: Word counts by name of the column, in order; only those that any valid repeat has.
+        estimates: Estimates by name of the quantity, in the order of quantities. Quantities that no valid repeat has
+            are omitted.
+        tallies: Word counts by name of the column, in order. Columns that no valid repeat has are omitted.
         payload_bytes: ICMP payload sizes of the valid repeats, ascending, by the name of each quantity that depends
             on them; see `Quantity.payload`.
         quantities_without_value: Quantities that were measured in the valid repeats, but have no value in any of
@@ -132,7 +132,7 @@ def aggregate(
     quantities: Sequence[Quantity] | None = None,
     words: Sequence[Column] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return one cell per condition, sorted by the columns `by` in their order, a distance by its length.
+    """Return one cell per condition, sorted by the columns `by` in their order; distances are sorted by length.
 
     Args:
         repeats: Attempts of repeats, including void and failed ones.
@@ -327,10 +327,10 @@ def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[n
 
 
 def _counts(repeats: Repeats, quantity: Quantity, chosen: Indices) -> tuple[NDArray[np.float64], ...] | None:
-    """Return the numbers of lost and of sent items per repeat, or flags and ones; None for other quantities.
+    """Return the numbers of lost and of sent items per repeat; for a flag, its values and ones.
 
-    A number of lost items can be negative: with segmentation offload, the paper's filter matches other frames at
-    either end.
+    The result is None for other quantities. A number of lost items can be negative: with segmentation offload, the
+    paper's filter matches other frames at either end.
     """
     if quantity.kind is Kind.FLAG:
         flags = repeats.numbers[quantity.name][chosen]

@@ -27,7 +27,9 @@ SAME: Final = (
 """Columns that must have the same values in both runs."""
 
 VARIED: Final = frozenset({"distance_m"})
-"""Columns among `SAME` that may be the variable of a comparison; another protocol or topology changes more."""
+"""Columns among `SAME` that may be the variable of a comparison. Another protocol or topology changes too many
+conditions.
+"""
 
 _KERNEL_COLUMNS: Final = frozenset({"tcp_congestion_control"})
 """Columns of the robots' operating systems. A comparison of backends includes their difference: the kernels of real

@@ -28,7 +28,7 @@ def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRo
 
 
 def to_csv(comparison: Comparison) -> str:
-    """Return a comparison as CSV: the columns that identify conditions, then those of `DifferenceRow`."""
+    """Return a comparison as CSV: the columns that identify conditions, then the columns of `DifferenceRow`."""
     names = [column.name for column in declared(DifferenceRow)]
     rows = (
         [*pair.key.values(), *(getattr(row, name) for name in names)] for pair, row in difference_rows(comparison)

@@ -1,4 +1,4 @@
-"""Datasets of Parquet files: the results of a sweep, with the columns of trial.csv and those of its settings.
+"""Datasets of Parquet files: the results of a sweep, with the columns of trial.csv and columns of its settings.
 
 The metadata of each file has the names of the columns that are folders (`partitions`), the columns that identify a
 condition (`by`), and declarations of columns that trials do not have.
@@ -42,7 +42,7 @@ def condition(folder: Path) -> dict[str, str]:
     """Return the columns that identify a condition: the flow and the factors of the sweep; errors as `read`.
 
     Returns:
-        The columns, in order; for each, the column that has its values as in the command of the sweep.
+        For each column, in order, the column that has its values as written in the command of the sweep.
     """
     by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
     return dict(zip(by, (*by[:1], *partitions), strict=True))

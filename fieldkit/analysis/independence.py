@@ -1,8 +1,8 @@
 """Independence of repeats in time: two rank tests, for a trend and for positive autocorrelation.
 
 An interval over repeats assumes that they are independent. If the place, the weather or a battery changes slowly,
-consecutive repeats are correlated, and the interval is too narrow. Both tests are valid for any distribution, ties
-included: their variances are those over all permutations of the values.
+consecutive repeats are correlated, and the interval is too narrow. Both tests are valid for any distribution,
+including ties: their variances are computed over all permutations of the values.
 """
 
 from math import erfc, sqrt

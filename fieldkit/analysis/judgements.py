@@ -54,7 +54,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class _Decision:
-    """Ruling by the repeats that have a value; its attributes are those of `Judgement`."""
+    """Ruling by the repeats that have a value; its attributes have the same meaning as in `Judgement`."""
 
     ruling: Ruling
     why: str = ""
@@ -133,7 +133,8 @@ def _decide(expectation: Expectation, estimate: Estimate) -> _Decision:
 def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
     """Decide by the interval: it must satisfy the bound at both ends.
 
-    The upper end for a figure of received items is the one over all sent items. An open end is infinite.
+    For a figure of received items, the upper end of the statistic over all sent items is used. An open end is
+    infinite.
     """
     if estimate.low is None:
         return _Decision(Ruling.OPEN, "a single repeat has no interval" if estimate.n == 1 else "it has no interval")
@@ -149,7 +150,7 @@ def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
 
 
 def _count_met(expectation: Expectation, sample: RepeatValues) -> tuple[int, int]:
-    """Return the number of repeats that certainly meet an expectation, and of those that certainly violate it."""
+    """Return the number of repeats that certainly meet an expectation, and the number that certainly violate it."""
     low, high = (_are_met(expectation, ends) for ends in (sample.low, sample.high))
     return int((low & high).sum()), int((~low & ~high).sum())
 

@@ -36,7 +36,7 @@ def share_high(met: int, n: int) -> float:
 
 
 def repeats_for(share: float) -> int:
-    """Return the number of repeats that show, if all meet a requirement, that this share of all repeats meets it.
+    """Return how many repeats must all meet a requirement to show that this share of all repeats meets it.
 
     From `share_low`: the smallest n with share^n <= 5 %.
     """

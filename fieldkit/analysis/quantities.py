@@ -121,7 +121,7 @@ def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
 
 
 def with_plain_name(quantities: Iterable[Quantity], name: str) -> list[Quantity]:
-    """Return the quantities with a name, disregarding the names of steps; that of an unnamed step comes first."""
+    """Return the quantities with a name, for any name of a step; the quantity of an unnamed step is first."""
     return sorted(
         (quantity for quantity in quantities if plain_name(quantity.name) == name),
         key=lambda quantity: quantity.step != "",

@@ -44,12 +44,12 @@ def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
 
 
 def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
-    """Return cells as CSV: the columns `by` that identify them, then those of `EstimateRow`.
+    """Return cells as CSV: the columns `by` that identify them, then the columns of `EstimateRow`.
 
     Args:
         by: Columns that identify cells.
         cells: The cells.
-        more: Number of additional repeats by quantity, for each cell; they are the last column, if given.
+        more: Number of additional repeats by quantity, for each cell; if given, it is the last column.
     """
     names = [column.name for column in declared(EstimateRow)]
     additional = more or ({},) * len(cells)

@@ -32,7 +32,7 @@ Mask = NDArray[np.bool_]
 
 
 class Truth(NamedTuple):
-    """The result of a condition for each row; neither mask is set where values are missing.
+    """The result of a condition for each row; neither mask is set where missing values leave it undecided.
 
     Attributes:
         true: Rows in which it is true. Shape (n,).

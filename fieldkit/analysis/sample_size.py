@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # a plan needs no tables of trials, which take long to import
     from fieldkit.analysis.cells import Cell
 
 _USUAL_SHARE = 0.9
-"""Share of all repeats that is used to show the difference between `every` repeat of a trial and all repeats."""
+"""Example of a share of all repeats, for the message that `every` refers only to the repeats of a trial."""
 
 
 def unmet_requirements(

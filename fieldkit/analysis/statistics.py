@@ -31,7 +31,7 @@ _SERIES: Final = (
     (79 * NORMAL**9 + 776 * NORMAL**7 + 1482 * NORMAL**5 - 1920 * NORMAL**3 - 945 * NORMAL) / 92160,
 )
 _LAST_TERM: Final = 32 * (_QUANTILE_2 - NORMAL - sum(term / 2**power for power, term in enumerate(_SERIES, 1)))
-MIN_FOR_ORDER_STATISTICS: Final = 6  # the range of five values contains the median in only 93.75 %
+MIN_FOR_ORDER_STATISTICS: Final = 6  # the range of five values contains the median with a probability of only 93.75 %
 _ROUNDING: Final = 1e-12  # smaller relative deviations are rounding errors of equal shares
 
 
@@ -96,7 +96,8 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
         deviations = lost - value[:, None] * sent
         squares, freedom = _squares_and_freedom(np.where(np.abs(deviations) > _ROUNDING * sent, deviations, 0))
         trials = value * (1 - value) * total**2 * (n - 1) / (n * squares)
-        # Repeats with equal shares have variance 0, but the share is not certain: then losses count as independent.
+        # Repeats with equal shares have variance 0, but the share is not certain. Losses are then treated as
+        # independent.
         trials = np.where(squares > 0, trials, total)
         repeats = total**2 / (sent**2).sum(axis=1)  # Kish 1965, Survey Sampling, 11.7: n if all sent the same number
         is_mixed = (value > 0) & (value < 1)

@@ -23,7 +23,7 @@ _SPREADSHEET_MARKS: Final = {
     b"schema_version\t": ("its cells are separated by tabs", "with commas"),
     b"s\x00c\x00h\x00e\x00m\x00a\x00": ("its encoding is UTF-16", "as UTF-8"),
 }
-"""Start of a header that a spreadsheet wrote in another format; the problem, and how to save the file instead."""
+"""Problem, and how to save the file instead, by the start of a header that a spreadsheet wrote in another format."""
 _BATCH_BYTES: Final = 1 << 25
 _MAX_HEADER_BYTES: Final = 1 << 20
 
@@ -43,7 +43,7 @@ def read(
     Args:
         paths: CSV files with the columns of trial.csv, of any schema version up to that of this version of fieldkit.
         declared: The columns of trial.csv.
-        columns: Names of the columns to read, None for all; those of `IDENTITY` are always read.
+        columns: Names of the columns to read, None for all; the columns of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.
         indexed: Rows of some of the tables, which are used instead.
 
@@ -262,7 +262,7 @@ def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
 def _read_large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
     """Return the rows of a large table, read in blocks; None for a small or an invalid table.
 
-    Raises errors of the header as `_header`.
+    Raises the errors of `_header` for an invalid header.
     """
     with _readable(path):
         if path.stat().st_size < 2 * _BATCH_BYTES:

@@ -1,9 +1,9 @@
 """An index of many tables: their rows, parsed and typed, in one file of the user's cache.
 
-The index is never trusted over the tables: an entry is used only if device, inode, size, modification time and
-change time of the table and of the `trial.yaml` next to it are those of the files that were read. A program can
-restore a modification time, but not the change time. A file that changed less than `SETTLED_S` before it was read
-gets no entry, because a later change within the resolution of the time stamps would not be detected.
+The tables take precedence over the index: an entry is used only if device, inode, size, modification time and change
+time of the table and of the `trial.yaml` next to it are the same as when these files were read. A program can restore
+a modification time, but not the change time. A file that changed less than `SETTLED_S` before it was read gets no
+entry, because a later change within the resolution of the time stamps would not be detected.
 
 The file consists of a Parquet file, a JSON description of the tables, the length of the description, a digest
 (BLAKE2b) of all of these, and `MAGIC`. A file that is damaged or belongs to another user is ignored.

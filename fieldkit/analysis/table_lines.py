@@ -39,7 +39,7 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )
-"""Label of a count of sent items, and names of losses: the count is `trials` of the first loss that a cell has."""
+"""Names of losses by the label of a count of sent items. The count is `trials` of the first loss that a cell has."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,9 @@ def part_of(n: int, cell: Cell) -> str:
 
 
 def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -> list[TableLine]:
-    """Return a line per quantity that any of the cells has or lacks, in order, and per payload size for an RTT.
+    """Return a line per quantity that any cell has, or measured without a value, in order.
+
+    An RTT has a line per payload size.
 
     Args:
         cells: The cells of the table.

@@ -233,8 +233,8 @@ def key(cell: Cell, name: str) -> str:
 def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
     """Return the columns in which the cells differ, and those in which all are equal.
 
-    Redundant columns are in neither: the distance in metres if the operator's text is there, and a procedure with the
-    name of its scenario.
+    Redundant columns are omitted: the distance in metres if `by` has the operator's text, and the procedure if it has
+    the same name as the scenario in all cells.
     """
     redundant = {"distance_m"} if "distance" in by else set()
     if {"procedure", "scenario"} <= set(by) and all(cell.key["procedure"] == cell.key["scenario"] for cell in cells):

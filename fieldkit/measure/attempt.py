@@ -88,7 +88,7 @@ class AttemptEvidence:
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return a robot's link samples in order of time: those of the testbed if there are any, else the robot's."""
+        """Return link samples of a robot in order of time, from the testbed or, if it has none, from the robot."""
         modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
         if samples := modelled.get(role):
             return samples

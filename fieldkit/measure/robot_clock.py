@@ -1,4 +1,4 @@
-"""The clock of a robot: its offset from the laptop's clock with the maximum error, and end times of jobs by it."""
+"""The clock of a robot: its offset from the laptop's clock with the maximum error, and times of the ends of jobs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ class Exchange:
 
     Attributes:
         request_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
-        robot_ns: The robot's clock at some time between them.
+        robot_ns: The robot's clock at some time between request and response.
         response_ns: The laptop's clock after the response arrived.
         resolution_ns: Resolution of `robot_ns`: the robot's clock was at most this much later. 0 if it is exact.
     """
@@ -73,7 +73,7 @@ def parse_date(text: str) -> tuple[int, int] | None:
 def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
     """Return the time at which a job ended, in nanoseconds since 1970 UTC by the robot's clock, to about 20 ms.
 
-    None if the robot did not record it, rebooted, or had its clock set during the attempt.
+    Return None if the robot did not record it or rebooted, or if its clock was set during the attempt.
 
     Args:
         evidence: The attempt.

@@ -45,7 +45,7 @@ class Table:
         return len(next(iter(vars(self).values())))
 
     def where(self, chosen: Mask | Ints | slice) -> Self:
-        """Return the rows that a mask or a slice selects, or those of an index array in its order."""
+        """Return the rows that a mask or a slice selects, or the rows of an index array in its order."""
         if not isinstance(chosen, slice) and chosen.dtype == np.bool_ and chosen.all():
             return self
         return type(self)(**{name: column[chosen] for name, column in vars(self).items()})

@@ -69,7 +69,7 @@ def _raw(_: Integers, frames: Frames) -> Ints:
 
 
 def _null(integers: Integers, frames: Frames) -> Ints:
-    """Return the positions after the address family, whose byte order may differ from that of the file."""
+    """Return the positions after the address family, whose byte order may differ from the byte order of the file."""
     family = integers.u32(frames.start)
     is_ip = _is_in(family, _IP_FAMILIES) | _is_in(family, [number << 24 for number in _IP_FAMILIES])
     return np.where(is_ip, frames.start + 4, NO_HEADER)
@@ -292,7 +292,7 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints)
 def _wrong_checksums(integers: Integers, head: Fields, at: Ints, header: Ints) -> Mask:
     """Return a mask of the headers whose checksum is wrong (RFC 1071: the words of a header add up to -0).
 
-    A checksum of 0 was not computed: some systems leave that to the adapter, after the capture. Linux computes it
+    A checksum of 0 was not computed: on some systems the adapter computes it, after the capture. Linux computes it
     before the capture, also with offload, and drops received packets in which it is wrong.
 
     Args:
@@ -358,8 +358,8 @@ def _ipv6(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints)
 def _ipv6_payload_bytes(integers: Integers, at: Ints, captured: Ints, protocol: Ints, wire: Ints) -> Ints:
     """Return the payload length after the fixed header.
 
-    If the header has 0, the length is that of the jumbo option or, for frames from segmentation offload, follows from
-    the wire length.
+    If the length in the header is 0, it is read from the jumbo option or, for frames from segmentation offload,
+    computed from the wire length.
     """
     payload_length = integers.u16(at + 4)
     jumbo = (protocol == _HOP_BY_HOP) & (captured >= 48) & (integers.u16(at + 42) == _JUMBO_OPTION)

@@ -93,9 +93,9 @@ class Packets(Table):
         echo: Identifier of an ICMP echo request, which differs between ping processes; `ECHO_REPLY` is added in a
             reply. `NO_ECHO` for other packets.
         echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` for other packets.
-        content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header, else after the IP header. The
-            transport checksum is not included, because offload computes it later. `NOT_CAPTURED` if one
-            of these bytes is missing.
+        content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header or, without one, after the IP header.
+            The transport checksum is not included, because offload computes it later. `NOT_CAPTURED` if one of these
+            bytes is missing.
     """
 
     time_ns: Ints
@@ -158,7 +158,7 @@ def decode(integers: Integers, frames: Frames) -> Packets:
     if len(ip) < len(frames):
         frames = frames.where(ip.frame)
     transport, payload, protocol = ip.payload_at, ip.payload_bytes, ip.protocol
-    # Ethernet pads short frames, so more bytes than the packet's may have been captured.
+    # Ethernet pads short frames, so more bytes than the packet has may have been captured.
     captured = np.minimum(frames.start + frames.captured_bytes - transport, payload)
 
     first = ip.fragment_offset == 0

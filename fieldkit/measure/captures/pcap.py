@@ -17,10 +17,10 @@ from fieldkit.measure.captures.packets import Packets, decode
 from fieldkit.measure.evidence import reading
 
 CHUNK_BYTES: Final = 1 << 22
-"""Number of file bytes that are decoded together; the memory needed besides the columns is a few times as much."""
+"""Number of file bytes that are decoded together. The columns and a few times this number of bytes are in memory."""
 
 _SPARE_DIVISOR: Final = 8
-"""The expected number of rows divided by this is the number of additional rows that are allocated."""
+"""The expected number of rows, divided by this value, is the number of additional rows that are allocated."""
 
 FORMATS: Final = MappingProxyType(
     {

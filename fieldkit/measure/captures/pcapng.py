@@ -130,14 +130,14 @@ def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]
 
 
 def _snap_bytes(section: _Section) -> int:
-    """Return the snap length of simple packet blocks, which is that of the first interface."""
+    """Return the snap length of simple packet blocks, which is the snap length of the first interface."""
     return section.interfaces[0].snap_bytes or _NO_LIMIT if section.interfaces else 0
 
 
 def _next_definition(section: _Section, data: Buffer, at: int) -> tuple[_Section, int] | None:
     """Return the section state after the section header or interface description at `at`, and the end of that block.
 
-    None if there is neither, or if the block is incomplete or invalid.
+    Return None if there is neither of them at `at`, or if the block is incomplete or invalid.
     """
     order = section.order
     kind = bytes(data[at : at + 4])

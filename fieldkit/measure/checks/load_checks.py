@@ -2,7 +2,7 @@
 
 iperf3 counts the bytes that its sockets read and write; a capture contains the packets that passed the interface. At
 any time, iperf3 has therefore received at most the bytes in the capture up to then. It has received at least the
-bytes that the kernel had acknowledged (TCP), or the bytes that arrived minus those dropped at its socket buffer
+bytes that the kernel had acknowledged (TCP), or the bytes that arrived minus the bytes dropped at its socket buffer
 (UDP). Times in the JSON are relative to the start of the test, which is between the client's last message on the
 control connection and the first packet of data.
 """
@@ -64,7 +64,7 @@ class LoadEvidence:
 
 @dataclass(frozen=True, eq=False)
 class _Progress:
-    """Bytes of all streams that the receiver has read at each time: lower and upper bound."""
+    """Lower and upper bound of the number of bytes of all streams that the receiver has read at each time."""
 
     times_ns: Ints
     lower: Ints

@@ -1,8 +1,8 @@
 """Contradictions within the output of ping, and between the output and captures.
 
-Round-trip times of iputils' ping differed from captured ones by -0.03 to 0.9 ms, the median by less than 0.1 ms, on a
-busy machine with 2 cores. busybox reads the time of a reply when its process resumes, iputils reads it from the
-kernel.
+On a busy machine with 2 cores, round-trip times of iputils' ping differed from captured ones by -0.03 to 0.9 ms, and
+the median differed by less than 0.1 ms. busybox reads the time of a reply when its process resumes, iputils reads it
+from the kernel.
 """
 
 from collections.abc import Iterator, Mapping
@@ -69,7 +69,7 @@ def _sizes(packets: Packets, first: Packets) -> Ints:
 
 
 def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
-    """Return the time at which each datagram was complete; -1 if it never was, or has another size."""
+    """Return the time at which each datagram was complete; -1 if it was never complete, or has another size."""
     times_ns = np.where(first.more_fragments, -1, np.where(first.ip_payload_bytes == size_bytes, first.time_ns, -1))
     for index in np.flatnonzero(first.more_fragments):
         parts = packets.where(packets.ip_id == first.ip_id[index])
@@ -92,12 +92,12 @@ _MAX_LATER_S: Final = 0.020
 """Limit of the excess of a single round-trip time over the captured one: ping's process may be delayed."""
 _MAX_MEDIAN_LATER_S: Final = 0.001
 _BUSYBOX_FACTOR: Final = 5
-"""busybox's ping may be later by this factor."""
+"""Factor of the limits for busybox's ping, which may print later."""
 _MAX_PRINT_DELAY_S: Final = 1.0
 _MAX_MEDIAN_PRINT_DELAY_S: Final = 0.05
 _MAX_SEQUENCE: Final = 0xFFFF
 _WAIT_SHARE: Final = 0.9
-"""Share of the interval that ping waits after its last request: a timer may fire early."""
+"""Minimum share of the interval that ping waits after its last request; below 1, because a timer may fire early."""
 _UNREAD_S: Final = 0.1
 """ping may end before it reads a reply that arrived within this time."""
 _CLOCK_SLACK_S: Final = 1.0
@@ -184,7 +184,8 @@ def compare_with_capture(
         captured: The echoes of one identifier.
         interval_s: Time between requests.
         role: Role of the capturing robot.
-        is_requester: True if this robot sends the requests; otherwise its capture has the replies as it sends them.
+        is_requester: True if this robot sends the requests; otherwise its capture has the times at which it sends the
+            replies.
     """
     if output.transmitted is None or output.transmitted > _MAX_SEQUENCE:
         return

@@ -74,7 +74,7 @@ def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> 
     A sending netcat uses one source port per transfer. Packets of an earlier transfer are detected in two ways: they
     arrive with payload from a port from which the sender's capture has no packet; or they left the sender late, from
     another port than the transfer that started last. Over TCP a SYN marks a start, because retransmissions of an
-    aborted connection have none.
+    aborted connection contain no SYN.
     """
     sent, received = (
         packets.where(packets.dport == transfer.port) for packets in map(transfer.forward, (sender, receiver))
@@ -116,7 +116,8 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
         yield f"{format_count(unsent, 'datagram')} arrived without being in the {transfer.source}'s capture"
     if files is None:
         return
-    # The arrived bytes are at most those announced by the first fragments, and at most those in all fragments.
+    # The number of arrived bytes is at most the number that the first fragments announce, and at most the number in
+    # all fragments.
     announced = received.udp_bytes[first_received]
     arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
         announced

@@ -1,8 +1,8 @@
 """Contradictions between a file received over UDP and the datagrams in both captures.
 
 netcat writes the payload of each datagram that its kernel delivers, in the order of delivery. The received file is
-therefore a sequence of blocks of the sent file: those of the datagrams that arrived completely, except those that the
-kernel dropped. Drops after the capture are counted by the kernel: a full socket buffer or a wrong checksum
+therefore a sequence of blocks of the sent file: the payloads of the datagrams that arrived completely and were not
+dropped by the kernel. The kernel counts its drops after the capture: a full socket buffer or a wrong checksum
 (InErrors), a failed reassembly (ReasmFails), a listener that had ended (NoPorts).
 """
 

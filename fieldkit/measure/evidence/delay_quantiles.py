@@ -15,7 +15,7 @@ def quantile_of_sent(arrived_s: Sequence[float] | NDArray[np.float64], sent: int
 
     Args:
         arrived_s: Delays of the received packets in seconds, in any order.
-        sent: Number of sent packets; at least the number of delays is used.
+        sent: Number of sent packets. If it is below the number of delays, the number of delays is used.
         share: The quantile, 0 to 1.
 
     Returns:

@@ -50,8 +50,9 @@ _MAX_NAME_BYTES: Final = 16
 """Maximum length of the name of a congestion control in Linux (TCP_CA_NAME_MAX)."""
 _DEV: Final = "/proc/net/dev"
 _REQUIRED_SECTIONS: Final = (BOOT, CLOCK, "date", _SNMP, _DEV, "iw station dump", "end")
-"""Sections that must be in both files or in neither: the same script writes those that the host supports, before and
-after."""
+"""Sections that must be in both files or in neither. The same script writes both files, and each of them contains the
+sections that the host supports.
+"""
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ def _parse_snmp(snmp: str) -> dict[tuple[str, str], int]:
 
 
 def without_shared_counters(measured: Measured) -> Measured:
-    """Return the columns of `measure` for a repeat in which other steps send UDP to the receiver too.
+    """Return the columns of `measure` for a repeat in which other steps also send UDP to the receiver.
 
     A counter above 0 becomes missing, because it may count the datagrams of other steps; 0 is valid for every step.
     """

@@ -80,8 +80,9 @@ _MAX_BYTES: Final = 16 << 20
 _INVALID_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
 _MIN_INTERVALS: Final = 3
 _MIN_LENGTH_SHARE: Final = 0.5
-"""An interval shorter than this share of the longest is a remainder at the end. On a link with losses, it contains
-some tenths of a second without data, until the receiver is notified of the end."""
+"""An interval shorter than this share of the longest is a remainder at the end. On a link with losses, this remainder
+contains some tenths of a second without data, until the receiver is notified of the end of the test.
+"""
 
 
 def json_file(role: Role) -> str:
@@ -91,13 +92,13 @@ def json_file(role: Role) -> str:
 
 @dataclass(frozen=True)
 class IperfInterval:
-    """One interval of a test at one end, with the sum of all streams; None if that end does not count it.
+    """One interval of a test at one end, with sums over all streams. A value is None if that end does not count it.
 
     Attributes:
         lasted_s: Length in seconds.
         payload_bytes: Payload sent or received.
-        datagrams: UDP datagrams; at the receiver, those that it expected.
-        lost: Of these, the datagrams that the receiver did not receive.
+        datagrams: UDP datagrams; at the receiver, the datagrams that it expected.
+        lost: Expected datagrams that the receiver did not receive.
         retransmits: Retransmitted segments.
         start_s: Start in seconds; None if the JSON does not contain it.
         end_s: End in seconds; None if the JSON does not contain it.

@@ -62,10 +62,10 @@ class IperfTotals:
         sent_bytes: Payload sent.
         received_bytes: Payload received.
         datagrams: UDP datagrams that the receiver expected.
-        lost: Of these, the datagrams that it did not receive.
+        lost: Expected datagrams that the receiver did not receive.
         jitter_s: Jitter at the receiver, in seconds.
         retransmits: Retransmitted segments.
-        out_of_order: Datagrams of all streams that arrived out of order, duplicates included.
+        out_of_order: Datagrams of all streams that arrived out of order, including duplicates.
         ends_s: End times of all summaries, in seconds from the start.
     """
 

@@ -1,7 +1,7 @@
 """Columns of the Wi-Fi links of sender and receiver during an attempt, computed from samples.
 
-A radio can have several peers. The link of an access point is the one with the station with which it exchanged the
-most packets; the link of a station continues when it roams to another access point.
+A radio can have several peers. For an access point, the link to the station with which it exchanged the most packets
+is used. The link of a station continues when the station roams to another access point.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,8 +25,9 @@ _COUNTERS: Final = {
 }
 """Attribute of `StationSample` by column."""
 _MAX_UNSAMPLED_NS: Final = 2 * 10**9
-"""Longest time between two samples around a reset of counters in which the lost counts are negligible; the slowest
-shell samples once a second."""
+"""If counters are reset, the counts since the last sample are lost. They are negligible if the two samples around the
+reset are at most this time apart. The slowest shell samples once a second.
+"""
 
 
 def _role_columns(role: Role) -> tuple[Column, ...]:

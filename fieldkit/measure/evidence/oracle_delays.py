@@ -1,10 +1,9 @@
 """Delays that a testbed's oracle reports: lateness of deliveries, and air delay of a transfer's packets.
 
-On a co-simulation, windows have a lateness too, and its sync policy adds to the delay of packets.
-
-The lateness is that of deliveries during a repeat, in comparison with the radio model (`Oracle.lateness`). The air
-delay has four components (`Oracle.delays`). Its file has one line per number: `packets 215`, then the components
-summed over all packets, in integer nanoseconds.
+The lateness of the deliveries during a repeat is relative to the radio model (`Oracle.lateness`). In a co-simulation,
+windows also have a lateness, and the sync policy adds to the delay of packets. The air delay has four components
+(`Oracle.delays`). Its file has one line per number: `packets 215`, then the components summed over all packets, in
+integer nanoseconds.
 """
 
 import re
@@ -134,7 +133,7 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
 
 
 def measure_window_lateness(lateness: Lateness | None) -> Measured:
-    """Return the columns; without values unless the testbed is a co-simulation."""
+    """Return the columns; they have no values unless the testbed is a co-simulation."""
     if lateness is None or lateness.windows is None:
         return Measured.all_missing(WINDOW_COLUMNS, "the robots do not run on a co-simulation")
     late_ns = {share: lateness_quantile_ns(lateness.windows, share) for share in (0.99, 1.0)}
@@ -234,7 +233,7 @@ def air_delay_text(before: DelayParts, after: DelayParts) -> str:
 
 
 def measure_air_delay(parts: DelayParts | None) -> Measured:
-    """Return the columns, means over the packets; `parts` is None if the testbed cannot measure the delay."""
+    """Return the columns (means over the packets); `parts` is None if the testbed cannot measure the delay."""
     if parts is None:
         return Measured.all_missing(AIR_DELAY_COLUMNS, "the testbed cannot measure the delay on the air")
     scale = 1e9 * parts.packets
@@ -252,7 +251,7 @@ def measure_air_delay(parts: DelayParts | None) -> Measured:
 
 
 def measure_policy_delay(parts: DelayParts | None) -> Measured:
-    """Return the column, a mean over the packets; without a value unless the testbed is a co-simulation."""
+    """Return the column, a mean over the packets; it has no value unless the testbed is a co-simulation."""
     if parts is None or parts.policy_ns is None:
         return Measured.all_missing(POLICY_COLUMNS, "the robots do not run on a co-simulation")
     value = parts.policy_ns / 1e9 / parts.packets if parts.packets else None

@@ -67,7 +67,7 @@ class Recovery:
 
 @dataclass(frozen=True)
 class _Note:
-    """Duration of the cause, None if unknown, and interval of the observer, in seconds."""
+    """Duration of the cause (None if unknown) and interval of the observer, in seconds."""
 
     lasted_s: float | None
     interval_s: float

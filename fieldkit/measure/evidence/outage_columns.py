@@ -9,7 +9,7 @@ _KINDS_IN_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind
 
 
 def _observer(kind: FaultKind) -> str:
-    """Return the observer of the outage, which is not the traffic of other steps."""
+    """Return the name of the observer of an outage: `process` for a killed process, otherwise `ping`."""
     return "process" if kind is FaultKind.KILL else "ping"
 
 

@@ -90,7 +90,7 @@ _MAX_LATE_NUMBERS: Final = 1 << 10
 """An answer whose number is below the previous one by less than this is late; otherwise the numbers have wrapped."""
 
 MIN_OPEN_GAP_S: Final = 1.0
-"""A gap at the start or end of a ping is ignored if it is shorter than this and than the longest gap in between."""
+"""A gap at the start or end of a ping is ignored if it is shorter than this and than the longest other gap."""
 MOTION_COLUMNS: Final = columns(
     40,
     (
@@ -272,7 +272,8 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
 
     Args:
         output: Output of ping.
-        interval_s: Time between two requests. The length of an open gap is its unanswered requests times this.
+        interval_s: Time between two requests. The length of an open gap is this interval times the number of
+            unanswered requests.
     """
     stamped = sorted(_stamped_answers(output))
     if not stamped and (output.answers or not output.transmitted):

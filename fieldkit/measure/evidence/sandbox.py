@@ -1,9 +1,9 @@
 """Sandboxed reading of untrusted files, in a process with limits of memory, CPU time and disk.
 
-A library that trusts a file decompresses it as a whole, runs queries that the file's database schema can change, and
-follows every reference. A check of the file in advance cannot detect all of this, and a thread cannot be killed, but
-a process can. The process starts with the first query, which takes 0.1 s, and also answers the following ones. It
-exits after an idle time, and after it ran out of memory.
+A library without precautions decompresses a file as a whole, runs queries that the file's database schema can change,
+and follows every reference. A check of the file in advance cannot detect all of this. A process is used because it
+can be killed, unlike a thread. The process starts with the first query, which takes 0.1 s, and also answers the
+following ones. It exits after an idle time, and after it ran out of memory.
 """
 
 import json
@@ -54,7 +54,7 @@ Json = dict[str, Any]
 
 
 class ReaderError(Exception):
-    """The reader gave no answer; the message is the reason."""
+    """The reader returned no answer; the message is the reason."""
 
 
 class SandboxedReader:
@@ -100,7 +100,7 @@ class SandboxedReader:
 
     def _exchange(self, question: Sequence[object], size_bytes: int) -> tuple[Json, int]:
         """Return the answer and 0, or an empty answer and the exit code if the process exited or was killed."""
-        if self._owner_pid != os.getpid():  # after fork, two processes would mix up the answers of one reader
+        if self._owner_pid != os.getpid():  # after a fork, two processes could receive each other's answers
             self._process, self._owner_pid = None, os.getpid()
         process = self._process = self._process or _start(self._module)
         assert process.stdin is not None

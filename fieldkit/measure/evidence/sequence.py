@@ -1,4 +1,4 @@
-"""Loss of messages from gaps in sequence numbers that wrap after 256, as those of MAVLink."""
+"""Loss of messages from gaps in sequence numbers that wrap after 256, as in MAVLink."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,8 +34,9 @@ def count_messages(arrivals: Sequence[tuple[int, int]], ended_us: int) -> Messag
     """Count received and lost messages.
 
     Between two consecutive messages, `(number - previous number - 1) % 256` are missing; a message that arrives late
-    is not lost. In a silence of more than 1 s, multiples of 256 can be lost in addition: the multiple is used that
-    best agrees with the rate in the rest of the time. After the last message, the loss is computed from this rate.
+    is not lost. In a silence of more than 1 s, a multiple of 256 messages can be lost in addition. The multiple that
+    best agrees with the rate in the rest of the time is used. After the last message, the loss is computed from this
+    rate.
 
     Args:
         arrivals: Time of arrival in us and sequence number of each message, in the order of arrival.

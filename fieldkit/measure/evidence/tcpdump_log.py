@@ -40,8 +40,9 @@ class CaptureLog:
         captured: Packets that were written.
         received_by_filter: Packets that the kernel passed to libpcap; each one twice on a loopback interface. The
             count is larger than `captured` if other packets arrived between the opening of the socket and the
-            installation of the filter. libpcap discards those itself (pcap-linux.c, `blocks_to_filter_in_userland`).
-            At 5,000 other packets per second, this happened to one packet in 2 of 10 captures.
+            installation of the filter. libpcap discards these packets itself (pcap-linux.c,
+            `blocks_to_filter_in_userland`). At 5,000 other packets per second, this happened to one packet in 2 of 10
+            captures.
         dropped_by_kernel: Packets that matched the filter while the capture buffer was full.
         dropped_by_interface: Packets that the interface or its driver dropped.
     """

@@ -1,4 +1,4 @@
-"""Positions and velocities of robots during a repeat, recorded by a testbed that has them (`Oracle.track`).
+"""Positions and velocities of robots during a repeat, recorded by a testbed that has this data (`Oracle.track`).
 
 A CSV line is valid until the next line of the same robot; `east_m` to `up_m` are empty while it was out of range.
 """
@@ -87,7 +87,7 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
 
 
 def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
-    """Yield start in ns and value of the distance between two robots, for each entry of one of them."""
+    """Yield the start in ns and the value of the distance between two robots, for each entry of either robot."""
     for utc_ns, sender, receiver in _joint_states(track, source, destination):
         yield utc_ns, _distance_m(sender, receiver)
 
@@ -135,7 +135,7 @@ def separation_between(
 def _joint_states(
     track: Sequence[TrackPoint], source: Role, destination: Role
 ) -> Iterator[tuple[int, TrackPoint, TrackPoint]]:
-    """Yield the start in ns and the entries of both robots, for each entry of one of them after both have one."""
+    """Yield the time in ns and the latest entries of both robots, for each entry of either one once both have one."""
     latest: dict[Role, TrackPoint] = {}
     for entry in track:
         latest[entry.role] = entry

@@ -1,4 +1,4 @@
-"""Columns of robots' positions during a measurement: from recorded positions if there are any, else the testbed's."""
+"""Columns of robots' positions during a measurement, from recorded positions or, without them, from the testbed."""
 
 from collections.abc import Collection, Sequence
 from fnmatch import fnmatch

@@ -86,7 +86,7 @@ def to_placement_frame(samples: Samples, position_source: PositionSource) -> Sam
 
     Args:
         samples: Odometry with times by the laptop's clock.
-        position_source: Has the start time, place and heading.
+        position_source: Source with the start time, place and heading.
 
     Raises:
         EvidenceError: The heading is unknown, or odometry has no sample at the start.

@@ -39,7 +39,8 @@ class PositionSource:
         topic: Topic in a bag, or message type in a telemetry log.
         child: Child frame of the robot in a tree of transforms.
         stamps: `header` for the time stamps in messages, `received` for the recorder's times of reception.
-        offset_s: Added to the times of a GPX or CSV file to get the laptop's; times in a bag are the robot's.
+        offset_s: Offset that is added to the times of a GPX or CSV file to convert them to the laptop's clock. Times
+            in a bag are by the robot's clock.
         gap_s: Longest time between two samples over which the position is interpolated.
         start: Place of the robot at the start of odometry.
         heading_rad: Heading at the start of odometry, from the frame's first axis towards its second; may be None.

@@ -203,7 +203,7 @@ def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Fl
     """Return positions of two robots in metres. Unless `heights` is set, both are at the median height.
 
     Raises:
-        EvidenceError: `heights` is set and some are unknown.
+        EvidenceError: `heights` is set, and some heights are unknown.
     """
     heights_m = np.concatenate((source.values[:, 2], destination.values[:, 2]))
     known_heights_m = heights_m[np.isfinite(heights_m)]
@@ -230,12 +230,12 @@ _AROUND_NS: Final = 1_000_000_000
 def distance_contradiction(
     evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, during_ns: tuple[int, int] | None
 ) -> str | None:
-    """Return the reason why a robot cannot have been that far from its start, or None if it can.
+    """Return the reason why a robot cannot have been `farthest_m` away from its start, or None if it can.
 
     Args:
         evidence: The attempt's evidence.
         role: The robot.
-        farthest_m: Its largest distance by its log.
+        farthest_m: The robot's largest distance from its start by its log.
         speed_m_s: Its speed.
         during_ns: First and last time of that log by the robot's clock; None if it has no times.
     """
@@ -256,7 +256,7 @@ def distance_contradiction(
 
 
 def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str | None:
-    """Return the reason why recorded positions of a robot contradict the distance, or None.
+    """Return the reason why recorded positions of a robot contradict the distance, or None if they do not.
 
     The recording may cover more of the attempt than the movement does. A larger recorded distance is therefore valid,
     a smaller one is not.

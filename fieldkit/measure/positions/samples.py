@@ -211,8 +211,8 @@ _ECCENTRICITY_2: Final = FLATTENING * (2 - FLATTENING)
 def ecef_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Return earth-centred, earth-fixed coordinates in metres (ECEF; TR8350.2, equation 4-14).
 
-    The straight line between two such points has its true length. Over 1 km it is 1 um shorter than the path along
-    the ground: d^3 / 24 R^2.
+    The distance between two such points is the true length of the straight line between them. Over 1 km this line is
+    1 um shorter than the path along the ground: d^3 / 24 R^2.
 
     Args:
         latitude_deg: Degrees north. Shape (n,).

@@ -23,7 +23,7 @@ MAX_ALTERED_SHARE: Final = 0.05
 """Largest permitted share of received packets that are not in the sender's capture: a few may be earlier traffic."""
 
 _MAX_LATE_PACKETS: Final = 3
-"""A connection that was aborted earlier may still send up to this many packets from its port to the transfer's."""
+"""An aborted earlier connection may still send up to this many packets from its port to the port of the transfer."""
 
 _DUPLICATE_NS: Final = 1_000_000
 """No sender retransmits a packet within this time with the same IP id."""
@@ -140,7 +140,7 @@ def _were_sent(sent: Packets, received: Packets) -> Mask:
     # Offload cuts and joins frames, but does not change their time stamps and the range of sequence numbers.
     sent_stamps, received_stamps = usable_stamps(sent, received)
     base = np.zeros(1 << 16, dtype=np.int64)
-    # If an index occurs several times, numpy stores the last value: here the earliest.
+    # If an index occurs several times, numpy stores the last value, which is the earliest one here.
     base[sent.sport[::-1]] = sent.tcp_seq[::-1]
     has_syn = np.zeros(1 << 16, dtype=np.bool_)
     has_syn[sent.sport[sent.tcp_flags & SYN != 0]] = True

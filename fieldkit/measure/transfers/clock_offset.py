@@ -25,11 +25,14 @@ import numpy as np
 from fieldkit.measure.captures.arrays import Floats, Ints, Table
 
 MAX_SKEW: Final = 500e-6
-"""Largest plausible skew in seconds per second, which a kernel lets NTP correct (adjtimex(2)); above it a clock is
-considered broken."""
+"""Largest plausible skew in seconds per second. It is the largest skew that NTP can correct through the kernel
+(adjtimex(2)); a clock with a larger skew is considered broken.
+"""
 
 QUARTZ_SKEW: Final = 100e-6
-"""Usual upper limit of the skew of two quartz clocks. If more is possible, the packets do not determine the skew."""
+"""Usual upper limit of the skew of two quartz clocks. If the range of possible skews is wider than this, the packets
+do not determine the skew.
+"""
 
 STAMP_S: Final = 1e-6
 """tcpdump truncates times to microseconds, so the difference of two times is wrong by up to this."""
@@ -104,9 +107,9 @@ class Clocks:
 def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     """Return the offset between the clocks, or None if no line fits all packets because a clock was set.
 
-    The chosen skew maximizes the shortest round-trip time without the fastest packet of each direction: if both
-    directions were undelayed early and late, any other skew shortens one of them. Among equally good skews the
-    smallest is chosen. If the packets leave more than `QUARTZ_SKEW` undetermined, the smallest possible skew is
+    The chosen skew maximizes the shortest round-trip time, computed without the fastest packet of each direction. If
+    both directions had undelayed packets early and late, any other skew shortens this time. Among equally good skews
+    the smallest is chosen. If the range of possible skews is wider than `QUARTZ_SKEW`, the smallest possible skew is
     chosen. The offset is the middle of the range that is possible with this skew.
 
     Args:

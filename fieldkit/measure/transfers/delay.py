@@ -83,7 +83,9 @@ LARGEST_ERROR: Final = 0.1
 """Maximum error of a one-way delay as a share of the delay; with a larger error the delay is withheld."""
 
 UNSTEADY: Final = "no offset and drift fit: a clock was set during the attempt, or drifts by more than 500 ppm"
-"""Reason why no times of a transfer are known, not even by one clock: either clock may be the wrong one."""
+"""Reason why no times of a transfer are known. Times by a single clock are also unknown, because either clock may be
+wrong.
+"""
 
 SINGLE_PACKET: Final = "one direction has a single packet in both captures, and no other packet confirms its time"
 """Reason why the error of the clock offset is unlimited."""
@@ -333,8 +335,9 @@ def _may_be_transfer(packets: Packets, transfer: Transfer) -> Mask:
 def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
     """Return the times of the packets that are in both lists.
 
-    Each received frame occurs once, so that a wrong time of it makes one pair wrong. If offload joined several frames
-    to it, it is paired with the last of them, whose bound on the clock offset is the strictest.
+    Each received frame occurs once, so that a wrong time of the frame makes only one pair wrong. If offload joined
+    several sent frames to a received frame, it is paired with the last of them, whose bound on the clock offset is
+    the strictest.
     """
     sent_index, received_index = _copies(match(sent, received))
     received_index, last = np.unique(received_index[::-1], return_index=True)

@@ -38,7 +38,7 @@ _EDGE_PACKETS: Final = 100
 within them."""
 
 REORDERING_NS: Final = 100_000_000
-"""Packets handled by two processors may be out of order by less than this; by more, the clock was set back."""
+"""Packets handled by two processors may be out of order by less than this. If it is more, the clock was set back."""
 
 
 @dataclass(frozen=True)
@@ -91,8 +91,8 @@ def of_udp(packets: UdpPackets, chosen: Mask, expected: FlowSchedule) -> Deliver
         EvidenceError: The deliveries cannot be determined from the captures.
     """
     matched = packets.match
-    chosen_packets = np.append(chosen, False)[packets.datagram]  # the last entry is that of NO_DATAGRAM
-    received_packets = np.append(chosen_packets, False)[matched.sent_index]  # that of match.NONE
+    chosen_packets = np.append(chosen, False)[packets.datagram]  # the last entry is for NO_DATAGRAM
+    received_packets = np.append(chosen_packets, False)[matched.sent_index]  # the last is for match.NONE
     if (received_packets & matched.possible_copy).any():
         raise EvidenceError("its packets cannot be distinguished, and some that arrived may be copies")
     sent_ns = packets.sent.time_ns[chosen_packets]
@@ -169,7 +169,7 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
     no_frame = len(chosen)
     count = int(pieces.range_id.max(initial=-1)) + 1
     first, size_bytes = np.full(count, no_frame), np.zeros(count, dtype=np.int64)
-    # If an index occurs several times, numpy stores the last value: here that of the earliest frame.
+    # If an index occurs several times, numpy stores the last value, which is the value of the earliest frame here.
     first[pieces.range_id[::-1]] = pieces.frame[::-1]
     size_bytes[pieces.range_id] = pieces.size_bytes
     reached = np.maximum.accumulate(first)

@@ -82,7 +82,7 @@ def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates 
     if (chosen & packets.match.ambiguous).any():
         return None
     offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * chosen) - packets.sent.ip_payload_bytes
-    received = np.append(chosen, False)[sent_index]  # the last entry is that of match.NONE
+    received = np.append(chosen, False)[sent_index]  # the last entry is for match.NONE
     return Fates(
         sent_ns=packets.sent.time_ns[chosen],
         sent_bytes=offset_bytes[chosen],
@@ -149,7 +149,7 @@ PACKET_COLUMNS: Final = columns(
 
 @dataclass(frozen=True, eq=False)
 class SentPackets:
-    """Packets that a transfer sent, in the order of the sender's capture; the fields are those of `PACKET_COLUMNS`.
+    """Packets that a transfer sent, in the order of the sender's capture; `PACKET_COLUMNS` describes the fields.
 
     For TCP, only frames with payload are included. All arrays have shape (n,); empty values are masked.
     """

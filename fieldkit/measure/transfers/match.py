@@ -27,7 +27,7 @@ Linux's TCP also considers a packet lost after this delay (minimum retransmissio
 """
 
 _CLEAR_FACTOR: Final = 4
-"""An arrival is clearly nearest to one packet if its offset is at most the distance to the next divided by this."""
+"""An arrival is clearly nearest to a packet if the next nearest packet is at least this many times as far away."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +82,7 @@ def match(sent: Packets, received: Packets) -> Match:
     flags and time stamp are equal; if several packets have equal values, their content must be equal as well.
 
     With segmentation offload the two ends capture different TCP frames. A frame without an equal one at the other end
-    is matched with the frame that has its first byte, and is a duplicate if all of its bytes are.
+    is matched with the frame that has its first byte. It is a duplicate if all of its bytes are duplicates.
 
     Args:
         sent: Packets captured at the sender.
@@ -158,14 +158,14 @@ def match_keys(
     sent_index = np.full(len(received_key), NONE)
     sent_index[received_order] = sent_order[(np.cumsum(sent_count) - sent_count)[received_group] + position]
     received_index = np.full(len(key), NONE)
-    # If an index occurs several times, numpy stores the last value: here the earliest copy.
+    # If an index occurs several times, numpy stores the last value, which is the earliest copy here.
     received_index[sent_index[received_order[::-1]]] = received_order[::-1]
     duplicates: Mask = sent_index != NONE
     duplicates[received_index[received_index != NONE]] = False
     ambiguous = np.zeros(len(key), dtype=np.bool_)
     ambiguous[sent_order] = (~is_clear & (received_count > 0))[group]
     possible_copy = np.zeros(len(received_key), dtype=np.bool_)
-    # If only one packet of a group arrived, it cannot be a copy of another.
+    # If only one packet of a group arrived, it cannot be a copy of another one.
     possible_copy[received_order] = (~is_clear & ~no_copy & (received_count > 1))[received_group]
     possible_copy &= ~duplicates
     return Match(received_index, sent_index, duplicates, ambiguous, possible_copy)
@@ -349,7 +349,7 @@ def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns:
 def _clock_offset_ns(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[int, bool]:
     """Return the receiver's clock minus the sender's, including the delay, and False if it is only a rough estimate.
 
-    It is known from items with a unique key or, if there are none, from groups of which all items arrived.
+    It is computed from items with a unique key or, if there are none, from groups whose items all arrived.
     """
     groups = int(group.max()) + 1
     sent, received = (np.bincount(groups_of, minlength=groups) for groups_of in (group, received_group))

@@ -60,7 +60,8 @@ class Rates:
 
     Attributes:
         throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, or without times.
-        completion_s: Time until the program had the file; None if it never had the file, or if this is unknown.
+        completion_s: Time until the program had received the file; None if it did not receive all of it, or if this
+            is unknown.
         head_bytes: Payload in the first packet, with which the measured time starts.
     """
 
@@ -83,7 +84,7 @@ class Rates:
 def of_udp(packets: udp.UdpPackets) -> Rates:
     """Return the rates of a UDP transfer."""
     sent_index = packets.match.sent_index
-    is_chosen = np.append(packets.chosen, False)[sent_index]  # the last entry is that of match.NONE
+    is_chosen = np.append(packets.chosen, False)[sent_index]  # the last entry is for match.NONE
     received, datagram = packets.received.where(is_chosen), np.append(packets.datagram, NONE)[sent_index[is_chosen]]
     time_ns = received.time_ns
     if not len(received) or (time_ns == NO_TIME).any():

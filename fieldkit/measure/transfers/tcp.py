@@ -39,14 +39,14 @@ class TcpCounts:
     Attributes:
         frames_sent: Frames captured at the sender, including those without payload.
         frames_received: Frames captured at the receiver; offload may change the number.
-        sent_bytes: Payload bytes sent, retransmissions included.
+        sent_bytes: Payload bytes sent, including retransmissions.
         unique_bytes: Payload bytes sent, each sequence number once.
         received_bytes: Payload bytes sent that arrived; a copy that was not sent is not counted.
         lost_bytes: Unique bytes that never reached the receiver.
         duplicated_bytes: Payload bytes received in addition to the first copy of each sequence number.
         retransmitted_frames: Frames whose range had been sent before, completely or partly.
-        spurious_frames: Frames all of whose bytes had been sent before in a frame that reached the receiver, before
-            or after. None if frames are ambiguous.
+        spurious_frames: Frames that were sent without need, because each of their bytes had been sent before in a
+            frame that reached the receiver at any time. None if frames are ambiguous.
         reordered_frames: Frames received whose first byte was sent before a byte that had arrived; only the first of
             several copies counts. None if frames are ambiguous.
         superframes: Frames of either capture with more payload than the largest MSS in a SYN: offload joined several
@@ -131,18 +131,18 @@ def count(frames: TcpFrames) -> TcpCounts:
 
 
 def _is_repeated(pieces: Pieces, others: Pieces) -> Mask:
-    """Return a mask of the pieces in a later frame than the first of `others` with the same bytes."""
+    """Return a mask of the pieces whose frame is later than the first frame in `others` with the same bytes."""
     earliest = np.full(
         max(pieces.range_id.max(initial=-1), others.range_id.max(initial=-1)) + 1, np.iinfo(np.int64).max
     )
-    # If an index occurs several times, numpy stores the last value: here that of the earliest frame.
+    # If an index occurs several times, numpy stores the last value, which is the earliest frame here.
     earliest[others.range_id[::-1]] = others.frame[::-1]
     mask: Mask = pieces.frame > earliest[pieces.range_id]
     return mask
 
 
 def sent_again(frames: TcpFrames) -> Mask:
-    """Return a mask of the sent frames with bytes that had been sent before, of the shape of `frames.sent`."""
+    """Return a mask of the frames in `frames.sent` with bytes that had been sent before."""
     again = np.zeros(len(frames.sent), dtype=np.bool_)
     again[frames.payload.sent.frame[_is_repeated(frames.payload.sent, frames.payload.sent)]] = True
     return again

@@ -16,8 +16,8 @@ from fieldkit.measure.captures.packets import ACK, FIN, SYN, Packets
 # Upper limit of the length of a stream: byte positions of different connections are this far apart.
 _MAX_STREAM_BYTES: Final = 1 << 44
 
-# The number of pieces of frames that all overlap is quadratic. In a transfer it is not: each end of a frame cuts one
-# other frame and its copies.
+# The number of pieces is quadratic if all frames overlap. It is not quadratic in a transfer, because each end of a
+# frame cuts only one other frame and its copies.
 _PIECES_PER_FRAME: Final = 16
 _MIN_PIECE_LIMIT: Final = 1 << 20
 

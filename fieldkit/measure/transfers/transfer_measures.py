@@ -43,7 +43,7 @@ def paper_frames_to(packets: Packets, address: str, port: int) -> int:
 
 
 def paper_transfer_s(packets: int, delay_s: float) -> float:
-    """Return the paper's transfer time: one mean round trip of a ping with the window's payload per packet."""
+    """Return the paper's transfer time: number of packets times the mean RTT of a ping with the window's payload."""
     return packets * delay_s
 
 
@@ -102,7 +102,8 @@ def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
 def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
     """Return the reason why no loss can be computed from two undamaged captures, or None if it can.
 
-    The reason is a contradiction between the captures, or with the file. Without two captures there is none.
+    The reason is a contradiction between the captures, or with the file. Without two captures there is no such
+    reason.
     """
     return evidence.cached(_incomparability_reason, transfer) if transfer.captured else None
 

@@ -62,7 +62,7 @@ class Transfer:
 
 
 def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
-    """Return the seconds from the first frame to the last with payload; None without payload or without times."""
+    """Return the seconds from the first frame to the last one with payload; None without payload or without times."""
     if not carries_payload.any() or (time_ns == NO_TIME).any():
         return None
     return float(time_ns[carries_payload].max() - time_ns.min()) / 1e9

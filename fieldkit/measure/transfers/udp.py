@@ -64,7 +64,7 @@ class UdpPackets:
 
     @property
     def is_transfer(self) -> Mask:
-        """Mask of the transfer's datagrams; the last entry is that of `NO_DATAGRAM`. Shape (k + 1,)."""
+        """Mask of the transfer's datagrams; the last entry is for `NO_DATAGRAM`. Shape (k + 1,)."""
         return np.append(self.sent.dport[self.first] == self.port, False)
 
     @property
@@ -83,12 +83,12 @@ class UdpCounts:
         packets_duplicated: Further copies of sent packets that arrived.
         packets_reordered: Sent packets that arrived after one that was sent later (RFC 4737, section 3). None if
             packets are ambiguous.
-        packets_ambiguous: Sent packets that equal others sent at nearly the same time, so that it is unknown which of
-            them arrived when.
+        packets_ambiguous: Sent packets that equal others sent at nearly the same time, so that the time of arrival of
+            each is unknown.
         possible_copies: Received packets that may be copies and hide a loss: see `Match.possible_copy`.
         loss_bursts: Runs of lost packets that were sent consecutively. None if packets are ambiguous and some were
             lost.
-        longest_burst: Packets in the longest run. None in the same case.
+        longest_burst: Packets in the longest run. None if `loss_bursts` is None.
         datagrams_sent: Datagrams.
         datagrams_received: Datagrams all of whose fragments arrived.
         bytes_sent: Payload bytes without UDP headers.
@@ -123,7 +123,7 @@ def count(packets: UdpPackets) -> UdpCounts:
     arrived, chosen = matched.arrived, packets.chosen
     complete_datagrams = complete(packets)
     payload = payload_bytes(sent)
-    received_chosen = np.append(chosen, False)[matched.sent_index]  # the last entry is that of match.NONE
+    received_chosen = np.append(chosen, False)[matched.sent_index]  # the last entry is for match.NONE
     bursts = _bursts(~arrived[chosen])
     time_ns = received.time_ns[received_chosen]
     ambiguous = int((chosen & matched.ambiguous).sum())
