@@ -1,1 +1,1 @@
-"""Statistics over repeats: estimates, intervals, comparisons, expectations, and tables of them."""
+"""Statistics over repeats: estimates, intervals, comparisons, expectations, and their tables."""

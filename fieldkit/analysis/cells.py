@@ -145,7 +145,7 @@ def aggregate(
     valid, void, failed = (np.bincount(cells[status == ending], minlength=len(keys)).tolist() for ending in ENDED)
     rows = np.argsort(cells, kind="stable")
     rows = rows[status[rows] == Status.VALID]
-    if "started_utc_ns" in repeats.numbers:  # the repeats of a cell in the order of time, unknown times last
+    if "started_utc_ns" in repeats.numbers:  # sort the repeats of a cell by time, unknown times last
         rows = rows[np.lexsort((repeats.numbers["started_utc_ns"][rows], cells[rows]))]
     estimates: list[dict[str, Estimate]] = [{} for _ in keys]
     for quantity in repeats.quantities if quantities is None else quantities:
@@ -159,7 +159,7 @@ def aggregate(
             tallies_by_cell[cell][column.name] = tally
     named_keys = (dict(zip(by, key, strict=True)) for key in keys)
     chosen = repeats.quantities if quantities is None else quantities
-    ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # the rows of a cell are adjacent
+    ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # rows of a cell are adjacent
     rows_by_cell = np.split(rows, ends) if keys else []
     payloads = [_payload_sizes(repeats, chosen, cell_rows) for cell_rows in rows_by_cell]
     without_value = [
@@ -237,11 +237,11 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
     Args:
         repeats: All repeats.
         quantity: The quantity.
-        rows: Indices of the valid repeats; those of a cell are adjacent.
+        rows: Indices of the valid repeats; the repeats of a cell are adjacent.
         cells: Cell of each row of `repeats`.
     """
     rows = rows[np.isfinite(repeats.observed(quantity)[0][rows])]
-    for name in quantity.columns[1:]:  # a share without its counts cannot be summed over repeats
+    for name in quantity.columns[1:]:  # omit shares without counts, because they cannot be summed over repeats
         rows = rows[np.isfinite(repeats.numbers[name][rows])]
     cell_of_row = cells[rows]
     starts = np.flatnonzero(np.diff(cell_of_row, prepend=-1))
@@ -302,7 +302,7 @@ def _upper_of_sent(
     """Return upper bounds of the values if lost items have an infinite value; infinity if unknown."""
     if quantity.of_sent is None:
         return upper
-    column = repeats.numbers.get(quantity.of_sent)  # missing in tables of earlier versions
+    column = repeats.numbers.get(quantity.of_sent)  # tables of earlier versions do not have the column
     of_sent = np.full_like(upper, np.nan) if column is None else column[chosen]
     return np.where(np.isnan(of_sent), np.inf, np.maximum(of_sent, upper))
 

@@ -56,7 +56,7 @@ _PAYLOAD: Final = "rtt_payload_bytes"
 MIXTURE_COLUMNS: Final = frozenset(
     (*(name for column, grouping, _ in _MIXTURES for name in (column, grouping)), _PAYLOAD)
 )
-"""Columns that `mixtures` needs in addition to those that identify conditions."""
+"""Columns that `mixtures` needs in addition to the columns that identify conditions."""
 
 _MESSAGES: Final = 2
 """Acceptable difference of recorded sizes in messages, because a recorder starts and stops between two messages."""
@@ -97,7 +97,7 @@ def concerns(
     """Return the concerns about comparing two runs, refusals first.
 
     A column of `varied`, or one of `VARIED` that is not in `by`, is the variable of the comparison if it has a single
-    value in each run; it causes no refusal then.
+    value in each run; it then causes no refusal.
 
     Args:
         pairs: Name of each condition, and its valid repeats in A and in B, at least one each.

@@ -96,7 +96,7 @@ class Comparison:
 
     Attributes:
         by: Columns that identify a condition.
-        pairs: All conditions of either run, those of A first.
+        pairs: All conditions of either run; conditions of A are first.
         concerns: Concerns about comparing the runs, refusals first.
     """
 
@@ -205,7 +205,7 @@ def _differences(
 
 
 def _values(rows: Repeats, quantity: Quantity) -> Numbers:
-    has_all = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # the same rows as in cells
+    has_all = np.isfinite([rows.numbers[name] for name in quantity.columns]).all(axis=0)  # same rows as in `cells`
     if quantity.at_least is not None:
         values, _ = rows.observed(quantity)
         return values[np.isfinite(values)]

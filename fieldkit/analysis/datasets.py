@@ -70,7 +70,7 @@ def read(folder: Path, declared: Mapping[str, Column]) -> tuple[dict[str, Number
     """
     partitions = pa.schema([(name, pa.string()) for name in dict(_metadata(folder, "partitions") or {})])  # type: ignore[call-overload]
     partitioning = pa.dataset.partitioning(partitions, flavor="hive")
-    base = folder.absolute()  # threads of pyarrow open the files, and may have another working folder than this one
+    base = folder.absolute()  # threads of pyarrow open the files; their working folder may differ
     try:
         dataset = pa.dataset.dataset(
             sorted(map(str, base.rglob("*.parquet"))),

@@ -92,7 +92,7 @@ def _upper_tail(statistic: Floats, variance: Floats) -> Floats:
     """Return the upper tail probability of a statistic with mean 0 in -1..1, treated as a correlation coefficient.
 
     The coefficient is converted to Student's t with 1/variance - 1 degrees of freedom, whose tail is approximated by
-    that of a normal distribution after Wallace's transformation (1959, Ann. Math. Stat. 30:1121).
+    the tail of a normal distribution after Wallace's transformation (1959, Ann. Math. Stat. 30:1121).
     """
     freedom = 1 / variance - 1
     size = np.minimum(np.abs(statistic), 1 - 1e-12)

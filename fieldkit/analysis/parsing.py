@@ -22,7 +22,7 @@ Texts = NDArray[np.object_]
 ArrowColumn = pa.ChunkedArray
 
 _MAX_SHOWN: Final = 40
-_TOLERANCE: Final = 1e-6  # coarser than the digits of a table
+_TOLERANCE: Final = 1e-6  # larger than the rounding errors of numbers in a table
 _REMEDY: Final = "correct the line, or create the file again: fieldkit rebuild TRIAL"
 _SPREADSHEET_REMEDY: Final = (
     "a spreadsheet has removed digits: name the trial.csv in the trial's folder, or create it again: "

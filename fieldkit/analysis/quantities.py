@@ -93,7 +93,7 @@ class Quantity:
 
     @property
     def needed(self) -> tuple[str, ...]:
-        """All columns that a table of it needs: `columns`, `optional_columns`, `payload` and `implied_by`."""
+        """All columns for a table of the quantity: `columns`, `optional_columns`, `payload` and `implied_by`."""
         return (
             *self.columns,
             *self.optional_columns,

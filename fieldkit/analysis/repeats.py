@@ -113,7 +113,7 @@ class Repeats:
         try:
             repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
             return repeat.folder(Status(texts["status"][row]), int(numbers["attempt"][row]))
-        except ValueError:  # the table was edited
+        except ValueError:  # an edited table can contain invalid values
             return None
 
     @cached_property
@@ -172,7 +172,7 @@ def by_name(declared: Iterable[Column]) -> dict[str, Column]:
     return {column.name: column for column in declared}
 
 
-@lru_cache(maxsize=16)  # thousands of tables have the same header
+@lru_cache(maxsize=16)  # because thousands of tables have the same header
 def header_names(header: bytes) -> tuple[str, ...]:
     """Return the names in a header line; an empty tuple if a name exceeds the 128 kB limit of the csv module."""
     try:

@@ -65,7 +65,7 @@ def parse_filter(text: str, columns: Mapping[str, Column]) -> RowFilter:
 
     Args:
         text: The expression.
-        columns: The columns of the table by name; `source` is allowed in addition.
+        columns: The columns of the table by name; `source` is also allowed.
 
     Raises:
         ConfigurationError: It has another form, or a column that does not exist or has another type.

@@ -17,7 +17,7 @@ from fieldkit.analysis.quantities import Quantity
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, NORMAL, Intervals, student
 from fieldkit.core.columns import Kind
 
-if TYPE_CHECKING:  # a plan needs no tables of trials, which take long to import
+if TYPE_CHECKING:  # not imported at run time: a plan needs no tables, and the import is slow
     from fieldkit.analysis.cells import Cell
 
 _USUAL_SHARE = 0.9
@@ -31,7 +31,7 @@ def unmet_requirements(
 
     Args:
         expectations: Expectations of the trial.
-        figures: Quantities that its repeats measure, including those of the expectations.
+        figures: Quantities that its repeats measure, including the quantities of the expectations.
         repeats: Number of repeats per protocol.
     """
     by_name = {quantity.name: quantity for quantity in figures}
@@ -122,10 +122,10 @@ def additional_repeats(
 ) -> NDArray[np.float64]:
     """Return the number of additional repeats until the half-width of an interval is at most `half_width`.
 
-    It is assumed that further repeats have the same dispersion as the existing ones, so from few repeats the number
-    is a rough estimate. For a share, the effective number of trials per repeat follows from the formula of the score
-    interval, even without any loss. For other quantities, the width decreases with the square root of the number. The
-    decrease of Student's quantile is taken into account.
+    It is assumed that further repeats have the same dispersion as the existing ones, so the number is only a rough
+    estimate if it is computed from few repeats. For a share, the effective number of trials per repeat follows from
+    the formula of the score interval, even without any loss. For other quantities, the width decreases with the
+    square root of the number. The decrease of Student's quantile is taken into account.
 
     Args:
         intervals: Intervals as returned by `statistics` or `cells`, shape (cells,).

@@ -41,7 +41,8 @@ def read(
     parser takes longer than parsing the 40 rows of a trial.
 
     Args:
-        paths: CSV files with the columns of trial.csv, of any schema version up to that of this version of fieldkit.
+        paths: CSV files with the columns of trial.csv, of any schema version up to the schema version of this
+            fieldkit.
         declared: The columns of trial.csv.
         columns: Names of the columns to read, None for all; the columns of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.

@@ -333,7 +333,7 @@ def replacing(path: Path, types: Mapping[str, str]) -> Iterator[IndexWriter]:
 
 def _remove_old(folder: Path) -> None:
     """Remove the oldest indexes beyond `MAX_FILES`, and temporary files of processes that were killed."""
-    with suppress(OSError):  # another process removes them, too
+    with suppress(OSError):  # another process has removed it
         by_age = sorted(folder.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
         left_over = [
             path for path in folder.glob(f"*{_TEMPORARY_SUFFIX}") if path.stat().st_mtime < time.time() - _LEFT_OVER_S

@@ -48,7 +48,7 @@ class TableLine:
 
     Attributes:
         label: Label of the line.
-        quantities: Quantities, of which the first one that a cell has is shown.
+        quantities: Quantities; the first one that a cell has is shown.
         payload_bytes: ICMP payload sizes of the cells in this line; None for all cells.
     """
 

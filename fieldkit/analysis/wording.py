@@ -91,7 +91,7 @@ def _at_least(is_bound: bool) -> str:
 
 
 def incomplete(estimate: Estimate) -> str:
-    """Return the number of repeats with a value, `7 of 10`, and of censored ones; empty if all have a value."""
+    """Return the number of repeats with a value, `7 of 10`, and of censored repeats; empty if all have a value."""
     parts = []
     if estimate.missing:
         parts.append(f"{estimate.n} of {estimate.n_valid}")
@@ -231,7 +231,7 @@ def key(cell: Cell, name: str) -> str:
 
 
 def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
-    """Return the columns in which the cells differ, and those in which all are equal.
+    """Return the columns in which the cells differ, and the columns in which all cells are equal.
 
     Redundant columns are omitted: the distance in metres if `by` has the operator's text, and the procedure if it has
     the same name as the scenario in all cells.

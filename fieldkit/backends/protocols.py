@@ -71,7 +71,7 @@ class Robot(Strict):
 
     @property
     def ros_environment(self) -> dict[str, str]:
-        """Environment variables of its ROS programs, in addition to those of its setup files.
+        """Environment variables of its ROS programs, in addition to the variables of its setup files.
 
         Robots that share a master find each other by their addresses on the radio. ROS_HOSTNAME overrides ROS_IP,
         which a setup file may set (wiki.ros.org/ROS/EnvironmentVariables).

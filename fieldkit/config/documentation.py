@@ -14,7 +14,7 @@ from fieldkit.core.errors import ConfigurationError, did_you_mean
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 _FOLDERS: Final = ("", "reference", "studies")
 _COMMANDS: Final = "commands"
-"""The topic that describes all commands; a command is a topic too."""
+"""The topic that describes all commands. Each command is also a topic."""
 
 
 @dataclass(frozen=True)

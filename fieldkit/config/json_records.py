@@ -35,7 +35,8 @@ class Codec(Generic[Record]):
         """
         try:
             # In strict mode pydantic accepts lists for tuples and words for enumerations only in JSON text.
-            # Its parser rejects half of a surrogate pair, which the parser of Python accepts, so it is replaced.
+            # An unpaired surrogate is replaced, because the parser of pydantic rejects it, although the parser of
+            # Python accepts it.
             text = json.dumps(data, ensure_ascii=False).encode(errors="replace")
             return self._adapter.validate_json(text, strict=True)
         except ValidationError as error:

@@ -111,11 +111,11 @@ _Crossing = Annotated[
 
 
 class RobotBridge(Strict):
-    """Topics of a robot with ROS 1 that `fieldkit bridge`, running on it, carries to a middleware without a master.
+    """Topics of a robot with ROS 1 that `fieldkit bridge` on this robot carries to a middleware without a master.
 
     Attributes:
         to: `dds` or `zenoh`.
-        topics: Topics carried there, each `NAME:TYPE` or `NAME:TYPE:QOS` as for `fieldkit bridge`.
+        topics: Topics carried to this middleware, each `NAME:TYPE` or `NAME:TYPE:QOS` as for `fieldkit bridge`.
         back: Topics carried in the other direction.
         domain: ROS 2 domain, 0 to 101.
         router: Host of a Zenoh router, and its port if it is not 7447; without it, peers are found by scouting.
@@ -301,12 +301,12 @@ class RobotProfile(catalog.Named, Sectioned):
     in this version.
 
     An emulated robot has its setup files at their paths, except in the root folder, `/proc`, `/sys` and `/dev`;
-    those in `/run` and `/tmp` are lost at a reboot. It publishes topics of any type at their rates and sizes. For
+    files in `/run` and `/tmp` are lost at a reboot. It publishes topics of any type at their rates and sizes. For
     `sensor_msgs/LaserScan` (needs `points`), `Imu`, `BatteryState`, `Range`, `NavSatFix`, `MagneticField`,
     `FluidPressure`, `Temperature`, `nav_msgs/Odometry`, `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the
-    values are those of such a sensor on [the moving robot](add-a-robot.md#messages-of-an-emulated-robot). In messages
-    of other types, strings are empty, numbers are 0, quaternions are the identity, and the first list of numbers is
-    noise of the size in the profile. Types with a `definition` need ROS 1.
+    values are the measurements of such a sensor on [the moving robot](add-a-robot.md#messages-of-an-emulated-robot).
+    In messages of other types, strings are empty, numbers are 0, quaternions are the identity, and the first list of
+    numbers is noise of the size in the profile. Types with a `definition` need ROS 1.
 
     Attributes:
         kind: `ugv` (ground), `uav` (air) or `usv` (water).

@@ -257,7 +257,7 @@ class Strict(BaseModel):
 
 
 def _names(model: type[Strict]) -> frozenset[str]:
-    """Return the keys of a model, without those of sections."""
+    """Return the keys of a model, without the keys of sections."""
     return frozenset(field.alias or name for name, field in model.model_fields.items())
 
 

@@ -93,9 +93,9 @@ class Site(Strict):
         patience: How long a command waits for a lost control connection before it fails. The first connection of a
             run is not retried.
         robots: The robots of the lab by name: lower-case letters, digits and hyphens.
-        roles: Robot by role, per topology. `master` needs `sender`, `receiver` and `relay`, `masterless` the first
-            two. Further roles are for procedures that have `places` for them; trials of other procedures do not use
-            their robots.
+        roles: Robot by role, per topology. `master` needs `sender`, `receiver` and `relay`; `masterless` needs the
+            first two. Further roles are for procedures that have `places` for them; trials of other procedures do not
+            use their robots.
         emulated: Options of the emulated backend; other backends ignore them.
     """
 
@@ -147,7 +147,7 @@ class Site(Strict):
 
 
 def load_site(path: Path) -> tuple[Site, schema.Document]:
-    """Return the site file and its document (backends validate their own section of it).
+    """Return the site file and its document (each backend validates its own section).
 
     Raises:
         ConfigurationError: As `schema.load`.

@@ -129,7 +129,7 @@ def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
 
 
 def _without_cascading_errors(problems: Sequence[Any]) -> list[Any]:
-    """Return the problems without those of lists that are too short only because of an error in their items."""
+    """Return the problems, except about lists that are too short only because of an error in their items."""
 
     def is_cascading(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
         depth = len(problem["loc"])

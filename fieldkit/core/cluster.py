@@ -49,7 +49,7 @@ class ClusterExecutor(WorkerExecutor):
             )
         where = {"scheduler_file": address} if address.endswith(".json") else {"address": address}
         try:
-            client: Any = Client  # it has no annotations
+            client: Any = Client  # Client has no type annotations
             self._client = client(**where, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise LinkError(
@@ -71,7 +71,7 @@ class ClusterExecutor(WorkerExecutor):
         if time.monotonic() - self._read_s >= _REFRESH_S:
             try:
                 self._capacity = sum(self._client.nthreads().values())
-            except (OSError, TimeoutError):  # futures report a lost connection
+            except (OSError, TimeoutError):  # the futures report the lost connection
                 self._capacity = 0
             self._read_s = time.monotonic()
         return self._capacity

@@ -39,8 +39,9 @@ _UNIT_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
 """Smallest and largest possible value by unit; values of other units can be any finite number."""
 
 NEGATIVE_LOSS_BOUNDS: Final = (-1000.0, 1.0)
-"""Bounds of a loss that may be negative because more can be counted as received than as sent: duplicated datagrams,
-or the segments of one super-frame (at most about a hundred)."""
+"""Bounds of a loss that may be negative. The received count can exceed the sent count because of duplicated
+datagrams, or because of the segments of one super-frame (at most about a hundred).
+"""
 CLOCK_DIFFERENCE_BOUNDS_S: Final = (-_MAX_TIME_S, _MAX_TIME_S)
 """Bounds of the difference between two clocks."""
 

@@ -117,8 +117,8 @@ def describe_exception(error: BaseException) -> str:
 def did_you_mean(name: str, candidates: Iterable[str], otherwise: str) -> str:
     """Return the remedy for an unknown name: `did you mean 'rtt_loss'?`, or `otherwise` if no known name is similar.
 
-    A name is similar if it contains `name` as a whole word, as `rtt_loss` contains `rtt`, or ends with it after the
-    name of a step, as `up.rtt`. If there is no such name, the closest match is similar. Case is ignored.
+    A name is similar if it contains `name` as a whole word (`rtt_loss` contains `rtt`), or if it is `name` with the
+    name of a step as prefix (`up.rtt`). If there is no such name, the closest match is used. Case is ignored.
     """
     names = {candidate.lower(): candidate for candidate in candidates}
     lower_name = name.lower()

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Workers:
-    """The choice of workers, as the options `--jobs` and `--cluster` give it.
+    """The choice of workers by the options `--jobs` and `--cluster`.
 
     Attributes:
         jobs: Number of processes on this machine; None for the number of processors that this process may use.

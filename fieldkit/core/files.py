@@ -47,12 +47,12 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             temporary.rename(path)  # before the file is closed, which releases its lock
             temporary = None
     except OSError as error:
-        if error.filename is None:  # the error of a failed write names no file
+        if error.filename is None:  # the error of a failed write has no file name
             error.filename = str(path)
         raise
     finally:
         if temporary is not None:
-            with suppress(OSError):  # an earlier error is more useful
+            with suppress(OSError):  # an error here would hide an earlier error
                 temporary.unlink(missing_ok=True)
     sync_folder(path.parent)
 
@@ -60,8 +60,8 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 def _create_temporary(path: Path) -> tuple[Path, int]:
     """Create a file next to `path`; return its path and its descriptor, which locks the file until it is closed.
 
-    A file that a killed process left is removed; its lock was released. If another process writes the file now, the
-    new file gets another name.
+    A file that a killed process left behind is removed, because its lock was released. If another process writes the
+    file now, the new file gets another name.
 
     Raises:
         OSError: It cannot be created.
@@ -70,7 +70,7 @@ def _create_temporary(path: Path) -> tuple[Path, int]:
     _remove_unlocked(temporary)
     with suppress(FileExistsError):
         descriptor = _create(temporary)
-        with suppress(OSError):  # a file system without locks, or another process removes the file
+        with suppress(OSError):  # there are no locks here, or another process is removing the file
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(descriptor).st_nlink:
             return temporary, descriptor
@@ -88,11 +88,11 @@ def _remove_unlocked(path: Path) -> None:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
-        with suppress(OSError):  # there is no such file
-            path.unlink()  # for example an attacker's link to another file
+        with suppress(OSError):  # the file may not exist
+            path.unlink()  # a link, for example of an attacker to another file
         return
     try:
-        with suppress(OSError):  # it is locked
+        with suppress(OSError):  # another process has locked it
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(descriptor), path.lstat()):
                 path.unlink()

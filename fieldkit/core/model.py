@@ -52,7 +52,7 @@ FIXED_ROLES: Final = (Role.SENDER, Role.RECEIVER, Role.RELAY)
 
 
 def sort_roles(roles: Iterable[Role]) -> list[Role]:
-    """Return roles in the order in which they are listed: those of `FIXED_ROLES`, then additional roles by name."""
+    """Return roles in the order of listings: first the roles in `FIXED_ROLES`, then additional roles by name."""
     return sorted(
         roles, key=lambda role: (FIXED_ROLES.index(role) if role in FIXED_ROLES else len(FIXED_ROLES), role)
     )

@@ -62,7 +62,7 @@ class LocalProcesses(ProcessPoolExecutor, WorkerExecutor):
         self, fn: Callable[Parameters, Result], /, *args: Parameters.args, **kwargs: Parameters.kwargs
     ) -> Future[Result]:
         try:
-            with _blocked_interrupts():  # a process that is started here inherits the mask
+            with _blocked_interrupts():  # a process that is started here inherits the signal mask
                 return super().submit(fn, *args, **kwargs)
         except BrokenExecutor:
             self._broken_by_death = True

@@ -36,7 +36,7 @@ def user_at_host() -> str:
     """Return `user@laptop`, which identifies the lock holder on robots."""
     try:
         user = getpass.getuser()
-    except (KeyError, OSError):  # a user id without an account
+    except (KeyError, OSError):  # the user id has no account
         user = "unknown"
     return f"{user}@{socket.gethostname()}"
 
@@ -114,7 +114,7 @@ def hold_lock(name: str) -> Iterator[None]:
             os.unlink(f"{name}{_SUFFIX}", dir_fd=folder)
         os.close(lock)
         os.close(folder)
-        with suppress(OSError):  # not empty if other processes hold locks
+        with suppress(OSError):  # the folder is not empty if other processes hold locks
             path.rmdir()
 
 

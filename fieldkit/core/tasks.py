@@ -18,9 +18,9 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 MAX_DEATHS: Final = 5
-"""Number of deaths of a worker after which a task has failed."""
+"""A task has failed if its worker died this number of times."""
 ALONE_AFTER: Final = 2
-"""Number of deaths after which a task is run alone."""
+"""A task is run alone if its worker died this number of times."""
 
 _PER_WORKER: Final = 2
 """Submitted tasks per worker: one that runs and one that waits, so that no worker is idle."""
@@ -105,7 +105,7 @@ class _Submission(Generic[Task, Result]):
                         yield end
                 if self._executor.is_broken():
                     if self._submitted:
-                        continue  # all futures of a broken executor end soon
+                        continue  # all futures of a broken executor end soon; wait for them first
                     self._executor.stop()
                     self._executor = self._workers.open(len(self._tasks))
                 if self._lost:

@@ -17,9 +17,9 @@ _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[
 def sanitized(text: str) -> str:
     """Return `text` with a `?` for each character that is not printable.
 
-    These are the control characters C0 and C1, which start terminal escapes; format characters, some of which change
-    the text direction; line and paragraph separators; and unpaired surrogates. Line feeds and no-break spaces
-    are kept.
+    Characters that are not printable are the control characters C0 and C1 (they start terminal escapes), format
+    characters (some of them change the text direction), line and paragraph separators, and unpaired surrogates. Line
+    feeds and no-break spaces are kept.
     """
     return "\n".join(line if line.isprintable() else _replace_unprintable(line) for line in text.split("\n"))
 

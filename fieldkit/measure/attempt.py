@@ -52,7 +52,7 @@ class AttemptEvidence:
             except EvidenceError as error:
                 self._failed[key] = error
                 raise
-            except MemoryError:  # not cached: the file may be readable on another machine
+            except MemoryError:  # not cached, because it is not caused by the file
                 raise
             except Exception as error:  # a reader's unexpected error is caused by the file's content
                 reason = f"cannot be read: {type(error).__name__}: {error}"

@@ -38,4 +38,4 @@ def printable(data: bytes, limit: int = 300) -> str:
     if len(words) <= limit:
         return words
     end = words[-limit:]
-    return end.partition(" ")[2] or end  # a word without its start may be misread
+    return end.partition(" ")[2] or end  # omit the first word, whose start may be missing

@@ -24,8 +24,8 @@ ALWAYS_ALLOWED_BYTES: Final = 1 << 30
 EXPECTED_TIMES: Final = 4
 UNEXPECTED_SHARE: Final = 0.1
 """The total size of large files is limited to the largest of three values: `ALWAYS_ALLOWED_BYTES`, `EXPECTED_TIMES`
-the expected size, and `UNEXPECTED_SHARE` of the free disk. A camera may send more than its profile states, but must
-not fill this disk."""
+times the expected size, and `UNEXPECTED_SHARE` of the free disk. A camera may send more than its profile states, but
+must not fill this disk."""
 
 RESERVE_BYTES: Final = 100 << 20
 """Disk space of this machine that evidence must leave free."""
@@ -33,7 +33,7 @@ RESERVE_BYTES: Final = 100 << 20
 _PIECE_S: Final = 300.0
 """Timeout of a piece: the time that a link with 14 kB/s needs."""
 _MIN_HASH_BYTES_PER_S: Final = 2e6
-"""Minimum rate of sha256sum on a robot: a tenth of that on a Raspberry Pi Zero."""
+"""Minimum rate of sha256sum on a robot: a tenth of the rate on a Raspberry Pi Zero."""
 
 _PACKED_BYTES: Final = 2 * PIECE_BYTES
 _CHUNK_BYTES: Final = 1 << 20
@@ -239,7 +239,7 @@ class _LargeFile:
             finally:
                 piece.unlink(missing_ok=True)
         if self._remote_hash() != digest.hexdigest():
-            part.unlink()  # the pieces of an earlier call may be wrong
+            part.unlink()  # pieces of an earlier call may be wrong, so all are fetched again
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
         path = _target_path(into, self.name, self.shell.robot)
         try:

@@ -129,7 +129,10 @@ def landing_marker_file(name: str) -> str:
 
 
 def stationary_file(name: str) -> str:
-    """Return the path of the file that a driving job creates when its robot is stationary; as `exit_file`."""
+    """Return the path of the file that a driving job creates when its robot is stationary.
+
+    The path is relative to the folder of the job's attempt.
+    """
     return f".jobs/{name}/stationary"
 
 

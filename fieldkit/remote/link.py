@@ -219,7 +219,7 @@ class Link:
             if transport.is_authenticated():
                 self.open_spares()
                 return
-            if not transport.is_active():  # a server also disconnects after the sixth wrong key
+            if not transport.is_active():  # a server may disconnect after several wrong keys, OpenSSH after six
                 break
             count += 1
         if not count:
@@ -283,7 +283,7 @@ class Link:
         with self._lock:
             spares = list(self._spares)
         for spare in spares:
-            spare.result()  # raises if the server has refused a spare channel, as it would refuse this one
+            spare.result()  # raises an error if the server has refused a spare channel: it would also refuse this one
         return self._open(transport)
 
     def _channel(self, transport: paramiko.Transport) -> Channel:

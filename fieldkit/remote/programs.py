@@ -7,7 +7,7 @@ from fieldkit.remote.script import HOME, REPLY_S, require_success
 from fieldkit.remote.shell import Shell
 
 _MIN_BYTES_PER_S: Final = 14_000.0
-"""Minimum rate of a usable link, as for evidence."""
+"""Minimum rate of a usable link, the same as for evidence."""
 
 # $1 folder of the program, $2 its name, $3 its mode, $4 its SHA-256. Folders whose name begins with a dot are not
 # evidence, so that the program is not fetched.

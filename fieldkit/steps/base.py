@@ -119,7 +119,7 @@ class Step(Strict, ABC):
         """Return the names of all files that the step writes into an attempt's folder, including logs.
 
         A bag is listed with and without the suffix `.bag`: the robot's profile determines its actual name, which may
-        be that of a folder.
+        be the name of a folder.
         """
         return ()
 

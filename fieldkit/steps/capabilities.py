@@ -22,7 +22,7 @@ from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 class Capability(ABC):  # noqa: B024 (its subclasses have the abstract methods)
     """Base class of capabilities: a class has a capability if it derives from it or defines all of its methods.
 
-    It is not a `typing.Protocol`, whose metaclass conflicts with that of a pydantic model.
+    It is not a `typing.Protocol`, because the metaclass of protocols conflicts with the metaclass of pydantic models.
     """
 
     @classmethod
@@ -96,7 +96,7 @@ class DependsOnCast(Capability):
 
         Args:
             cast: The robot in each role.
-            path_s: Duration of the path of the robot that moves meanwhile, in seconds; None if no robot moves.
+            path_s: Duration of the path of the robot that moves during the step, in seconds; None if no robot moves.
         """
 
 

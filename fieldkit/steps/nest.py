@@ -82,12 +82,12 @@ def end_inside(nest: Nest, scene: Scene, testbed: Testbed) -> None:
         LinkError: A robot did not answer.
     """
     for planned in nest.inside(scene):
-        with suppress(RobotError):  # it was never started
+        with suppress(RobotError):  # the job was never started
             jobs.stop(testbed.shells[planned.role], planned.job)
 
 
 def own_jobs(step: Step, scene: Scene) -> Iterator[Planned]:
-    """Yield the jobs of a step without those of the steps inside it."""
+    """Yield the jobs of a step without the jobs of the steps inside it."""
     inside = {(planned.role, planned.job.name) for planned in step.inside(scene)} if isinstance(step, Nest) else set()
     return (planned for planned in step.jobs(scene) if (planned.role, planned.job.name) not in inside)
 
@@ -99,7 +99,7 @@ def resolved(entry: StepEntry, cast: Cast, path_s: float | None = None) -> StepE
 
 
 def with_record(entry: StepEntry, duration_s: float) -> StepEntry:
-    """Return an entry whose step, and the steps inside it, have recordings `duration_s` long."""
+    """Return an entry whose step, and the steps inside it, have recordings of the duration `duration_s`."""
     step = entry.step
     if isinstance(step, Nest):
         step = step.model_copy(update={"during": tuple(with_record(inner, duration_s) for inner in step.during)})

@@ -74,8 +74,8 @@ class Scene:
         sections: The sections of the procedure that installed packages added, by key.
         halt: Interrupts waits when the steps must not continue.
         motions: The robots that move automatically, which the operator may stop.
-        origins: Where the robots that move automatically started, an object of the package that moves them; None if
-            no attempt is made.
+        origins: Start positions of the robots that move automatically, as an object of the package that moves them;
+            None if no attempt is made.
     """
 
     protocol: Protocol
@@ -243,7 +243,7 @@ class Flow:
         frames: Approximate number of Ethernet frames including answers, from `frames`.
         protocol: Transport protocol; None for the one under test.
         group: A multicast group to which either of them also sends; None without multicast.
-        served: Whether an existing program on the source listens, which is not started by the step.
+        served: Whether a program that the step does not start listens on the source.
     """
 
     source: Role

@@ -20,7 +20,7 @@ _MAX_OMITTED_S: Final = 1.1
 """Maximum length of a last interval that version 3.17 omits because nothing arrived in it."""
 _ROUNDING: Final = 1e-3
 _EARLY_S: Final = 0.1
-"""A timer of the client may end a test this much before its duration."""
+"""A timer of the client may end a test up to this time before its full duration."""
 _TIMESTAMP_S: Final = 2
 """`timesecs` has a resolution of whole seconds."""
 

@@ -125,7 +125,7 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
     sent_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
     yield from _byte_count_contradictions(files, sent_bytes, arrived_bytes, transfer)
     # Copies can compensate for missing packets in the sum, but not packet by packet. A later fragment whose id
-    # another transfer uses too cannot be assigned.
+    # another transfer also uses cannot be assigned.
     other_ids = np.concatenate(
         [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
     )

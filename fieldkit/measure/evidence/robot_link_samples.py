@@ -147,7 +147,7 @@ def _sampler_text(path: Path) -> str:
     compressed = path.with_name(f"{path.name}.gz")
     if not compressed.is_file():
         return ""
-    reading.size(compressed)  # checks that it is a readable file
+    reading.size(compressed)  # raises an error if it is not a readable file
     try:
         with gzip.open(compressed, "rb") as file_:
             content = file_.read(reading.MAX_TEXT_BYTES)

@@ -113,7 +113,7 @@ class SandboxedReader:
         except TimeoutError:
             self._end(process)
             return {}, _TIMED_OUT
-        except BaseException:  # after Ctrl-C, this answer would be read as the answer to the next query
+        except BaseException:  # otherwise, after Ctrl-C, this answer would be read as the next one
             self._end(process)
             raise
         if len(line) > max_bytes:
@@ -129,7 +129,7 @@ class SandboxedReader:
         with suppress(subprocess.TimeoutExpired):
             process.wait(patience_s)
         process.kill()
-        with process:  # closes its pipes
+        with process:  # closes the pipes of the process
             return process.wait()
 
 
@@ -222,7 +222,7 @@ def _start(module: str) -> subprocess.Popen[bytes]:
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         bufsize=0,
-        start_new_session=True,  # the first Ctrl-C must not reach it, because the repeat still finishes
+        start_new_session=True,  # Ctrl-C must not reach it, because the current repeat is still completed
         env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},  # numpy reserves memory for a thread per core
     )
 

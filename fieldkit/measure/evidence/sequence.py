@@ -54,7 +54,7 @@ def count_messages(arrivals: Sequence[tuple[int, int]], ended_us: int) -> Messag
         if step == 0 and not is_silence:
             repeated += 1
         elif step > NUMBERS // 2 and not is_silence:
-            messages, lost = messages + 1, max(lost - 1, 0)  # it was counted as lost, but was only late
+            messages, lost = messages + 1, max(lost - 1, 0)  # it was counted as lost before, but is only late
         else:
             step = step or NUMBERS
             wraps = max(round((rate_hz * interval_us / 1e6 - step) / NUMBERS), 0) if is_silence else 0

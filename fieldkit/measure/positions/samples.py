@@ -180,7 +180,7 @@ def _time_ns(name: str, text: str, where: str) -> int:
     """Return a time in nanoseconds since 1970 UTC."""
     invalid = EvidenceError(f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z")
     if name != "t":
-        if not _UNIX_TIME.fullmatch(text):  # also rejects 1.7e9, because a time with an exponent has lost digits
+        if not _UNIX_TIME.fullmatch(text):  # also rejects 1.7e9: a time with an exponent lacks digits
             raise invalid
         return round(Decimal(text) * _NS_PER[name])  # a float cannot represent nanoseconds since 1970
     try:

@@ -63,7 +63,7 @@ def separation_between(source: Trajectory, destination: Trajectory, start_ns: in
     """Return the distances and speeds of two robots during a time span that both trajectories cover.
 
     Args:
-        source: The sender; its speed over the ground is returned too.
+        source: The sender; its speed over the ground is also returned.
         destination: The receiver.
         start_ns: Start of the time span.
         end_ns: End of the time span.

@@ -45,7 +45,7 @@ def incomparability_reason(sender: Packets, receiver: Packets, transfer: Transfe
     Args:
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
-        transfer: Identifies the packets of the transfer; only those with a port are used.
+        transfer: Identifies the packets of the transfer; only packets with a port are used.
     """
     forward_sent, forward_received = transfer.forward(sender), transfer.forward(receiver)
     sent, received = (packets.where(packets.dport == transfer.port) for packets in (forward_sent, forward_received))

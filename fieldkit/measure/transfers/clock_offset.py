@@ -3,7 +3,7 @@
 No packet arrives before it was sent. The offset is therefore at most the apparent delay of any packet to the
 receiver, and at least the negative apparent delay of any packet from it. With constant drift the offset is a straight
 line over time, and every line below all upper bounds and above all lower bounds is possible (Duda et al.,
-"Estimating global time in distributed systems", ICDCS 1987; the convex hulls are those of Moon, Skelly and Towsley,
+"Estimating global time in distributed systems", ICDCS 1987; the convex hulls are as in Moon, Skelly and Towsley,
 "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). The captures contain no more
 information: the division of a round trip into its two directions is unobservable (Paxson, "On calibrating
 measurements of packet transit times", SIGMETRICS 1998).
@@ -11,9 +11,10 @@ measurements of packet transit times", SIGMETRICS 1998).
 A single wrong time stamp can exclude the true line. Therefore a line counts as possible if it violates the bound of
 at most one packet: the true line is one of them if one time stamp is wrong, by any amount. This is the intersection
 algorithm of Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905, section
-11.2.1) with at most one faulty source, where each packet is a source. The lines are those of the polygons that result
-if one packet is left out; only packets on the convex hulls change the polygon. No smaller set has this property,
-because each of these lines is the true one if the time stamp of the packet that was left out is wrong.
+11.2.1) with at most one faulty source, where each packet is a source. The possible lines are all lines in the
+polygons that result if one packet is left out; only packets on the convex hulls change the polygon. No smaller set of
+lines is sufficient, because each of these lines can be the true one if the time stamp of the packet that was left out
+is wrong.
 """
 
 from collections.abc import Sequence
@@ -217,7 +218,7 @@ class _Hull:
         points = sorted(zip(x[lowest].tolist(), y[lowest].tolist(), strict=True))
         outer = _lower_hull(points)
         on_hull = set(outer)
-        # Without a point of this hull, only points of the hull of all others can be on the hull in addition.
+        # If a point of this hull is left out, only points of the hull of all other points can be added to the hull.
         inner_points = [point for index, point in enumerate(points) if index not in on_hull]
         inner_hull = [inner_points[index] for index in _lower_hull(inner_points)]
         hulls = [[points[index] for index in outer]]

@@ -346,7 +346,7 @@ def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
 
 
 def _copies(matched: Match, chosen: Mask | None = None) -> tuple[Ints, Ints]:
-    """Return the indices of matched packets among those sent and those received, without ambiguous ones."""
+    """Return the indices of matched packets among sent and among received packets, without ambiguous packets."""
     is_certain = matched.arrived & ~matched.ambiguous
     index = np.flatnonzero(is_certain if chosen is None else is_certain & chosen)
     return index, matched.received_index[index]

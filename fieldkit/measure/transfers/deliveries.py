@@ -4,8 +4,8 @@ TCP delivers bytes in order, each once (RFC 9293, section 3.10.7.4): a frame is 
 contiguous received bytes. UDP delivers complete datagrams. A retransmitted copy, a duplicate, a fragment and a
 segment after a gap deliver nothing alone, so segmentation offload changes no time by more than one frame.
 
-All times are those of the receiver's capture. The sender's times are converted with the fastest packet of the flow
-that is in both captures, so that a converted time is the earliest possible arrival.
+All times are by the clock of the receiver's capture. The sender's times are converted with the fastest packet of the
+flow that is in both captures, so that a converted time is the earliest possible arrival.
 """
 
 from dataclasses import dataclass, replace
@@ -188,7 +188,7 @@ def stream_delivery(
         sent_ns: Times at which its sender sent the first packet, the first payload and the last payload.
         pairs: Its packets that are in both captures.
         expected: Known properties of the stream.
-        rtt_s: Round-trip time if the stream retransmits lost data, else 0.
+        rtt_s: Round-trip time if the stream retransmits lost data, otherwise 0.
     """
     min_stall_s = max(MIN_STALL_S, _MIN_RTTS * rtt_s, _MIN_INTERVALS * expected.interval_s)
     first_ns, data_ns, last_ns = sent_ns

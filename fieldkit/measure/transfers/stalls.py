@@ -28,7 +28,7 @@ from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
 
 RANK: Final = 120
-"""Position of the columns in trial.csv: after those of earlier versions."""
+"""Position of the columns in trial.csv: after the columns of earlier versions."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """All columns of one transfer, computed from files, captures, ping and host counters.
 
-The columns of the paper are computed as in its procedure, for comparison with those of fieldkit. Its filters are
-tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches either
-port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
+The columns of the paper are computed as in its procedure, for comparison with the columns of fieldkit. Its filters
+are tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches
+either port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
 """
 
 from collections.abc import Mapping

@@ -36,7 +36,7 @@ def datagrams(packets: Packets) -> tuple[Ints, Ints]:
 
 
 def with_ports(packets: Packets) -> Packets:
-    """Return the packets with each later fragment's ports set to those of its first fragment, or `NO_PORT`."""
+    """Return the packets; later fragments get the ports of their first fragment, or `NO_PORT` without one."""
     first, datagram = datagrams(packets)
     sport, dport = (np.append(ports[first], NO_PORT)[datagram] for ports in (packets.sport, packets.dport))
     return replace(packets, sport=sport, dport=dport)

@@ -1,4 +1,4 @@
-"""The kinds of step: the built-in ones, and those of entry points."""
+"""The kinds of step: built-in kinds, and kinds of entry points."""
 
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint
@@ -34,7 +34,7 @@ def builtin() -> frozenset[str]:
 
 
 def shipped() -> frozenset[str]:
-    """Return the names of the kinds that ship with fieldkit: the built-in ones, and its own entry points."""
+    """Return the names of the kinds that ship with fieldkit: built-in kinds, and kinds of its own entry points."""
     points = plugins.entry_points(plugins.STEPS)
     return builtin() | {point.name for point in points if point.dist is not None and point.dist.name == _PACKAGE}
 

@@ -70,7 +70,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
 
     Attributes:
         robots: Roles that capture.
-        port: A port to capture in addition to those of the steps inside.
+        port: A port to capture in addition to the ports of the steps inside.
         during: Steps to capture.
     """
 

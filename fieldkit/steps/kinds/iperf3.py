@@ -46,7 +46,7 @@ _STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
 
 
 class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraffic, Summarizes):
-    """Measures with iperf3, 3.1 or later, which both robots need: `sudo apt-get install iperf3`.
+    """Measures with iperf3. Both robots need iperf3 3.1 or later: `sudo apt-get install iperf3`.
 
     The server ends with the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
     `capture`, figures of the same packets are also computed from the captures: [columns](method-loss.md#iperf3),

@@ -172,7 +172,7 @@ class RunStep(Step, UsesSpace, Summarizes):
     output: FileName = "run.txt"
     prints: Bytes = 10_000.0
     figures: tuple[PrintedColumn, ...] = Field(default=(), alias="columns")
-    expect: Expected = Field(default_factory=Expected)  # a default object would be built at every import
+    expect: Expected = Field(default_factory=Expected)  # a plain default would be built at every import
 
     @schema.model_validator(mode="after")
     def _can_be_run(self) -> "RunStep":

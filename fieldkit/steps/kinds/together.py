@@ -83,7 +83,7 @@ class TogetherStep(Nest, Prepares, DescribesActions):
 
         def end() -> None:
             scene.halt.set()
-            with suppress(FieldkitError):  # the first error is reported
+            with suppress(FieldkitError):  # the first error is raised instead
                 end_inside(self, scene, testbed)
 
         try:

@@ -242,7 +242,7 @@ class TransferStep(
             code = listening.end(self.limit + 2 * jobs.REPLY_S)
         if scene.protocol is Protocol.TCP and code != 0 and waited_s > MAX_LATE_SHARE * self.limit:
             raise self._late_start(waited_s, f"the listener was stopped after {self.limit:g} s", scene)
-        # A sender runs longer than its listener only if the transfer was interrupted; then its limit has passed, too.
+        # A sender runs longer than its listener only if the transfer was interrupted; its limit has then also passed.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.laptop_folder is not None:
             after = oracle.delays(*flow)
