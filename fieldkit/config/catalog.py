@@ -1,4 +1,4 @@
-"""Robots and procedures by name: YAML files in the lab's folder first, then those that ship with fieldkit."""
+"""Robots and procedures by name: YAML files in the lab's folder first, then the files that ship with fieldkit."""
 
 from typing import TypeVar
 

@@ -120,8 +120,8 @@ _Loader.add_constructor("tag:yaml.org,2002:float", _Loader.checked_float)  # typ
 class _Dumper(yaml.SafeDumper):
     """SafeDumper that quotes text which YAML 1.1 or 1.2 would read as a number, such as the hash `6372e70369712148`.
 
-    It escapes the line ends of YAML 1.1 other than the line feed, because SafeDumper does not and they would be read
-    back as spaces.
+    It also escapes the line ends of YAML 1.1 other than the line feed. SafeDumper does not escape them, so they would
+    be read back as spaces.
     """
 
     def represent_text(self, text: str) -> yaml.Node:

@@ -23,7 +23,7 @@ class Codec(Generic[Record]):
 
     @cached_property
     def _adapter(self) -> TypeAdapter[Record]:
-        return TypeAdapter(self._record)  # takes 10 ms, and few commands use each adapter
+        return TypeAdapter(self._record)  # at first use: it takes 10 ms, and a command uses few adapters
 
     def parse(self, data: Any) -> Record:  # noqa: ANN401 (any JSON value)
         """Return the record of a JSON value.

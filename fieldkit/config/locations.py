@@ -1,4 +1,4 @@
-"""Names of a lab's files: its site file, and the robots and procedures of the lab and those that ship with fieldkit.
+"""Names of files: the site file of a lab, and robots and procedures of the lab or of fieldkit itself.
 
 It imports no YAML reader, so that the command line can list and complete the names quickly.
 """
@@ -30,8 +30,8 @@ def folders(kind: Kind) -> tuple[Path, ...]:
 def names(kind: Kind) -> dict[str, Path]:
     """Return every name of `kind` with its file, sorted by name.
 
-    An empty file does not replace a shipped one, because the shell creates it before
-    `fieldkit robots show NAME > robots/NAME.yaml` runs.
+    An empty file does not replace a shipped file, because the shell creates an empty file before `fieldkit robots
+    show NAME > robots/NAME.yaml` runs.
     """
     paths: dict[str, Path] = {}
     for folder in folders(kind):

@@ -167,7 +167,7 @@ class Ros(Strict):
             `RMW_IMPLEMENTATION` also determine how the robot [is driven](motion.md) and which middleware an emulated
             robot uses.
         topics: Topics that the robot publishes; emulated robots publish them.
-        bridge: Topics of a robot with ROS 1 that [a bridge](bridge.md#in-a-profile) on it carries.
+        bridge: Topics of a robot with ROS 1 that [a bridge](bridge.md#in-a-profile) on the robot carries.
     """
 
     variant: Annotated[str, Field(pattern="^(ros1|ros2)$")]

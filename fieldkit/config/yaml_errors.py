@@ -173,7 +173,7 @@ def _message(problem: Mapping[str, Any], shapes: Mapping[str, str]) -> str:
 
 
 def _choice_message(text: str, choices: Sequence[str]) -> str:
-    """Return the message about a text that is not one of the valid ones."""
+    """Return the message about a text that is not one of the valid texts."""
     hint = did_you_mean(text, choices, "")
     return f"{_quoted(text)} is not one of: {', '.join(choices)}{f'; {hint}' if hint else ''}"
 

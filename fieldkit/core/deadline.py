@@ -62,7 +62,7 @@ class Deadline:
 class ExpiredError(TimeoutError):
     """A fieldkit deadline has passed.
 
-    A plain `TimeoutError` is instead the time-out of a connection, reported by the operating system.
+    The operating system raises a plain `TimeoutError` if a connection times out.
 
     Args:
         what: What did not happen in time, for messages: `start`.

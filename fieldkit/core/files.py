@@ -44,7 +44,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            temporary.rename(path)  # before the file is closed, which releases its lock
+            temporary.rename(path)  # before closing the file, which releases its lock
             temporary = None
     except OSError as error:
         if error.filename is None:  # the error of a failed write has no file name
@@ -123,7 +123,7 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
     try:
         descriptor = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        # ELOOP is the error for a symbolic link, ENXIO the one for a pipe or a socket opened for writing.
+        # ELOOP is the error for a symbolic link, ENXIO the error for a pipe or a socket opened for writing.
         if error.errno in {errno.ELOOP, errno.ENXIO} and (reason := unexpected_type(path)):
             raise OSError(error.errno, reason, str(path)) from error
         raise

@@ -108,7 +108,7 @@ class Status(StrEnum):
 
 
 MAX_REPEATS: Final = 100_000
-"""Maximum number of repeats per protocol of one trial. So many repeats would take weeks."""
+"""Maximum number of repeats per protocol of one trial. This number of repeats would take weeks."""
 
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """Final states of an attempt."""
@@ -245,7 +245,7 @@ class TrackPoint:
 
 @dataclass(frozen=True)
 class StationSample:
-    """Statistics that a radio reports of one peer station; None if not reported. Counters start at any number.
+    """Statistics that a radio reports about one peer station; None if not reported. Counters start at any number.
 
     Attributes:
         station: MAC address of the station, or its name if the sample is of an emulator.

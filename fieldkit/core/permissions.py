@@ -32,7 +32,7 @@ def installed() -> Mapping[str, Permission]:
     """Return the permissions of installed packages by name.
 
     Raises:
-        ConfigurationError: One cannot be loaded.
+        ConfigurationError: A permission cannot be loaded.
     """
     return {point.name: plugins.load(point) for point in plugins.entry_points(plugins.PERMISSIONS)}
 

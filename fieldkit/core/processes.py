@@ -21,7 +21,7 @@ class WorkerExecutor(Executor):
     """An executor that reports the number of its workers and their deaths.
 
     Attributes:
-        MIN_SUBMITTED: Number of tasks that are submitted to any number of workers.
+        MIN_SUBMITTED: Minimum number of tasks that are submitted, for any number of workers.
     """
 
     MIN_SUBMITTED: ClassVar[int] = 4

@@ -74,7 +74,7 @@ def encodable(text: str) -> str:
 
 
 def print_text(text: object = "", *, end: str = "\n", flush: bool = False) -> None:
-    """Print a text with its control characters replaced, except tabs, which files that are shown may contain."""
+    """Print a text with its control characters replaced, except tabs, which may be part of a shown file."""
     sys.stdout.write("\t".join(map(sanitized, str(text).split("\t"))) + end)
     if flush:
         sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""The folder of an attempt on a robot: created before it, deleted after it; its jobs are stopped."""
+"""The folder of an attempt on a robot: its creation before the attempt, the stop of its jobs, and its deletion."""
 
 from collections.abc import Collection
 from typing import Final

@@ -143,7 +143,7 @@ def fetch(
         LinkError: The robot did not answer.
         LateJobError: All files were fetched, but a job failed after `jobs.stop` had returned.
         RobotError: It has no such folder, or could not pack its files; files that arrived are kept.
-        EvidenceError: The files are incomplete, unsafe, fail their hash, or are too large.
+        EvidenceError: The files are incomplete, unsafe or too large, or do not match their hash.
     """
     packed = into / f".{role}.tar"
     try:

@@ -90,7 +90,7 @@ class Credentials:
     Attributes:
         host_key: Pinned host key.
         private_key: OpenSSH private key text; None uses the keys of the SSH agent, unless there is a password.
-        password: The password, which is then the only method; None to use keys.
+        password: The password, which is then the only login method; None to use keys.
     """
 
     host_key: HostKey

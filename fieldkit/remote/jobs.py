@@ -68,7 +68,7 @@ _LANDING_LINE: Final = re.compile(
 
 _LINE_BYTES: Final = 300
 
-# Forwards at most $1 bytes of each output of the program. The exit code is that of the program.
+# Forwards at most $1 bytes of each output of the program. The exit code is the program's.
 _LIMITED: Final = (
     'n=$1; shift; exec 5>&1 6>&2; exit "$( { { { "$@" 3>&- 5>&- 6>&-; echo $? >&3; } 2>&1 >&4 4>&- 5>&- 6>&- '
     '| head -c "$n" >&6; } 4>&1 | head -c "$n" >&5; } 3>&1 )"'
@@ -122,8 +122,8 @@ def exit_file(job: Job) -> str:
 def landing_marker_file(name: str) -> str:
     """Return the path of the file that protects a job from SIGKILL, relative to the folder of its attempt.
 
-    A job creates it while it must not be killed, for example while it lands a drone. When all jobs are stopped, it
-    receives SIGINT as the others do, but no SIGKILL while the file exists.
+    A job creates it while it must not be killed, for example while it lands a drone. When all jobs are stopped, the
+    job receives SIGINT like the others, but no SIGKILL while the file exists.
     """
     return f".jobs/{name}/unhurried"
 
@@ -310,7 +310,7 @@ class Aborted:
 def abort(shell: Shell, user: str, deadline: Deadline) -> Aborted:
     """Break the robot's lock in the name of `user`, and stop all jobs of all trials.
 
-    The script is not installed for it, because a full or read-only disk may be the reason for the abort.
+    The job script is not installed for this, because a full or read-only disk may be the reason for the abort.
 
     Raises:
         LinkError: The robot did not answer.

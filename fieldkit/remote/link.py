@@ -65,7 +65,7 @@ class NoSessionError(paramiko.SSHException):
 
 
 class _Packetizer(paramiko.packet.Packetizer):
-    """Limits the length of packets and of the banner, which paramiko does not.
+    """Limits the length of packets and of the banner, because paramiko does not limit it.
 
     Attributes:
         acknowledges: Whether answers of the server are acknowledged immediately. OpenSSH's server uses Nagle's
@@ -243,7 +243,7 @@ class Link:
         return channel
 
     def acknowledge(self) -> None:
-        """Send the TCP acknowledgement now, so that no delayed one collides with packets of the robot's command."""
+        """Send the TCP acknowledgement now, because a delayed one could collide with packets of the command."""
         stream, _ = self._connection()
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
@@ -345,7 +345,7 @@ def connection_error(transport: paramiko.Transport) -> BaseException | None:
     """Return the error of the connection of a closed channel, or None if the server has closed only the channel.
 
     paramiko stores its exception, closes the channels of the connection, and only then marks the connection as
-    inactive. On a busy computer this takes any time.
+    inactive. On a busy computer the time between these actions has no limit.
     """
     assert isinstance(transport.packetizer, _Packetizer)
     error = transport.saved_exception

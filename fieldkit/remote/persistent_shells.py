@@ -1,10 +1,10 @@
 """Persistent shells on a robot: they run commands without a new SSH session for each command.
 
 A command is a line `NONCE VERB WORD...`, quoted as all remote commands. On both streams the shell writes the nonce,
-the output of the command, and the nonce again with the exit code. If `held` precedes the verb, it writes the end only
-after it has received another line. The nonce is random for each command, and programs on the robot do not receive it.
-Therefore no output, with or without a newline at its end, can be mistaken for the end of an answer, and output of
-processes that a command left running is dropped between two commands.
+the output of the command, and the nonce again with the exit code. If `held` precedes the verb, the shell writes the
+end only after it has received another line. The nonce is random for each command, and programs on the robot do not
+receive it. Therefore no output, with or without a newline at its end, can be mistaken for the end of an answer, and
+output of processes that a command left running is dropped between two commands.
 """
 
 import re
@@ -60,7 +60,7 @@ class ShellPool:
         return command
 
     def restore(self, link: Link, command: str) -> None:
-        """Start to open a shell by `command` if `link` has too few, unless that failed on this link before."""
+        """Start to open a shell by `command` if `link` has too few, unless an earlier attempt failed on this link."""
         with self._lock:
             if self._link is not link:
                 self._link, self._shells, self._opening = link, [], False
@@ -103,7 +103,7 @@ class PersistentShell:
         """Start a shell by `command` on `channel`, and return it when it is ready.
 
         Raises:
-            EOFError: The shell did not start, or a login shell printed a greeting before.
+            EOFError: The shell did not start, or a login shell printed a greeting before it started.
             OSError, SSHException: The connection broke.
         """
         channel.exec_command(command)

@@ -43,7 +43,7 @@ _GREETING_BYTES: Final = 60
 _READ_ONLY_REMEDY: Final = "on the robot: dmesg | tail; a failing SD card becomes read-only, so save its data"
 
 HELD_REMEDY: Final = "wait, resume that trial if it is yours, or end it: fieldkit abort"
-"""Remedy for a locked robot. The holder may be another trial of the operator whose laptop failed."""
+"""Remedy for a locked robot. The holder of the lock may be another trial of the operator whose laptop failed."""
 
 _MESSAGE_PREFIX: Final = b"job.sh: "
 _HELD: Final = re.compile(

@@ -108,7 +108,7 @@ class Shell(Protocol):
         """Keep the connection silent during the body, if it crosses the radio under test.
 
         A connection that is lost during the body is reopened after it, or after `seconds` if the body waits for the
-        connection. The time limit for reopening starts then. Data of running commands are not affected.
+        connection. The time limit for reopening starts at that time. Data of running commands are not affected.
         """
         ...
 

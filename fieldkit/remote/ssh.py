@@ -35,10 +35,10 @@ class SshShell:
         user: Login name.
         host_key: Pinned host key as in `known_hosts`: `ssh-ed25519 AAAA...`.
         private_key: OpenSSH private key text; None uses the keys of the SSH agent, unless there is a password.
-        password: The password, which is then the only method; None to use keys.
+        password: The password, which is then the only login method; None to use keys.
         host: Host name or address, for messages; empty for the name of the robot.
         port: SSH port, for messages.
-        patience_s: Time for which a lost connection is reopened.
+        patience_s: Time after a loss during which attempts to reopen the connection are made.
         notice: Called with one line when the connection is lost, and when it is restored.
         on_air: Whether the connection crosses the radio under test.
         timing: Timeouts of the connection.

@@ -61,8 +61,8 @@ def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets
 def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
     """Return the fates of a transfer's packets.
 
-    None if a capture is missing, damaged, without times or empty, if the captures contradict each other, or if it is
-    ambiguous which packets were lost.
+    Return None if a capture is missing, damaged, without times or empty, if the captures contradict each other, or if
+    it is ambiguous which packets were lost.
 
     Args:
         evidence: The attempt's evidence.
