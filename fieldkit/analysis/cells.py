@@ -53,8 +53,9 @@ class Estimate:
             number of all estimates; None if it was not tested.
         wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items are independent; None
             unless counted.
-        wilson_high: Upper end.
-        events: Number of lost items, or of repeats that are true; None unless the quantity is counted or a flag.
+        wilson_high: Upper end of the Wilson interval.
+        events: Number of lost items, or of repeats in which a flag is true; None unless the quantity is counted or a
+            flag.
         trials: Number of sent items, or of repeats.
         mean: Mean over repeats.
         median: Median over repeats.
@@ -135,7 +136,7 @@ def aggregate(
     """Return one cell per condition, sorted by the columns `by` in their order; distances are sorted by length.
 
     Args:
-        repeats: Attempts of repeats, including void and failed ones.
+        repeats: Attempts of repeats, including void and failed attempts.
         by: Columns that identify a condition.
         quantities: Quantities to estimate; None for all that the repeats have.
         words: Columns whose words are counted; None for all that the repeats have.

@@ -19,7 +19,7 @@ NOT_JUDGED: Final = "words are counted, not judged"
 
 
 def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
-    """Yield each condition with each of its rows: one per quantity, or a single row if neither run measured one."""
+    """Yield each condition with each of its rows: one per quantity, or a single row if there is no quantity."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
         rows = [_difference_row(difference, missing_in, comparison.n_compared) for difference in pair.differences]

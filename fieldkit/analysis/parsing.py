@@ -38,7 +38,7 @@ def columns(
     Args:
         names: All columns of the table, in order.
         body: Its lines without the header, each with its line end.
-        declared: The requested columns; those that the table does not have are missing in all rows.
+        declared: The requested columns; columns that the table does not have are missing in all rows.
 
     Raises:
         ValueError: A line or a value is invalid.
@@ -150,7 +150,7 @@ def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) ->
 
 
 def arrow_type(column: Column) -> pa.DataType:
-    """Return the type as which Arrow reads a column."""
+    """Return the Arrow type by which a column is read."""
     if column.type is str:
         return pa.dictionary(pa.int32(), pa.string())
     return {"bool": pa.bool_(), "ns": pa.int64()}.get(column.unit, pa.float64())

@@ -48,7 +48,7 @@ class Quantity:
 
     @classmethod
     def of(cls, column: Column) -> Self | None:
-        """Return the quantity of a column; None if the column has no figure, or one of kind `words`."""
+        """Return the quantity of a column; None if the column has no figure, or a figure of the kind `words`."""
         figure = column.figure
         if figure is None or figure.kind is Kind.WORDS:
             return None
@@ -77,7 +77,7 @@ class Quantity:
 
     @property
     def is_builtin(self) -> bool:
-        """Whether it is a built-in quantity, instead of one that another package or a lab declares."""
+        """Whether it is a built-in quantity; False if another package or a lab declares it."""
         return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
 
     @property

@@ -1,7 +1,7 @@
 """Sample sizes: the repeats or packets that expectations need, and the additional repeats that a cell needs.
 
-Expectations are checked before the trial runs. The additional repeats are those that narrow the interval of a cell to
-a requested width.
+Expectations are checked before the trial runs. The additional repeats narrow the interval of a cell to a requested
+width.
 """
 
 import math
@@ -122,10 +122,10 @@ def additional_repeats(
 ) -> NDArray[np.float64]:
     """Return the number of additional repeats until the half-width of an interval is at most `half_width`.
 
-    It is assumed that further repeats have the same dispersion as the existing ones, so the number is only a rough
+    It is assumed that further repeats have the same dispersion as the existing repeats, so the number is only a rough
     estimate if it is computed from few repeats. For a share, the effective number of trials per repeat follows from
     the formula of the score interval, even without any loss. For other quantities, the width decreases with the
-    square root of the number. The decrease of Student's quantile is taken into account.
+    square root of the number of repeats. The decrease of Student's quantile is taken into account.
 
     Args:
         intervals: Intervals as returned by `statistics` or `cells`, shape (cells,).
@@ -156,7 +156,7 @@ def additional_repeats(
         estimated = (kind is not Kind.FLAG) & (value > 0) & (value < 1)
     else:
         estimated = (n < MIN_FOR_ORDER_STATISTICS) | (kind is Kind.MEAN)
-    with_normal = np.ceil(n * ratio * (1 - 1e-12))  # rounding must not increase a ratio of 1
+    with_normal = np.ceil(n * ratio * (1 - 1e-12))  # rounding must not increase the result for a ratio of 1
     total = np.where(estimated, _with_student(n, ratio, with_normal), with_normal)
     return np.asarray(total - n)
 

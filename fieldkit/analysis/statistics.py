@@ -170,8 +170,9 @@ def medians(
     assumes a normal distribution, and the range of the repeats, whose coverage for any distribution is `assured`.
 
     A right-censored repeat has its lower bound as value, and infinity as `upper`. The lower end is computed from the
-    lower bounds and the upper end from the upper bounds, so the interval contains the one that would result if all
-    values were known. With fewer than six repeats and a censored one, it is the range of the repeats only.
+    lower bounds and the upper end from the upper bounds, so the interval contains the interval that would result if
+    all values were known. With fewer than six repeats of which any is censored, the interval is only the range of the
+    repeats.
 
     Args:
         values: Shape (cells, n).

@@ -299,7 +299,7 @@ class IndexWriter:
 
 
 def _column(column: pa.ChunkedArray | None, kind: pa.DataType, rows: int) -> pa.ChunkedArray | pa.Array:
-    """Return a column, or one in which all values are missing; a missing text is empty."""
+    """Return a column, or a column in which all values are missing; a missing text is empty."""
     if column is not None:
         return column
     if pa.types.is_dictionary(kind):

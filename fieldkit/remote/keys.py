@@ -32,7 +32,7 @@ def read_private_key(path: str, *, where: str) -> str:
     """
     try:
         text = Path(path).expanduser().read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # RuntimeError is raised for `~NAME` of an unknown user
+    except (OSError, UnicodeDecodeError, RuntimeError) as error:  # RuntimeError: `~NAME` names an unknown user
         raise ConfigurationError(
             f"its key {path} cannot be read",
             where=where,

@@ -153,7 +153,7 @@ def _load(point: EntryPoint) -> type[Step]:
     """Return the class of a kind.
 
     Raises:
-        ConfigurationError: It cannot be loaded, or is not a complete subclass of `Step`.
+        ConfigurationError: The class cannot be loaded, or is not a complete subclass of `Step`.
     """
     loaded, location, remedy = plugins.load(point), plugins.location(point), plugins.REMEDY
     if not (isinstance(loaded, type) and issubclass(loaded, Step)):

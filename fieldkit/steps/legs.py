@@ -18,7 +18,7 @@ class PathLeg(Strict):
             relay: away from the sender). For a drone: forward.
         towards: Distance towards that robot. For a drone: backward.
         left: Distance to the left, seen by an observer who looks away from that robot. Combined with `away` or
-            `towards` it is a diagonal.
+            `towards` the segment is diagonal.
         right: Distance to the right.
     """
 

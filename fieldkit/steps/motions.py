@@ -43,8 +43,8 @@ class Motions:
     """The moving robots, and the order to stop. After the order no robot starts to move.
 
     Attributes:
-        stop_notes: A line for each robot on what it does when it is stopped, while steps run in which robots move
-            automatically; empty otherwise.
+        stop_notes: While steps run in which robots move automatically, a line for each robot about what it does when
+            it is stopped; empty at other times.
         is_ordered: Whether the order was given; it cannot be withdrawn.
     """
 
@@ -65,7 +65,7 @@ class Motions:
         """
         self._movers.append(
             mover
-        )  # before `is_ordered` is read; `order_stop` sets `is_ordered` before it reads the list
+        )  # added before `is_ordered` is read, because `order_stop` sets `is_ordered` before it reads the list
         try:
             if self.is_ordered:
                 raise KeyboardInterrupt

@@ -69,8 +69,8 @@ def listener_failed(code: int | None, log: str | None) -> bool:
     """Return True if a listener was terminated by a signal (see `sender_was_killed`) or could not write.
 
     On a full disk (tested manually) the traditional one exits with code 1 without a message, busybox and ncat write
-    a message, and OpenBSD's exits as after a complete transfer. After an idle time (`-w`, `-i`) a listener writes a
-    message and exits with code 1, or 2 for ncat.
+    a message, and the OpenBSD one exits as after a complete transfer. After an idle time (`-w`, `-i`) a listener
+    writes a message and exits with code 1, or 2 for ncat.
     """
     return code in {1, 2} and log is not None and (not log.strip() or "write" in log)
 

@@ -9,7 +9,8 @@ from fieldkit.steps.scene import CommandResult, Need, Scene
 DAEMONS: Final = ("babeld", "bird", "olsrd", "olsrd2", "bmx7", "batmand")
 """Routing daemons for ad-hoc networks in Debian and OpenWrt, by process name."""
 
-# Two others are not processes: batman-adv is a kernel module, and the driver forwards in 802.11s.
+# Two other routing protocols have no process: batman-adv is a kernel module, and in 802.11s the driver forwards
+# packets.
 _SEARCH: Final = """
 for file in /proc/[0-9]*/comm; do
     { read -r name <"$file"; } 2>/dev/null || continue

@@ -97,7 +97,7 @@ class Scene:
         return self.cast[role]
 
     def tools(self, role: Role) -> Variants:
-        """Return the detected tools of the robot in `role`, or those expected from its profile."""
+        """Return the detected tools of the robot in `role`, or the tools that are expected from its profile."""
         return self.variants.get(role) or variants.expected(self.cast[role].profile)
 
     @property
@@ -203,8 +203,8 @@ class Need:
         argv: Command that changes nothing on the robot.
         judge: Converts the result to a verdict, a detail, and a remedy, which is empty if the need is met.
         required_program: Program without which the check is skipped; empty if the check depends on no program.
-        missing_program: Program that is missing if this need is not met, so its absence is not reported as well;
-            empty if there is none.
+        missing_program: Program whose absence is the cause if this need is not met. Its absence is then not reported
+            separately. Empty if there is no such program.
         agent: Whether the command runs the agent, which is then installed first.
     """
 
@@ -241,7 +241,7 @@ class Flow:
         destination: Role of the receiver.
         port: Listening port of one of them; None if the packets have no ports.
         frames: Approximate number of Ethernet frames including answers, from `frames`.
-        protocol: Transport protocol; None for the one under test.
+        protocol: Transport protocol; None for the protocol under test.
         group: A multicast group to which either of them also sends; None without multicast.
         served: Whether a program that the step does not start listens on the source.
     """
@@ -263,8 +263,8 @@ class ListeningPort:
         role: Role of the listening robot.
         port: The port.
         peer: Role of the robot that connects or sends to it.
-        source: Role of the one of the two that sends the data, if the step identifies its connections by the ports of
-            both ends; None if it identifies them by this port alone.
+        source: Role of the robot (one of these two) that sends the data, if the step identifies its connections by
+            the ports of both ends; None if it identifies them by this port alone.
         by: Key of the step that changes the port.
         shared: Whether several programs can listen on the port at the same time.
     """

@@ -109,7 +109,7 @@ def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tup
     index_by_id = {int(ip_id): index for index, ip_id in enumerate(first.ip_id)}
     fragments = received.where(np.isin(received.ip_id, first.ip_id))
     both = (fragments, sent.where(np.isin(sent.ip_id, first.ip_id)))
-    # A later fragment of another flow with the same id cannot be distinguished from one of the transfer.
+    # A later fragment of another flow with the same id cannot be distinguished from a fragment of the transfer.
     is_ambiguous = np.concatenate([(packets.fragment_offset == 0) & (packets.dport != port) for packets in both])
     if is_ambiguous.any():
         return None

@@ -28,7 +28,7 @@ class Clock:
         first_ns: Earliest possible time of the clock at these readings.
         last_ns: Latest possible time.
         lowest_ns: Lower bound of the clock minus the time since boot.
-        highest_ns: Upper bound; it is below `lowest_ns` if the clock was set between two readings.
+        highest_ns: Upper bound of this difference; it is below `lowest_ns` if the clock was set between two readings.
     """
 
     first_ns: int

@@ -19,7 +19,7 @@ def quantile_of_sent(arrived_s: Sequence[float] | NDArray[np.float64], sent: int
         share: The quantile, 0 to 1.
 
     Returns:
-        The quantile in seconds; None if it is infinite because too many packets were lost, or if none was sent.
+        The quantile in seconds; None if it is infinite because too many packets were lost, or if no packet was sent.
     """
     total = max(sent, len(arrived_s))
     position = share * (total - 1)

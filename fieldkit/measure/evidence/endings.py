@@ -17,7 +17,7 @@ _TICKS_PER_S: Final = 100
 """Unit of field 22 of /proc/PID/stat (USER_HZ), on every processor except Alpha and Itanium."""
 
 _KILLED: Final = 128
-"""A shell's exit code for a command that was killed by a signal is this plus the signal number."""
+"""A shell's exit code for a command that was killed by a signal is this number plus the signal number."""
 
 _TOLERANCE_S: Final = 0.1
 """Tolerance of a job's duration, for the resolution of both times (10 ms) and the start of its program."""

@@ -57,7 +57,7 @@ sections that the host supports.
 
 @dataclass(frozen=True)
 class Counters:
-    """Counters of /proc/net/snmp (RFC 1213 names; Linux adds RcvbufErrors); None if the file does not contain one.
+    """Counters of /proc/net/snmp (names of RFC 1213; Linux adds RcvbufErrors); a missing counter is None.
 
     Attributes:
         udp_buffer_errors: Datagrams dropped because of a full receive buffer, `Udp: RcvbufErrors`.
@@ -126,7 +126,7 @@ def state(path: Path) -> HostState:
 def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
     """Yield the names of sections that are in only one of the two states of an attempt.
 
-    A section that the host does not support is in neither. Files of versions without the boot ID have no jobs.
+    A section that the host does not support is in neither state. Files of versions without the boot ID have no jobs.
     """
     for name in _REQUIRED_SECTIONS:
         if name in before.sections ^ after.sections:

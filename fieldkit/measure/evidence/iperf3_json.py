@@ -28,7 +28,7 @@ def number(document: Mapping[str, Any], key: str) -> float | None:
 
 
 def count(document: Mapping[str, Any], key: str) -> int | None:
-    """Return the number under a key as an integer; None under the conditions of `number`."""
+    """Return the number under a key as an integer; None if `number` returns None."""
     value = number(document, key)
     return None if value is None else int(value)
 

@@ -211,7 +211,7 @@ def busy_share(samples: Sequence[LinkSample]) -> float | None:
 
 
 def _increment(counts: Iterable[int | None]) -> int | None:
-    """Return the increment of a counter, which restarts from 0 if it decreases; None if not reported twice."""
+    """Return the increment of a counter; if it decreases, it has restarted from 0. None if not reported twice."""
     present = [count for count in counts if count is not None]
     if len(present) < 2:
         return None
@@ -221,7 +221,7 @@ def _increment(counts: Iterable[int | None]) -> int | None:
 def _roams(samples: Sequence[LinkSample]) -> int | None:
     if not any(sample.cell for sample in samples):
         return None
-    # A station dump lists the access point too, and may be the only sample of an association.
+    # A station dump also lists the access point, and may be the only sample of an association.
     names = [{station.station for station in sample.stations if station.station} for sample in samples]
     cells = [
         sample.cell or ("".join(peers) if len(peers) == 1 else "")

@@ -30,7 +30,7 @@ _ROW: Final = re.compile(
 
 
 def robot_file(role: Role) -> str:
-    """Return the name of the file that a robot's sampler writes, without the suffix `.gz` of a compressed one."""
+    """Return the name of the file that a robot's sampler writes, without the suffix `.gz` of a compressed file."""
     return f"{role}-link.txt"
 
 

@@ -87,7 +87,7 @@ OPEN_GAP_COLUMNS: Final = columns(
 _SEQUENCE_NUMBERS: Final = 1 << 16
 """Number of ICMP sequence numbers."""
 _MAX_LATE_NUMBERS: Final = 1 << 10
-"""An answer whose number is below the previous one by less than this is late; otherwise the numbers have wrapped."""
+"""An answer is late if its number is below the previous one by less than this; otherwise the numbers have wrapped."""
 
 MIN_OPEN_GAP_S: Final = 1.0
 """A gap at the start or end of a ping is ignored if it is shorter than this and than the longest other gap."""
@@ -205,7 +205,7 @@ class Ping:
 
     @property
     def gaps(self) -> tuple[int, ...]:
-        """Sequence numbers without an answer, from the first request to the last known one."""
+        """Sequence numbers without an answer, from the first request to the last known request."""
         answered = {reply.seq for reply in self.answers}
         seen = answered | {problem.seq for problem in self.problems}
         end = max(seen, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
@@ -255,7 +255,7 @@ class AnswerGap:
 
     Attributes:
         lasted_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
-        lost: Number of requests without an answer in it.
+        lost: Number of unanswered requests in the gap.
         is_open: Whether ping started or ended in the gap, so that both numbers are lower bounds.
     """
 

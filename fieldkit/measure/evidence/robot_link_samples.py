@@ -103,7 +103,7 @@ def parse_wireless(line: str) -> tuple[float | None, float | None]:
 
 
 def _lines(text: str) -> dict[str, str]:
-    """Return the values of lines `NAME: VALUE` by name, the first of each name; later ones are of single antennas."""
+    """Return the first value of each name in lines `NAME: VALUE`; later values are of single antennas."""
     lines: dict[str, str] = {}
     for name, value in _LINE.findall(text):
         lines.setdefault(name, value)

@@ -149,7 +149,7 @@ def serve(answer: Callable[[Json], Json]) -> None:
         except Exception as error:  # noqa: BLE001 (the file may cause any exception)
             has_memory = not isinstance(error, MemoryError)
             reply = {_ERROR_KEY: _error_text(error)}
-        _remove(tempfile.tempdir)  # the parent process may have been killed
+        _remove(tempfile.tempdir)  # done here, because the parent process may have been killed
         sys.stdout.write(json.dumps(reply) + "\n")
         sys.stdout.flush()
 
@@ -158,7 +158,7 @@ def serve(answer: Callable[[Json], Json]) -> None:
 def _temporary_folder() -> Iterator[str | None]:
     """Create a folder for unpacked files, and remove it even if the reader is killed.
 
-    The folder is None if no disk has space for it, because few files need it.
+    The folder is None if no disk has space for it. This is not an error, because few files need the folder.
     """
     folder = None
     with suppress(OSError):
@@ -183,7 +183,7 @@ def _limits(size_bytes: int) -> tuple[int, int, int]:
 
 
 def _apply_limits(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
-    """Limit the resources that this process may use in addition to those that it already uses."""
+    """Limit the resources that this process may use in addition to its present use."""
     used_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     used = resource.getrusage(resource.RUSAGE_SELF)
     limits = {

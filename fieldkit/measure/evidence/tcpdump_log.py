@@ -64,7 +64,7 @@ def read(path: Path) -> CaptureLog:
 
 
 def parse(text: str) -> CaptureLog:
-    """Return the counters in the text of a log; all are None if there are none."""
+    """Return the counters in the text of a log; they are None if the text contains no counters."""
     counts = {match["what"]: int(match["count"]) for match in _COUNT.finditer(text)}
     captured = counts.get("captured")
     return CaptureLog(

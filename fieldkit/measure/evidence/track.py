@@ -155,9 +155,9 @@ def measure(
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
-    """Return the columns of distance and speeds of two robots between the first and the last of some times.
+    """Return the columns of distance and speeds of two robots between the first and the last of the given times.
 
-    The times are of a robot's clock, which is the laptop's clock on testbeds that record positions.
+    The times are by a robot's clock, which is the laptop's clock on testbeds that record positions.
 
     Args:
         track: Positions of the robots; None if they are unknown.

@@ -142,7 +142,7 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     if (position_source := sources.robots.get(role)) is None:
         raise EvidenceError(f"no source has the position of the {role}")
     if position_source.place is not None:
-        place = np.array([position_source.place], dtype=float)  # NaN for None
+        place = np.array([position_source.place], dtype=float)  # converts None to NaN
         return Samples(np.zeros(1, dtype=np.int64), place, position_source.frame)
     if position_source.topic:
         recorded_samples = evidence.read(position_files.read_topic, position_source.file, position_source)

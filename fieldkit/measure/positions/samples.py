@@ -144,7 +144,7 @@ class _Columns:
             value = float(row[index]) * factor
         except ValueError:
             value = math.nan
-        if not abs(value) <= bound:  # True for NaN as well
+        if not abs(value) <= bound:  # also True for NaN
             raise EvidenceError(
                 f"{row[index][:40]!r} is not a valid coordinate", where=where, remedy="correct or delete the line"
             )

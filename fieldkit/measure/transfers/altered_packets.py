@@ -4,8 +4,8 @@ A router that translates addresses or ports (NAT), changes ids or sequence numbe
 alters them: they match no packet in the sender's capture and would count as lost. With complete captures, the
 receiver has no packet of the transfer that is not in the sender's capture.
 
-A router recomputes the checksum of the IPv4 header. A wrong one shows that the header changed on a link or in the
-file: the packet belongs to no flow any more, so it would count as lost, or as never sent. Packets of other flows,
+A router recomputes the checksum of the IPv4 header. A wrong checksum shows that the header changed on a link or in
+the file: the packet belongs to no flow any more, so it would count as lost, or as never sent. Packets of other flows,
 which tcpdump captures before its filter is attached, have correct checksums.
 """
 

@@ -1,8 +1,8 @@
 """Estimate of the offset between the receiver's and the sender's clock, from packets in both captures.
 
 No packet arrives before it was sent. The offset is therefore at most the apparent delay of any packet to the
-receiver, and at least the negative apparent delay of any packet from it. With constant drift the offset is a straight
-line over time, and every line below all upper bounds and above all lower bounds is possible (Duda et al.,
+receiver, and at least the negative apparent delay of any packet from the receiver. With constant drift the offset is
+a straight line over time, and every line below all upper bounds and above all lower bounds is possible (Duda et al.,
 "Estimating global time in distributed systems", ICDCS 1987; the convex hulls are as in Moon, Skelly and Towsley,
 "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). The captures contain no more
 information: the division of a round trip into its two directions is unobservable (Paxson, "On calibrating
@@ -59,7 +59,7 @@ class Clocks:
     """Offset of the receiver's clock from the sender's over time: the best line, and the range of possible lines.
 
     Offsets are relative to `base_ns`, which keeps precision if clocks are decades apart. Times are seconds from
-    `middle_ns`. If a direction has a single packet, no other one confirms its time, and the error is infinite.
+    `middle_ns`. If a direction has a single packet, no other packet confirms its time, and the error is infinite.
 
     Attributes:
         middle_ns: Middle of the packets' times by the receiver's clock.
@@ -68,7 +68,7 @@ class Clocks:
         skew: Best estimate of the skew: relative rate of the receiver's clock minus 1, in seconds per second.
         skews: Skews at the corners of the polygons of possible lines, ascending. Shape (k,).
         lowest_s: Lowest offset at `middle_ns` for each of these skews in its polygon. Shape (k,).
-        highest_s: Highest offset in it. Shape (k,).
+        highest_s: Highest offset at `middle_ns` for each of these skews in its polygon. Shape (k,).
     """
 
     middle_ns: int
@@ -89,7 +89,7 @@ class Clocks:
         return self.offset_s + self.skew * self._elapsed_s(receiver_ns)
 
     def delays_s(self, sender_ns: Ints, receiver_ns: Ints) -> Floats:
-        """Return the one-way delays of packets from sender to receiver; each time is by the end's own clock."""
+        """Return the one-way delays of packets from sender to receiver; each time is by the clock of its robot."""
         return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.offset_at_s(receiver_ns)
 
     def error_s(self, receiver_ns: Ints) -> float:
@@ -171,7 +171,7 @@ def _range_without_fastest(
 
 
 def _polygon(ceiling: "_Hull", floor: "_Hull") -> Floats | None:
-    """Return the lines between two hulls: skews, lowest and highest offsets of the corners; None without a line."""
+    """Return the lines between two hulls: skews, lowest and highest offsets of the corners; None if there is none."""
     slopes = np.concatenate(((-MAX_SKEW, MAX_SKEW), ceiling.slopes(), -floor.slopes()))
     skews = np.unique(np.clip(slopes, -MAX_SKEW, MAX_SKEW))
     lowest_s, highest_s = _range(ceiling, floor, skews)

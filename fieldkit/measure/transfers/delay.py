@@ -123,7 +123,7 @@ def tcp_copies(frames: tcp.TcpFrames) -> tuple[Ints, Ints]:
 
 
 def tcp_sent(frames: tcp.TcpFrames) -> int:
-    """Return the number of frames with payload that were sent, including those that did not arrive."""
+    """Return the number of frames with payload that were sent, including frames that did not arrive."""
     return int(_is_last_piece(frames.payload.sent).sum())
 
 
@@ -179,7 +179,7 @@ def packet_delays(
 ) -> tuple[Floats, float] | None:
     """Return the one-way delay of each packet, and the maximum error from the clocks, in seconds.
 
-    None if the clock offset cannot be estimated, or its error is unlimited.
+    Return None if the clock offset cannot be estimated, or if its error is unlimited.
 
     Args:
         pairs: The transfer's packets as for `measure`; all must have times.
@@ -198,7 +198,7 @@ def packet_delays(
 def clocks_between(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> Clocks | None:
     """Return the offset between two robots' clocks, estimated from all packets between them, of any protocol.
 
-    None if a capture lacks times, there are no packets in one direction, or a clock was set.
+    Return None if a capture lacks times, if there are no packets in one direction, or if a clock was set.
 
     Args:
         sender: Packets of the sender's capture.
@@ -300,7 +300,7 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
 
 
 def _other_pairs(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
-    """Return the other packets from sender to receiver: those without payload, and ping's."""
+    """Return the other packets from sender to receiver: packets without payload, and packets of ping."""
     ends = transfer.sender_address, transfer.receiver_address
     return _matched_pairs(
         *(
@@ -323,7 +323,7 @@ def _is_between(packets: Packets, source: str, destination: str) -> Mask:
 
 
 def _may_be_transfer(packets: Packets, transfer: Transfer) -> Mask:
-    """Return a mask of the packets that may be the transfer's; a later UDP fragment has no port."""
+    """Return a mask of the packets that may belong to the transfer; a later UDP fragment has no port."""
     mask: Mask = (
         packets.protocol == UDP
         if transfer.protocol is Protocol.UDP

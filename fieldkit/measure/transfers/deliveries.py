@@ -2,7 +2,7 @@
 
 TCP delivers bytes in order, each once (RFC 9293, section 3.10.7.4): a frame is a delivery if it extends the
 contiguous received bytes. UDP delivers complete datagrams. A retransmitted copy, a duplicate, a fragment and a
-segment after a gap deliver nothing alone, so segmentation offload changes no time by more than one frame.
+segment after a gap deliver nothing by themselves, so segmentation offload changes no time by more than one frame.
 
 All times are by the clock of the receiver's capture. The sender's times are converted with the fastest packet of the
 flow that is in both captures, so that a converted time is the earliest possible arrival.

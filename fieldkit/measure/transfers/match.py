@@ -3,7 +3,7 @@
 Headers can be equal in several packets: 16-bit IP ids repeat in a long transfer, or are always 0 in packets that are
 never fragmented (RFC 6864, section 4), and a retransmission repeats its sequence numbers. Such packets are
 distinguished by their content or by TCP time stamps, otherwise by time if they were sent far enough apart. The
-remaining ones are ambiguous.
+remaining packets are ambiguous.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,9 @@ Linux's TCP also considers a packet lost after this delay (minimum retransmissio
 """
 
 _CLEAR_FACTOR: Final = 4
-"""An arrival is clearly nearest to a packet if the next nearest packet is at least this many times as far away."""
+"""An arrival is clearly nearest to a sent packet if the time between the two, multiplied by this factor, is at most
+the time between this sent packet and the nearest other one.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +186,8 @@ def reordered(sent_index: Ints) -> Mask:
 def usable_stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
     """Return the TCP time stamps of packets sent and received; `NO_STAMP` for connections where some are missing.
 
-    If time stamps were negotiated, every frame except a reset has one (RFC 7323, section 3.2). They cannot be used if
-    a middlebox removed some, or a capture truncated them.
+    If time stamps were negotiated, every frame except a reset has one (RFC 7323, section 3.2). Time stamps cannot be
+    used if a middlebox removed some of them, or if a capture truncated them.
     """
     lacking = [
         (packets.protocol == TCP) & (packets.tcp_stamp == NO_STAMP) & (packets.tcp_flags & RST == 0)
@@ -280,8 +282,8 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     If the items of a group were sent at least `MIN_SPACING_NS` apart, and each received item is clearly nearest in
     time to one of them, it is assigned to that one, and the group is clear. In all other groups, each received item
     is assigned to the nearest in time, subject to two conditions: the order is kept, and each item of the smaller
-    side, sent or received, is assigned. A group has no copies if each received item is clearly nearest to another
-    sent item, even if these were sent close together.
+    side, sent or received, is assigned. A group has no copies if each received item is clearly nearest to a different
+    sent item, even if the sent items are close together in time.
 
     Args:
         group: Group of each sent item, ascending.
@@ -315,7 +317,8 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
 
     order = np.arange(len(received_group)) - (np.cumsum(received_count) - received_count)[received_group]
     surplus = (sent_count - received_count)[received_group]
-    # If fewer items were received, some of those sent are skipped; if more, some of those sent have several copies.
+    # If fewer items were received than sent, some sent items are skipped. If more were received, some sent items have
+    # several copies.
     sign = np.where(surplus < 0, -1, 1)
     skipped = np.clip(sign * (nearest - order), 0, np.abs(surplus))
     group_base = received_group * (len(group) + len(received_group))
@@ -325,7 +328,7 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
 
 
 def _spacing_ns(group: Ints, time_ns: Ints) -> Ints:
-    """Return the time from each sent item to the nearest one of its group; input ordered by group, then time."""
+    """Return the time from each sent item to the nearest other one of its group; input ordered by group and time."""
     steps_ns = np.where(np.diff(group) == 0, np.diff(time_ns), np.iinfo(np.int64).max)
     edge = np.iinfo(np.int64).max
     spacing_ns: Ints = np.minimum(np.append(edge, steps_ns), np.append(steps_ns, edge))

@@ -3,8 +3,8 @@
 Payload is overdue from the previous delivery on; in a flow with a fixed rate, from one sending interval after it on.
 Time in which the sender had nothing to send is therefore not part of a stall. Overdue time longer than
 `Delivery.min_stall_s` is a stall. Time before the first payload, during which a connection is established, and time
-after the last payload, while more was due, are included only if they are longer than that. A stall after the last
-payload is right-censored: it had not ended when the flow ended.
+after the last payload, while more was due, are included only if they are also longer than this. A stall after the
+last payload is right-censored: it had not ended when the flow ended.
 """
 
 from collections.abc import Callable, Sequence

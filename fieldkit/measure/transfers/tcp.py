@@ -1,7 +1,7 @@
 """Loss of a TCP transfer, counted by sequence ranges.
 
-A byte is identified by its sequence number (RFC 9293, section 3.4), so segmentation offload, which joins segments
-into larger frames, reordering, duplicates, retransmissions and partial overlaps do not change the counts.
+A byte is identified by its sequence number (RFC 9293, section 3.4), so the counts are not changed by reordering,
+duplicates, retransmissions, partial overlaps, or segmentation offload, which joins segments into larger frames.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class TcpCounts:
     """Counts of frames and bytes that left the sender and that reached the receiver's interface.
 
     Attributes:
-        frames_sent: Frames captured at the sender, including those without payload.
+        frames_sent: Frames captured at the sender, including frames without payload.
         frames_received: Frames captured at the receiver; offload may change the number.
         sent_bytes: Payload bytes sent, including retransmissions.
         unique_bytes: Payload bytes sent, each sequence number once.

@@ -103,7 +103,7 @@ class ByteIntervals:
 
     @property
     def size_bytes(self) -> int:
-        """Number of bytes that they cover, each counted once."""
+        """Number of bytes that the intervals cover, each counted once."""
         if not len(self.starts):
             return 0
         order = np.argsort(self.starts)

@@ -29,7 +29,7 @@ PAPER_WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.T
 """Ping payload that the paper uses as the window of each protocol."""
 
 PAPER_COUNTS: Final = ("paper_packets", "paper_received", "paper_loss", "paper_transfer_s")
-"""Columns that depend on the counts of these filters, which may include packets of other transfers."""
+"""Columns that depend on the counts of the paper's filters, which may include packets of other transfers."""
 
 
 def paper_frames_from(packets: Packets, address: str, port: int) -> int:

@@ -16,8 +16,8 @@ NO_DATAGRAM: Final = -1
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:
     """Return the index of each datagram's first packet, and the datagram of each packet.
 
-    A later fragment belongs to the latest first fragment with the same addresses and id, or to the next one if there
-    is none before it. Its datagram is `NO_DATAGRAM` if there is none at all.
+    A later fragment belongs to the latest first fragment with the same addresses and id, or to the next first
+    fragment if there is none before it. Its datagram is `NO_DATAGRAM` if there is neither.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
     # An unfragmented packet has no other fragments, even if another packet has the same id.

@@ -29,7 +29,7 @@ _MAX_LETTERS: Final = 31
 
 
 def _can_be_chosen(word: str) -> str:
-    """Return a word that can be a choice: neither a number, a position in the list, nor an answer for *unknown*."""
+    """Return a word after a check: a choice is not a number, a position in the list, or an answer for *unknown*."""
     fits = 0 < len(word) <= _MAX_LETTERS and word.isprintable() and word == word.strip()
     if not fits or word.isdigit() or word in {UNKNOWN, *MISSING}:
         raise schema.validation_error(
@@ -56,7 +56,7 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         least: Smallest possible number.
         most: Largest possible number.
         usual: Default answer. It is used if the operator only presses Enter, and if no operator is asked.
-        each: `trial`: asked once, before the first repeat that contains the step; `repeat`: asked in each.
+        each: `trial`: asked once, before the first repeat that contains the step; `repeat`: asked in each repeat.
     """
 
     column: StepName

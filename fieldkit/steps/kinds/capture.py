@@ -48,7 +48,7 @@ _RECORD_BYTES: Final = 16
 # 0.5 s and all after 1.0 s.
 RING_S: Final = 2
 
-# Text of tcpdump's last line; after it the kernel needs 15 to 31 ms to close the socket.
+# Text of tcpdump's last line. After this line the kernel needs 15 to 31 ms to close the socket.
 LAST_LINE: Final = "dropped by kernel"
 
 BACK_S: Final = 0.1
@@ -125,7 +125,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
                 *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", self._file(role)),
                 self._filter(scene),
             ),
-            # Longer than the captured jobs, because a capture that was stopped at its limit looks complete.
+            # The limit exceeds the captured jobs, because a capture that was stopped at its limit looks complete.
             limit_s=LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log(role),
             ready="log:listening on",
@@ -213,7 +213,7 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
             for step in others:
                 step.run(scene, testbed, announce)
         except FieldkitError:
-            # The captures are kept with the failed attempt; its reason is the first error.
+            # The captures are kept with the failed attempt. The first error is the reason of the failure.
             with suppress(FieldkitError):
                 self._stop(scene, testbed, captures)
             raise

@@ -37,8 +37,9 @@ COLUMNS: Final = columns(
 """Columns of trials with a step that records positions."""
 
 MakeSources = Callable[[int, Mapping[Role, Offset]], PositionSources]
-"""Returns the sources of positions. Receives the start of the steps inside, in nanoseconds since 1970 UTC of the
-laptop's clock, and the offsets of the robots' clocks from it."""
+"""Returns the sources of positions. The arguments are the start of the steps inside, in nanoseconds since 1970 UTC by
+the laptop's clock, and the offsets of the robots' clocks from this clock.
+"""
 
 
 def run_while_recording(
@@ -84,7 +85,7 @@ def run_while_recording(
         run_parallel(query_clock, list(exchanges))
         run_parallel(wait, recordings)
     except FieldkitError:
-        # The recordings are kept with the failed attempt; its reason is the first error.
+        # The recordings are kept with the failed attempt. The first error is the reason of the failure.
         with suppress(FieldkitError):
             _stop(testbed, recordings)
         raise

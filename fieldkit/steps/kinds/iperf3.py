@@ -175,7 +175,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     @override
     def listens(self) -> tuple[ListeningPort, ...]:
-        """Return the port of the server; the reports contain the ports of both ends, so the source is given."""
+        """Return the port of the server. Its source is given, because the reports contain the ports of both ends."""
         return (ListeningPort(self.receiver, self.port, self.sender, self.source),)
 
     @override

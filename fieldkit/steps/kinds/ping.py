@@ -146,7 +146,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         shell = testbed.shells[self.sender]
         with shell.silence(planned.job.limit_s):
             code = jobs.run(shell, planned.job)
-        if code not in {0, 1}:  # 1: replies are missing, which is a measurement
+        if code not in {0, 1}:  # exit code 1: replies are missing, which is a valid result
             raise scene.failure(planned, f"ping ended with exit code {code}")
 
     @override
@@ -296,7 +296,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
 
 def _has_payload(packets: Packets, payload_bytes: int | None) -> Mask:
-    """Return a mask of the packets that can be echoes with this payload: unfragmented ones and first fragments."""
+    """Return a mask of the packets that can be echoes with this payload: unfragmented packets and first fragments."""
     if payload_bytes is None:
         return np.ones(len(packets), dtype=np.bool_)
     size = payload_bytes + _HEADER_BYTES

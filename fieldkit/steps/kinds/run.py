@@ -25,7 +25,7 @@ from fieldkit.steps.scene import Announce, Planned, PutProgram, Scene
 from fieldkit.steps.view import View
 
 _SHELL_OPERATORS: Final = frozenset({"|", "||", "&", "&&", ";", "<", ">", ">>", "2>", "2>&1", "&>"})
-"""Words that are almost certainly mistakes in `command`; as real arguments they can be written in `argv`."""
+"""Words that are almost certainly mistakes in `command`; if they are intended, they can be written in `argv`."""
 
 _Word = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 
@@ -49,8 +49,8 @@ class PrintedColumn(Strict):
         name: Name of the column.
         unit: Any unit, `V`, `dBm`, `%`; `text`, `bool` or `count` for values without one.
         meaning: Meaning of the values, for `fieldkit columns`.
-        path: Where the value is in JSON output, `battery.cells[0].mV`: a [JMESPath](https://jmespath.org). If a key
-            occurs twice, the last one is used.
+        path: Location of the value in JSON output, `battery.cells[0].mV`: a [JMESPath](https://jmespath.org). If a
+            key occurs twice, the last one is used.
         expression: In place of `json`, a regular expression ([RE2](https://github.com/google/re2/wiki/Syntax)) with
             one group; its first match is the value. `^` and `$` match at ends of a line.
         optional: Whether the value may be missing in a valid repeat.

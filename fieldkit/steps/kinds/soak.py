@@ -95,7 +95,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
         except FieldkitError:
-            # The reason is the first error; a job that was never started cannot be stopped.
+            # The first error is the reason of the failure; a job that was never started cannot be stopped.
             for planned in (client, server):
                 with suppress(FieldkitError):
                     jobs.stop(testbed.shells[planned.role], planned.job)

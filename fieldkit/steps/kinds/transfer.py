@@ -238,7 +238,8 @@ class TransferStep(
             waited_s = time.monotonic() - started_s
             if scene.protocol is Protocol.UDP and waited_s >= self.idle:
                 raise self._late_start(waited_s, f"the listener exits after {self.idle:g} s of silence", scene)
-            # Longer than the robot needs to stop the listener at its limit, so that it ends before the step.
+            # This time exceeds the time in which the robot stops the listener at its limit, so the listener ends
+            # before the step.
             code = listening.end(self.limit + 2 * jobs.REPLY_S)
         if scene.protocol is Protocol.TCP and code != 0 and waited_s > MAX_LATE_SHARE * self.limit:
             raise self._late_start(waited_s, f"the listener was stopped after {self.limit:g} s", scene)
