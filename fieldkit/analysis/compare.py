@@ -84,7 +84,7 @@ class Pair:
 
     @property
     def words(self) -> tuple[tuple[Tally, Tally], ...]:
-        """Word counts of A and B for each column of words that either cell has; no counts for a cell without words."""
+        """Word counts of A and B for each column of words that either cell has; empty for a cell without words."""
         a, b = (cell.tallies if cell else {} for cell in (self.a, self.b))
         empty = {name: replace(tally, counts={}) for name, tally in (*a.items(), *b.items())}
         return tuple((a.get(name, tally), b.get(name, tally)) for name, tally in empty.items())
