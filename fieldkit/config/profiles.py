@@ -267,7 +267,7 @@ class Limits(Strict):
             drone.
         fence_m: Maximum horizontal distance from the robot's start, in metres; required by steps that fly or drive
             it.
-        battery_min: Approximate running time on one charge, in minutes; a longer trial prints a warning.
+        battery_min: Approximate running time on one charge, in minutes; a note is shown for a longer trial.
     """
 
     max_speed_m_s: Number | Int

@@ -97,7 +97,7 @@ class AttemptEvidence:
         return self.read_or_none(robot_link_samples.read, "", role) or ()
 
     def counters(self, role: Role) -> Counters:
-        """Return the increments of a robot's kernel counters during the attempt; an unknown one is None."""
+        """Return the increments of a robot's kernel counters during the attempt; an unknown increment is None."""
         before, after = (self.read_or_none(host.read, file(role)) for file in (host.before_file, host.after_file))
         return host.difference(before or Counters(None, None), after or Counters(None, None))
 

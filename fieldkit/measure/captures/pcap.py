@@ -56,7 +56,7 @@ class Capture:
 
     Attributes:
         packets: IP packets.
-        frames: Number of frames, including those without a decodable IP packet: too short, encrypted, or of an
+        frames: Number of frames, including frames without a decodable IP packet: too short, encrypted, or of an
             unknown link type.
         damage: Position and kind of damage after `packets`, or None if the file is undamaged.
     """
