@@ -191,7 +191,7 @@ class CampaignRun:
         self._includes_failed = False
 
     def _remaining_trials(self) -> tuple[PlannedTrial, ...]:
-        """Return the trials that have not ended; before `_restart_failed` also failed ones to repeat."""
+        """Return the trials that have not ended. Before `_restart_failed`, this includes ended trials to repeat."""
         ended = {
             name for name, entry in self._journal.ended().items() if not (self._includes_failed and entry.failed)
         }

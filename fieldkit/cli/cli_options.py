@@ -73,7 +73,7 @@ def _open_answers(path: str) -> TextIO:
 
 
 def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
-    """Run this command line where the backend must run it; return its exit code, or None to run it here.
+    """Run this command line in the environment that the backend requires; None if that is this process.
 
     Args:
         chosen: The backend.

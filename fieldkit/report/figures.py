@@ -47,7 +47,7 @@ _EDGE: Final = 0.15
 """Share of the world next to its edges in which labels are aligned inwards."""
 
 _MAX_LABELLED: Final = 15
-"""Maximum number of links that are labelled with their SNR: those of six robots."""
+"""Maximum number of links that are labelled with their SNR: the number of pairs of six robots."""
 _MIN_LABELLED: Final = 0.1
 """Minimum length of a labelled link, as a share of the drawing's width."""
 

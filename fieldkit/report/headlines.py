@@ -155,7 +155,7 @@ class _HeadlineWriter:
     differing: Collection[str]
 
     def repeats(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
-        """Return the number of valid repeats, and the conditions of the others, the worst first."""
+        """Return the number of valid repeats, and the conditions of the other repeats, the worst first."""
         silent = coverage.everything_lost(self.evidence.repeats)
         counted = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
         planned, valid = (sum(getattr(counts, name) for _, counts in counted) for name in ("planned", "valid"))
@@ -281,6 +281,6 @@ def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
-    """Return the quantity called `name`, or those of named steps if no other step measures it."""
+    """Return the quantity called `name`, or the quantities of named steps if no other step measures it."""
     matching = with_plain_name(quantities, name)
     return matching[:1] if matching and not matching[0].step else matching

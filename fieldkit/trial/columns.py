@@ -48,7 +48,7 @@ OTHERS: Final = Column("others", "text", "Robots in further roles of the procedu
 """The column is present only if a procedure has such roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS, *oracle_delays.WINDOW_COLUMNS)
-"""Columns that are measured with any steps."""
+"""Columns that are measured in every trial, whatever its steps are."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
 """Kinds of step whose columns are in every trial, in addition to `outage_columns.COLUMNS` of faults.

@@ -59,7 +59,7 @@ def of_trial(plan: Plan, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
 
 
 def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
-    """Yield a sentence for each robot whose battery does not last for trials in sequence, by its profile."""
+    """Yield a sentence for each robot whose battery is, by its profile, too small for a series of trials."""
     duration = total(of_trial(plan, []) for plan in plans)
     for robot in plans[0].cast.values():
         battery_min = robot.profile.limits.battery_min

@@ -189,7 +189,7 @@ def ended(entries: list[JournalEntry]) -> list[Attempt]:
 
 
 def interrupted(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that started and did not end, `running` or `measured`, because fieldkit was killed."""
+    """Return the attempts with status `running` or `measured`, which did not end because fieldkit was killed."""
     ended_attempts = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
     started = {
         (entry.repeat, entry.attempt): entry.utc_ns

@@ -50,7 +50,7 @@ class Manifest:
         return attempt in self._lines
 
     def unchanged_lines(self, name: str) -> int | None:
-        """Return the number of lines that a top-level file had at its checksum; None if they have changed.
+        """Return the number of lines that the checksum of a top-level file covers; None if these lines have changed.
 
         An append-only file may have more lines now. The result is 0 for a file without a checksum.
         """

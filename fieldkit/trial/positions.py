@@ -21,7 +21,7 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import Rebuilt, rebuild
 
 MAX_BYTES: Final = 64 << 20
-"""One day at 10 Hz as GPX."""
+"""Maximum size of a position file: one day at 10 Hz as GPX."""
 
 
 @dataclass(frozen=True)

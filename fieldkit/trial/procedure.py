@@ -51,7 +51,7 @@ Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 
 
 class Place(PathLeg):
-    """Place of a robot in a role that the procedure defines; its directions are those of a leg of a path.
+    """Place of a robot in a role that the procedure defines; directions are given as in a leg of a path.
 
     Attributes:
         near: The robot under test that the position is relative to: `sender`, `receiver` or `relay`. At least one of

@@ -1,4 +1,4 @@
-"""Rebuild a trial's tables from plan, journal and raw evidence alone: the same bytes, without a robot."""
+"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot. The bytes are the same."""
 
 from dataclasses import dataclass
 from pathlib import Path

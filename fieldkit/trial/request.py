@@ -1,4 +1,4 @@
-"""The operator's request for a trial, and the plan that is made of it."""
+"""The operator's request for a trial, and the plan that is made from it."""
 
 import platform
 from collections.abc import Mapping
@@ -69,7 +69,7 @@ def make_plan(
         now: Start of the trial; it becomes part of its name.
         session: The run of fieldkit that the trial belongs to; None if it contains only this trial.
         lab_bytes: Maximum number of bytes that the lab itself adds to an attempt (`Backend.lab_bytes`).
-        simulators: Those of the backend (`simulators_of`).
+        simulators: Simulators of the backend (`simulators_of`).
 
     Raises:
         ConfigurationError: No robot has a role that the procedure or the topology needs, or the procedure needs a

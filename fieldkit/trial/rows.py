@@ -110,7 +110,7 @@ def _lost_all(row: Row) -> bool:
 
 
 def to_csv(rows: Iterable[Row], table: Sequence[Column]) -> str:
-    """Return the text of a trial.csv with these rows and columns; `table` is that of `Plan.table`."""
+    """Return the text of a trial.csv with these rows and columns; `table` is `Plan.table`."""
     return head(table) + "".join(line(row, table) for row in rows)
 
 

@@ -16,7 +16,7 @@ from fieldkit.trial.columns import installed, trial_columns
 from fieldkit.trial.plan import PLAN_FILE
 
 Facts = Callable[[Path], TableFacts | None]
-"""Returns the properties of a table that are known without reading it; None if they are not."""
+"""Returns the properties of a table that are known without reading it; None if they are unknown."""
 
 
 def unknown(_: Path) -> None:
@@ -61,7 +61,7 @@ def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
 
 
 def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str, Column]:
-    """Return the columns of several plans by name; of compatible columns of one name, the first is kept.
+    """Return the columns of several plans by name; if columns of one name are compatible, the first is kept.
 
     Args:
         declared: Plans with their columns.
@@ -132,7 +132,7 @@ def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
 
 
 def _type_of(column: Column) -> tuple[object, ...]:
-    """Return the properties in which two columns must agree for their values to be combined; texts always can be."""
+    """Return the properties that must be equal so that values of two columns can be combined; texts have none."""
     figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 

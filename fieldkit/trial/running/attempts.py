@@ -66,7 +66,7 @@ class Attempts:
         self._reached: Status | None = None
 
     def make(self, repeat: RepeatId) -> str:
-        """Make another attempt at a repeat, and store it with any result.
+        """Make another attempt at a repeat, and store it whatever its result is.
 
         Returns:
             The remedy of a failed step; empty if none failed.

@@ -20,7 +20,7 @@ from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
 """Lifetime of a lock that is not renewed; `evidence.begin` renews it after half of this time.
-It is longer than any attempt, and than robots are carried to another place."""
+It is longer than any attempt, and longer than carrying robots to another place takes."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 
@@ -87,7 +87,7 @@ def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) ->
     )
     try:
         for shell in in_order:
-            attempted.append(shell)  # added before it answers, because the answer of a successful lock may be lost
+            attempted.append(shell)  # before the answer, which may be lost
             words = (word(holder.token), str(ttl_s), word(holder.user), word(holder.purpose))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield

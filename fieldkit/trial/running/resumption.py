@@ -137,7 +137,7 @@ _NO_SIMULATORS: Final = "no simulators"
 
 
 def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) -> None:
-    """Raise an error if a trial would be resumed on other simulators: one table has the results of one of them.
+    """Raise an error if a trial would be resumed on other simulators, because their results must not be in one table.
 
     Args:
         plan: The trial.
@@ -145,7 +145,7 @@ def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) 
         folder: The trial's folder.
 
     Raises:
-        ConfigurationError: It was started on others.
+        ConfigurationError: It was started on other simulators.
     """
     if simulators != plan.simulators:
         raise ConfigurationError(
