@@ -241,7 +241,7 @@ class AutopilotState:
         return self._yaw_rad if time.monotonic() - self._attitude_s < FRESH_S else None
 
     def receive(self) -> None:
-        """Process the frames that have arrived. Damaged frames and those of other systems are ignored."""
+        """Process the frames that have arrived. Damaged frames and frames of other systems are ignored."""
         for frame in self.link.receive():
             if not is_intact(frame):
                 continue

@@ -188,7 +188,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
 
     @property
     def _lease_s(self) -> float:
-        """Lease of the guard, which must not expire before the pilot's."""
+        """Lease of the guard, which must not expire before the lease of the pilot."""
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:

@@ -59,16 +59,16 @@ class MoveStep(
 
     So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
     on the ground of their world, and return instantly; in the field the operator is asked to start the motion and
-    to bring the robot back. Ground robots that [fieldkit drives](motion.md) do both, with `--allow-motion`, and
-    leave `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a
-    `name` for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside
-    a fault.
+    to bring the robot back. Ground robots that [fieldkit drives](motion.md) move and return automatically, with
+    `--allow-motion`, and write `drive.jsonl`. `--dry-run` describes the path. A move may be inside a move of another
+    robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move, but not
+    a move inside a fault.
 
     Attributes:
         robot: Role that moves.
         path: Its path, a list of straight segments; each begins where the previous one ends.
-        speed: Speed, `0.2m/s`; at most `limits.max_speed_m_s` of its profile, or the trial is refused. Without it,
-            that speed.
+        speed: Speed, `0.2m/s`; by default `limits.max_speed_m_s` of its profile. A trial with a higher speed is
+            refused.
         within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
             as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
             Otherwise the trial is refused.
@@ -247,7 +247,7 @@ class MoveStep(
 
     @override
     def measure(self, view: View) -> Measured:
-        """Return the values of the drive, without those that other sources of the robot's position contradict."""
+        """Return the values of the drive, without values that other sources of the robot's position contradict."""
         if not self.driven:
             return Measured()
         log = view.evidence.read_or_none(drive_log.read, self._log)

@@ -5,8 +5,8 @@ with zeros, because the file grows by blocks.
 
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
 by the head (`fieldkit.agent.messaging.stream`): magic, sequence number and time of sending. The head is visible if
-that part of the packet was captured: always if a sample starts a packet, but not if TCP or a middleware put it after
-another sample.
+that part of the packet was captured. This is always the case if a sample starts a packet, but may not be if TCP or a
+middleware put it after another sample.
 """
 
 import struct
