@@ -33,7 +33,7 @@ class CliOptions:
         self._options: list[tuple[str, str]] = []
 
     def read(self, arguments: argparse.Namespace) -> None:
-        """Store those of the parsed arguments that remedies repeat."""
+        """Store the parsed arguments that remedies repeat."""
         for name in _REPEATED_OPTIONS:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]

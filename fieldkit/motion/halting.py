@@ -1,4 +1,4 @@
-"""Stop the programs of the agent that drive or fly robots, including those of other instances of fieldkit."""
+"""Stop the programs of the agent that drive or fly robots, including programs of other instances of fieldkit."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping

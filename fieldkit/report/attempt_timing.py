@@ -1,6 +1,6 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
-Times are those of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the payload of
+These are times of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the payload of
 transfers, and the panels of steps that draw them (`DrawsPanels`).
 """
 

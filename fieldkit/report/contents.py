@@ -48,7 +48,7 @@ _ALWAYS_VISIBLE: Final = frozenset(
 
 
 _FIRST: Final = "expected and lab-defined figures"
-"""Quantities with an expectation, and quantities that a lab declares."""
+"""Heading of charts and tables of quantities with an expectation, and of quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12
 """Maximum number of charts of quantities that are not defined by fieldkit."""

@@ -114,7 +114,7 @@ class _CurveDrawing:
     ranking: Ranking
 
     def chart(self, measured: Mapping[Quantity, Sequence[Cell]]) -> Iterator[Chart]:
-        """Yield the chart of a quantity, or of the same quantity of several steps, if it has several distances."""
+        """Yield the chart of a quantity, or of one quantity of several steps, if it has several distances."""
         if not any(
             is_curve(with_missing(self.cells, step_quantity, cells), step_quantity, self.evidence)
             for step_quantity, cells in measured.items()

@@ -46,7 +46,7 @@ class Ranking:
         return name in self._lab_columns
 
     def more_is_worse(self, quantity: Quantity) -> bool | None:
-        """Return True if larger values are worse, by the expectation or else by unit; None if both are unknown."""
+        """Return True if larger values are worse, by the expectation or otherwise by the unit; None if unknown."""
         if (expectation := self._expected.get(quantity.name)) is not None:
             return expectation.is_below
         if quantity.name in self._lab_columns or quantity.kind is Kind.FLAG:
@@ -110,7 +110,7 @@ class Headline:
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
-    """Yield the outcomes of repeats, then quantities: expected ones, the lab's, those of each protocol.
+    """Yield the outcomes of repeats, then quantities: with an expectation, of the lab, and of each protocol.
 
     Steps that differ only in their names share a headline, in which the step is part of the condition.
 

@@ -1,4 +1,4 @@
-"""The columns of trial.csv: those that identify an attempt, and those that steps and the testbed declare."""
+"""The columns of trial.csv: some identify an attempt, and the others are declared by steps and the testbed."""
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
@@ -62,14 +62,14 @@ Row = Mapping[str, Value]
 
 @cache
 def measures() -> tuple[Column, ...]:
-    """Return every column that evidence fills in every trial: those of the testbed and of fieldkit's step kinds."""
+    """Return the columns that evidence fills in every trial: columns of the testbed and of fieldkit's step kinds."""
     of_kinds = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
     filled = dict.fromkeys((*ALWAYS, *of_kinds, *outage_columns.COLUMNS))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 
 def trial_columns(additional: Iterable[Column] = ()) -> tuple[Column, ...]:
-    """Return the columns of a trial.csv in order: those of every trial, then the others that its steps fill.
+    """Return the columns of a trial.csv in order: columns of every trial, then others that its steps fill.
 
     Args:
         additional: Columns that not every trial has, as in the trial's plan.
@@ -91,7 +91,7 @@ def of_step(step: Step) -> tuple[Column, ...]:
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
     """Return the columns of steps that are not in every trial, in the order of the steps.
 
-    These are the columns of named steps, additional columns that a step declares, and those of other packages' kinds.
+    These are columns of named steps, additional columns that a step declares, and columns of other packages' kinds.
     """
     return tuple(column for step in steps for column in of_step(step) if column.name not in _common_columns())
 

@@ -1,4 +1,4 @@
-"""Tables of trials with an index: which of them it covers, and the index of those that it does not cover yet."""
+"""Tables of trials and their index: find the tables that the index covers, and add the other tables to it."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

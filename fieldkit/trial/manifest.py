@@ -1,6 +1,6 @@
 """The manifest of a trial: a SHA-256 checksum of each file, computed once when the file is stored.
 
-Its format is that of `sha256sum`.
+It has the format of `sha256sum`.
 """
 
 import hashlib

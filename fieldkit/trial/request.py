@@ -121,7 +121,7 @@ def make_plan(
 
 
 def _robot_data(cast: Cast) -> dict[str, object]:
-    """Return the data that distinguishes the robots of this trial from those of other trials."""
+    """Return the data that distinguishes the robots of this trial from the robots of other trials."""
     # Earlier versions hashed the key also for a robot without this section; equal robots must have equal hashes.
     data: dict[str, object] = {
         role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()

@@ -24,7 +24,7 @@ def unknown(_: Path) -> None:
 
 
 def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column, ...]:
-    """Return every column of the tables: those of every trial first, then others in the order of the tables.
+    """Return all columns of the tables: first the columns of every trial, then others in the order of the tables.
 
     A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
     kind of step, by its name with or without the name of the step; otherwise it is text

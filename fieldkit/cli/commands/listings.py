@@ -75,7 +75,7 @@ _SHOW: Final = "show"
 
 
 def run_columns(arguments: argparse.Namespace) -> int:
-    """List all columns or those of a procedure, or show one."""
+    """List all columns or the columns of a procedure, or show one."""
     if arguments.filled not in {None, _SHOW}:
         if arguments.column is not None:
             raise ConfigurationError(

@@ -34,7 +34,7 @@ _PHASE_GAIN: Final = 0.03
 a smaller one, it does not follow the drift of a period that is known to 0.1 %."""
 _SKIP_COST: Final = 1.0
 """Cost of a period that the autopilot skipped, in squared periods: more than the squared deviation of one late
-message, less than that of two."""
+message, less than the sum for two."""
 _HYPOTHESES: Final = 4
 """Number of hypotheses that are kept; after late messages two or three are still possible."""
 

@@ -80,8 +80,8 @@ class Assessment:
     def rank(self) -> tuple[float, float]:
         """Largest loss of any cell and largest delay of any repeat; smaller is better.
 
-        The ends of the intervals are not used: the interval of repeats without a loss is wider than that of repeats
-        with few losses.
+        The ends of the intervals are not used: the interval of repeats without a loss is wider than the interval of
+        repeats with few losses.
         """
         losses = [math.inf if cell.loss is None else cell.loss.value for cell in self.cells]
         return max(losses), max(cell.largest_delay_s for cell in self.cells)

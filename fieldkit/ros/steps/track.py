@@ -131,7 +131,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     Attributes:
         robots: Source of each robot's position, by role.
-        heights: Whether heights above the ellipsoid are used; those of satellite receivers are often wrong by 10 m.
+        heights: Whether heights above the ellipsoid are used; heights of satellite receivers are often wrong by 10 m.
         during: Steps that run at the same time.
     """
 

@@ -1,4 +1,4 @@
-"""Samples of topics: those in logs that the agent writes on a robot, and those in a capture, by their heads.
+"""Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
 
 Logs (`fieldkit.agent.messaging.records`) are fixed-size records after a magic. A log whose writer was killed ends
 with zeros, because the file grows by blocks.
@@ -216,7 +216,7 @@ _LAYOUT: Final = struct.Struct("<III")
 
 @dataclass(frozen=True, eq=False)
 class SampleHeads(Table):
-    """Heads of samples in the order of a capture, including those of retransmitted samples.
+    """Heads of samples in the order of a capture, including heads of retransmitted samples.
 
     Attributes:
         sequence: Sequence number of the sample.

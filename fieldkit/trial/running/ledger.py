@@ -151,7 +151,7 @@ class Ledger:
         return cells
 
     def _rename(self, attempt: Attempt) -> None:
-        """Rename the folder of an attempt that failed before its repeat was reopened to that of a void attempt."""
+        """If an attempt failed before its repeat was reopened, rename its folder as for a void attempt."""
         if not attempt.reopened:
             return
         before = attempt.repeat.folder(Status.FAILED, attempt.number)
