@@ -40,7 +40,7 @@ class CampaignOutcome:
 
     Attributes:
         remaining: Trials that have not ended.
-        failed: Number of failed repeats in the others.
+        failed: Number of failed repeats in the trials that have ended.
         unmet: Number of expectations that their figures do not prove.
         folders: Folders of the trials that have ended.
     """

@@ -217,7 +217,7 @@ def build_contents(
 def _against_distance(
     cells: Sequence[Cell], identities: Identities, evidence: Evidence, first: Sequence[str]
 ) -> Iterator[ChartSection]:
-    """Yield the charts of quantities that fieldkit defines; those with the plain names `first` come first."""
+    """Yield the charts of quantities that fieldkit defines; quantities with the plain names `first` come first."""
     for heading, names in (
         (_FIRST, first),
         *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),

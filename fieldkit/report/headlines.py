@@ -22,7 +22,7 @@ _LOSSES: Final = frozenset((*LOSSES, "topic_loss", "iperf3_loss", "iperf3_captur
 
 
 class Ranking:
-    """The order of quantities: those with an expectation, those that a lab declares, then the others.
+    """The order of quantities: quantities with an expectation, then quantities that a lab declares, then the others.
 
     Args:
         evidence: The available plans, which contain the expectations and the columns of a lab.
@@ -37,7 +37,7 @@ class Ranking:
         self._lab_columns = dict.fromkeys(name for plan in plans for name in _lab_columns(plan))
 
     def first(self, quantities: Iterable[Quantity]) -> list[Quantity]:
-        """Return the expected quantities, then those that a lab declares, without the others."""
+        """Return the expected quantities, then the quantities that a lab declares; others are omitted."""
         by_name = {quantity.name: quantity for quantity in quantities}
         return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
 
@@ -226,7 +226,7 @@ class _HeadlineWriter:
 def _missing(
     lacking: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
 ) -> Iterator[HeadlineLine]:
-    """Yield a line per reason for missing values, with the conditions; those without any value come first."""
+    """Yield a line per reason for missing values, with the conditions; conditions without any value come first."""
     ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].total)
     for reason in dict.fromkeys(absence.reason for _, absence in ordered):
         places = [
@@ -240,7 +240,7 @@ def _missing(
 def _worst_and_best(
     values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, is_whole: bool
 ) -> list[HeadlineLine]:
-    """Return the worst and the best of values that are sorted from worst to best, or the value that all have."""
+    """Return the worst and the best of values that are sorted from worst to best, or only one if all are equal."""
     worst, best = (wording.value(values[index][1]) for index in (0, -1))
     if worst == best and len(values) > 1:
         return [HeadlineLine("in all conditions" if is_whole else "in all others", worst, "", "")]

@@ -88,7 +88,7 @@ class Evidence:
         return chosen
 
     def observed(self, cell: Cell, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
-        """Return the values of a cell's valid repeats in order of time, and a mask of those that are lower bounds."""
+        """Return the values of a cell's valid repeats in order of time, and a mask of the lower bounds among them."""
         rows = self.rows(cell)
         rows = rows[self.repeats.texts["status"][rows] == Status.VALID]
         values, is_bound = (column[rows] for column in self.repeats.observed(quantity))

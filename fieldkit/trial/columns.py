@@ -121,7 +121,7 @@ def column_conflict(column: Column, filled: Collection[str]) -> str | None:
 
 @cache
 def installed() -> tuple[Column, ...]:
-    """Return the columns of every trial, and those declared by the step kinds of other packages.
+    """Return the columns of every trial, and the columns that step kinds of other packages declare.
 
     Raises:
         ConfigurationError: As for `step_types`, or a kind declares an invalid column, or one that exists already.

@@ -73,8 +73,8 @@ def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
 def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of a number of repeats of a trial.
 
-    Finished repeats at the same distance are the best basis. Otherwise those at the nearest shorter and longer
-    distances are used, of the same topology if there are any. If no finished repeat was at a longer distance, the
+    Finished repeats at the same distance are the best basis. Otherwise repeats at the nearest shorter and longer
+    distances are used, of the same topology if possible. If no finished repeat was at a longer distance, the
     link may be dead at this distance.
 
     Args:

@@ -33,7 +33,7 @@ Note = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class IndexedTables:
-    """The tables that an index covers, and those that it will cover.
+    """The tables that an index covers, and the tables to be added to it.
 
     Attributes:
         path: The file of the index; None if there is no index.
@@ -72,7 +72,7 @@ NO_INDEX: Final = IndexedTables()
 
 
 def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
-    """Return the tables that the index in the user's cache covers, and the properties of those to add.
+    """Return the tables that the index in the user's cache covers, and the properties of the tables to add.
 
     Args:
         tables: The tables.

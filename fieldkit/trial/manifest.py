@@ -177,7 +177,7 @@ def is_positions(name: str) -> bool:
 
 
 def _unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of leading lines of a file that have this checksum, or None if no number of lines has it."""
+    """Return the number of leading lines of a file that have this checksum, or None if there is no such number."""
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)

@@ -36,7 +36,7 @@ class Plan(Strict):
     Attributes:
         schema_version: Version of the CSV columns at planning; each row has the version at its own measurement.
         trial: Name of the trial and of its folder.
-        versions: Versions of fieldkit, Python, the packages that measure, and those that add steps or backends.
+        versions: Versions of fieldkit, Python, packages that measure, and packages that add steps or backends.
         code_sha256: Hash over fieldkit's source.
         profiles_sha256: Hash over the profiles of the cast.
         procedure_sha256: Hash of the procedure.

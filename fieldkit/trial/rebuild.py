@@ -34,7 +34,7 @@ def rebuild(folder: Path) -> Rebuilt:
     """Write trial.csv and summary.csv of the trial in `folder` again.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another fieldkit runs it, or it cannot be written.
+        ConfigurationError: `folder` is not a trial, another process runs it, or it cannot be written.
         EvidenceError: The journal cannot be read, or the evidence differs from its checksums; nothing is written
             then.
     """

@@ -28,7 +28,7 @@ class TrialRequest:
         procedure: The procedure.
         distance: The distance.
         topology: Topology.
-        protocols: Protocols; empty for those of the procedure.
+        protocols: Protocols; empty for the protocols of the procedure.
         repeats: Repeats per protocol.
         record_s: Duration of every recording, in seconds.
         seed: Seed.
@@ -46,7 +46,7 @@ class TrialRequest:
 
     @property
     def chosen_topology(self) -> Topology:
-        """The requested topology, or that of the procedure."""
+        """The requested topology, or the topology of the procedure."""
         return self.topology or self.procedure.topology
 
 

@@ -168,7 +168,7 @@ class SimulatedTrial:
 
         Args:
             simulated: The repeat.
-            identity: Columns that replace those of the plan, for example the name of the trial.
+            identity: Columns that replace columns of the plan, for example the name of the trial.
         """
         with TemporaryDirectory(prefix="fieldkit-simulated-") as name:
             folder = Path(name)

@@ -98,7 +98,7 @@ def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def frozen_columns(table: Path) -> tuple[Column, ...]:
-    """Return the columns that a dataset declares, or those in the plan in the folder of a table.
+    """Return the columns that a dataset declares, or the columns in the plan in the folder of a table.
 
     Raises:
         ConfigurationError: The plan cannot be read.

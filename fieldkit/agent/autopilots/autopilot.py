@@ -1,6 +1,6 @@
 """State of a drone's autopilot, and commands to it, over MAVLink, for programs on the drone's computer.
 
-Messages, commands and their numbers are those of https://mavlink.io/en/messages/common.html.
+Messages, commands and their numbers are defined in https://mavlink.io/en/messages/common.html.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "completion": "print a shell script for Tab completion",
     }
 )
-"""The order is that of the help."""
+"""The help lists the commands in this order."""
 LISTINGS: Final = ("robots", "procedures", "columns")
 """Commands in the module `listings`."""
 

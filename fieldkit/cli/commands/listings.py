@@ -104,7 +104,7 @@ def _columns_of(procedure: str) -> int:
 
 
 def _columns(name: str | None) -> int:
-    """List the columns of all files, or those called `name`."""
+    """List the columns of all files, or the columns called `name`."""
     from fieldkit.analysis.quantities import DEFAULT_BY
     from fieldkit.trial.columns import installed
 

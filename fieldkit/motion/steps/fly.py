@@ -49,7 +49,7 @@ _Distance = Annotated[Length, Field(gt=0)] | None
 _MOTORS_OFF_S: Final = 60.0
 """Timeout until the motors are off; after an aborted attempt the drone may still be landing."""
 _SLACK_S: Final = 30.0
-"""Additional time for the change of mode, the motors and the last metre; again for the landing."""
+"""Additional time of a take-off for the change of mode, the motors and the last metre; the same for a landing."""
 _SLOWEST_M_S: Final = 0.3
 """Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0

@@ -242,7 +242,7 @@ class FlightLease(LeaseKeeper):
         """Wait until the program reports that it has reached a state.
 
         Args:
-            mark: The state, as at the end of a line of the log.
+            mark: The state, as printed at the end of a line of the log.
             within_s: Timeout in seconds.
 
         Raises:

@@ -2,7 +2,8 @@
 
 Most types have the same name and members in both. Time and duration are messages of `std_msgs` in ROS 1 and of
 `builtin_interfaces` in ROS 2, with the same two numbers (ros1_bridge maps them in the same way). Since Iron,
-`sensor_msgs/Range` has an additional last member: it is 0 in messages from ROS 1, and is dropped towards ROS 1.
+`sensor_msgs/Range` has an additional last member: it is 0 in messages from ROS 1, and is removed from messages to
+ROS 1.
 """
 
 import struct

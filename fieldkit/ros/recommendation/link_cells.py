@@ -35,11 +35,11 @@ class LinkCriterion:
     """The requirements that a middleware must meet on the link in each repeat.
 
     Attributes:
-        max_loss: Share of the samples that may be lost, 0 to 1; those that were never sent count as lost.
+        max_loss: Share of the samples that may be lost, 0 to 1; samples that were never sent count as lost.
         max_delay_s: Limit for the delay of 95 % of all samples sent; None without a limit.
         size_bytes: Only samples of this size count; None for all.
         repeats: Number of valid repeats that a cell needs.
-        share: Share of all repeats that must meet it, shown with 95 % confidence; None if each measured repeat must.
+        share: Share of repeats that must meet it, with 95 % confidence; None if every measured repeat must meet it.
     """
 
     max_loss: float

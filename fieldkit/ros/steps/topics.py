@@ -100,7 +100,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             argv=agent_commands.agent_command(
                 robot, verb, self.agent_arguments(scene, role), self._file(role), environment=self.environment(robot)
             ),
-            # The limit of the subscriber must be longer than that of the publisher.
+            # The time limit of the subscriber must be longer than the limit of the publisher.
             limit_s=duration_s if publishes else 2 * duration_s,
             log=self._log(role),
             ready=None if publishes else "log:up,",

@@ -1,4 +1,4 @@
-"""Arrivals of samples: the times in a subscriber's log compared with those in its capture."""
+"""Arrivals of samples: the times in a subscriber's log compared with the times in its capture."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

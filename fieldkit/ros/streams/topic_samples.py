@@ -39,7 +39,7 @@ _SAMPLE, BEGUN, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
-"""Value in an end record whose size field is a checksum; logs of versions without origin records have no checksum."""
+"""Marks an end record whose size field is a checksum. Older logs, without origin records, have no checksum."""
 _SIZE_AT: Final = 4
 
 

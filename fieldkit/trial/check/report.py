@@ -18,7 +18,7 @@ class UserTools:
 
     Attributes:
         root: Whether the user is root.
-        programs: Available programs among those used in remedies.
+        programs: The available programs that remedies can use.
     """
 
     root: bool

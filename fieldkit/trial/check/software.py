@@ -1,4 +1,4 @@
-"""Checks of a robot's programs by the probe: those that steps start, and other requirements of steps."""
+"""Checks of a robot's programs by the probe: programs that steps start, and other requirements of steps."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -27,7 +27,7 @@ _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of a lock on robots, and its purpose. Only letters, digits and `._@-` of a text are used, at most 80.
+    """Holder of a lock on robots, and its purpose. Of each text, at most 80 letters, digits and `._@-` are used.
 
     Attributes:
         token: Identifies the trial; a holder with the same token can lock its robots again.
@@ -42,7 +42,7 @@ class Holder:
 
 @contextmanager
 def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
-    """Lock all robots while the body runs, as the only process of this machine with the holder's token.
+    """Lock all robots while the body runs. Only one process of this machine can use the holder's token.
 
     Raises:
         ConfigurationError: Another process has the token; it would use the same locks and release them.
