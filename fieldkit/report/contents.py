@@ -243,7 +243,7 @@ def _further_charts(
         first: Plain names of quantities that are drawn already.
     """
     drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
-    others: dict[str, str] = {}  # the first name with each plain name
+    others: dict[str, str] = {}  # by plain name, the first name
     for quantity in measured_in(cells):
         if (
             not quantity.is_builtin

@@ -148,7 +148,7 @@ def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> I
     """Yield the missing values of a quantity under conditions in which it should have been measured.
 
     Args:
-        cells: Conditions. Those whose protocol and topology have no condition with the quantity are ignored.
+        cells: Conditions. A condition is ignored if no condition of its protocol and topology has the quantity.
         quantity: The quantity.
         evidence: The table and the available plans.
     """

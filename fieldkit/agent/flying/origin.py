@@ -85,7 +85,7 @@ def frame_id(computer: str, booted_s: float) -> str:
 
 
 def is_same_frame(identifier: str, other_identifier: str) -> bool:
-    """Return True if two identifiers of `frame_id` denote the same frame, without a reboot between."""
+    """Return True if two identifiers of `frame_id` denote the same frame, without a reboot between them."""
     (computer, _, booted), (other_computer, _, other_booted) = (
         identifier.rpartition(" "),
         other_identifier.rpartition(" "),

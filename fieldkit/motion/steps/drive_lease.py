@@ -82,7 +82,7 @@ class DriveLease(LeaseKeeper):
     def end_state(self) -> str:
         """Reason why the drive has ended, `home` if the robot is back at its place; empty while it drives.
 
-        The driver writes its status ten times a second. Without a new status, it has exited or cannot be reached.
+        The driver writes its status ten times a second. If there is no new one, it has exited or cannot be reached.
         """
         status, silent_s = self.status, self.unchanged_s
         if isinstance(ended := status.get("ended"), str) and ended:

@@ -56,7 +56,7 @@ _LIMIT_S: Final = 3600.0
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
+"""Growth of the log: ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
 
 
 class FlyLeg(PathLeg):
@@ -297,7 +297,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, may_send=may_send)
 
     def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, flight: piloting.FlightLease) -> None:
-        """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
+        """Give the orders of the flight; the origin is stored before the first order that moves the drone."""
         name = scene.robot(self.robot).name
         self._wait_for_start(scene, flight)
         with origins_of(scene).moving(self.robot) as motion:

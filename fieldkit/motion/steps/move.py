@@ -38,7 +38,7 @@ from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/driving/drive.py`), each of about 220 bytes."""
+"""Growth of the log: ten lines a second (`agent/driving/drive.py`), each of about 220 bytes."""
 _FENCE_MARGIN_M: Final = 0.5
 """Distance between the fence and the end of a shortened path, because the robot may overshoot."""
 
@@ -89,7 +89,7 @@ class MoveStep(
 
     @override
     def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
-        """Return the step with a speed, and with `within_limits` reduced to the robot's limits."""
+        """Return the step with a speed. With `within_limits`, path and speed are reduced to the robot's limits."""
         robot = cast[self.robot]
         fastest_m_s, fence_m = robot.profile.limits.max_speed_m_s, robot.profile.limits.fence_m
         speed_m_s = fastest_m_s if self.speed is None else self.speed

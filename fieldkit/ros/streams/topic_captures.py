@@ -200,7 +200,7 @@ def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
 
 
 def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
-    """Yield a contradiction if a log has samples more often than the capture."""
+    """Yield a contradiction if a log contains samples more often than the capture does."""
     numbers, copies = np.unique(samples.sequence, return_counts=True)
     captured_numbers, captured_copies = np.unique(subscriber.heads.sequence, return_counts=True)
     is_captured = np.isin(numbers, captured_numbers)
