@@ -39,9 +39,9 @@ _ON_LIGHT: Final = "#111111"
 _ON_DARK: Final = "#fefefe"
 """Both are not colours of the theme, because the colours of a heat map are the same in the dark theme."""
 _LEVEL_CHARACTERS: Final = 40
-"""Labels below a heat map are vertical if they have at least this number of characters."""
+"""Labels below a heat map are vertical if they need more than this number of characters in total."""
 _NOTE_COLUMNS: Final = 12
-"""The texts of a heat map are smaller if it has at least this number of columns."""
+"""The texts of a heat map are smaller if it has more than this number of columns."""
 _SMALLEST: Final = 3.5
 """Smallest font size of texts in a heat map."""
 _EDGE_TEXT: Final = 34

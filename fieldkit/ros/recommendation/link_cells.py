@@ -15,8 +15,8 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.core.columns import Kind, step_prefixed
 
 MIN_REPEATS: Final = 5
-"""Minimum number of repeats. Losses over TCP may be bimodal (docs/studies/middleware-link.md): all of fewer repeats
-may be in the same mode."""
+"""Default number of valid repeats that a cell needs. Losses over TCP may be bimodal
+(docs/studies/middleware-link.md): a smaller number of repeats may all be in the same mode."""
 _DECIMALS: Final = 12
 """Decimals to which a bound is rounded: 2.9 % is stored as slightly less than 0.029, but a loss of 29 of 1,000 must
 not exceed it."""
