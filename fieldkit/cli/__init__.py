@@ -34,7 +34,7 @@ EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
 _COLLECT_AFTER: Final = 50_000
 """New objects between two runs of the cyclic garbage collector.
 
-Imports create fewer objects, and no run during imports would free any of them.
+Imports create fewer objects, and a collection during imports would free none of them.
 """
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")

@@ -73,7 +73,7 @@ def _open_answers(path: str) -> TextIO:
 
 
 def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
-    """Run this command line in the environment that the backend requires; None if that is this process.
+    """Run this command line where the backend requires it. Return its exit code; None if it must run here.
 
     Args:
         chosen: The backend.

@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 def operator_of(config: pytest.Config, options: LabOptions, sink: Sink) -> Operator:
-    """Return the operator: with the option `yes` nobody, otherwise the person at the terminal."""
+    """Return the operator: the person at the terminal, or nobody if the option `yes` is set."""
     return UNATTENDED if options.yes else Uncaptured(config, sink)
 
 

@@ -110,7 +110,7 @@ class Headline:
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
-    """Yield the outcomes of repeats, then quantities: with an expectation, of the lab, and of each protocol.
+    """Yield the outcomes of repeats, then the expected, the lab's, and each protocol's quantities.
 
     Steps that differ only in their names share a headline, in which the step is part of the condition.
 
