@@ -1,4 +1,4 @@
-"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot. The bytes are the same."""
+"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot; bytes are reproduced."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -132,7 +132,7 @@ def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
 
 
 def _type_of(column: Column) -> tuple[object, ...]:
-    """Return the properties that must be equal so that values of two columns can be combined; texts have none."""
+    """Return the properties that must be equal to combine values of two columns; for texts they always are."""
     figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 

@@ -137,7 +137,7 @@ _NO_SIMULATORS: Final = "no simulators"
 
 
 def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) -> None:
-    """Raise an error if a trial would be resumed on other simulators, because their results must not be in one table.
+    """Raise an error if a trial would be resumed on other simulators, because one table must not mix simulators.
 
     Args:
         plan: The trial.
