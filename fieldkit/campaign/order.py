@@ -2,8 +2,8 @@
 
 Slow changes during a day (sun, batteries, other Wi-Fi networks) must not look like an effect of distance, so the
 order is random. Setting up robots for another topology takes longest, and carrying robots takes long. Therefore the
-order is random within blocks: all trials of a topology; in it all of a scenario; in it all at a distance. The total
-path is limited.
+order is random within nested blocks. A block has all trials of one topology. Within it, a block has all trials of one
+scenario; within that, a block has all trials at one distance. The total path is limited.
 """
 
 import random
@@ -53,8 +53,8 @@ _ROUNDING_M: Final = 1e-6
 def walk_m(trials: Iterable[PlannedTrial]) -> float:
     """Return the length of the path along which robots are carried, in metres.
 
-    In `master` both stations are carried, starting at the relay; in `masterless` the sender is. Each topology starts
-    at 0.
+    In `master` both stations are carried, starting at the relay; in `masterless` only the sender is carried. The
+    path of each topology starts at distance 0.
     """
     total_m = 0.0
     for topology, block in groupby(trials, key=lambda trial: trial.topology):

@@ -36,7 +36,7 @@ _NONEMPTY_AND_DISTINCT: Final = (Field(min_length=1), _require_distinct(lambda i
 
 
 class Exclusion(Strict):
-    """Trials that a campaign excludes: those that match all given keys.
+    """Excluded trials of a campaign: all trials that match every given key.
 
     Attributes:
         procedure: Name of a procedure.
@@ -67,15 +67,15 @@ class CampaignFile(Strict):
         procedures: List of procedures; each determines its scenario.
         distances: List of distances.
         topologies: List of `master`, `masterless`.
-        protocols: List of `tcp`, `udp`; if empty, those of each procedure.
-        repeats: Repeats per protocol; without it, those of each procedure.
-        record: Duration of every recording; without it, that of each procedure.
+        protocols: List of `tcp`, `udp`; if empty, the protocols of each procedure.
+        repeats: Repeats per protocol; by default the repeats of each procedure.
+        record: Duration of every recording; by default the duration in each procedure.
         seed: Seed of the order and of all randomness in the trials, from 0.
         walk: Maximum distance over which the robots are carried in total, `300m`; without it, three times the
             shortest path.
         left_out: List of exclusions: trials that match every key of an entry are left out.
-        expect: [Expectations](values.md#expectations) of every trial that measures the figure, in addition to those
-            of its procedure.
+        expect: [Expectations](values.md#expectations) of every trial that measures the figure, in addition to the
+            expectations of its procedure.
     """
 
     name: Annotated[
@@ -100,7 +100,7 @@ def load_campaign(path: Path) -> tuple[CampaignFile, Document]:
 
 
 def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedure, ...]:
-    """Return the procedures of a campaign; expectations of the campaign are added to those that measure the figure.
+    """Return the procedures of a campaign, with the campaign's expectations of figures that they measure.
 
     Raises:
         ConfigurationError: As for `load_procedure`, with the line; or no procedure measures the figure of an

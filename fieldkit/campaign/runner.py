@@ -40,7 +40,7 @@ class CampaignOutcome:
 
     Attributes:
         remaining: Trials that have not ended.
-        failed: Number of failed repeats in the others.
+        failed: Number of failed repeats in the trials that have ended.
         unmet: Number of expectations that their figures do not prove.
         folders: Folders of the trials that have ended.
     """
@@ -191,7 +191,7 @@ class CampaignRun:
         self._includes_failed = False
 
     def _remaining_trials(self) -> tuple[PlannedTrial, ...]:
-        """Return the trials that have not ended; before `_restart_failed` also failed ones to repeat."""
+        """Return the trials that have not ended. Before `_restart_failed`, this includes ended trials to repeat."""
         ended = {
             name for name, entry in self._journal.ended().items() if not (self._includes_failed and entry.failed)
         }

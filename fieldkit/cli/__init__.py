@@ -34,13 +34,13 @@ EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
 _COLLECT_AFTER: Final = 50_000
 """New objects between two runs of the cyclic garbage collector.
 
-Imports create fewer, and none of them would be freed.
+Imports create fewer objects, and a collection during imports would free none of them.
 """
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "1")
-"""By default OpenBLAS, which numpy uses, starts a thread per core that spins for 30 ms.
+"""Setting of OpenBLAS, which numpy uses. By default it starts a thread per core, and each thread spins for 30 ms.
 
-It speeds up only larger matrices.
+The threads are useful only for larger matrices.
 """
 
 _EPILOG: Final = """\

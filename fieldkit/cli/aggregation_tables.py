@@ -95,7 +95,7 @@ def show(arguments: argparse.Namespace) -> int:
 
 
 def _default_quantities(output_format: str, available: Mapping[str, Quantity]) -> list[Quantity]:
-    """Return the quantities to aggregate without `--quantity`: all, or for latex those that fit into a paper."""
+    """Return the quantities to aggregate without `--quantity`: all, or for latex the quantities for a paper."""
     if output_format != "latex":
         return list(available.values())
     return [

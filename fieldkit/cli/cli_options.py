@@ -73,7 +73,7 @@ def _open_answers(path: str) -> TextIO:
 
 
 def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
-    """Run this command line where the backend must run it; return its exit code, or None to run it here.
+    """Run this command line where the backend requires it. Return its exit code; None if it must run here.
 
     Args:
         chosen: The backend.

@@ -115,7 +115,7 @@ def _render_lines(cells: Sequence[Sequence[str]], widths: Sequence[int], right: 
 def _fold_cell(cell: str, width: int) -> str:
     """Return a cell with lines that are wider than `width` folded between words.
 
-    The wrapping of rich cuts lines that contain characters of two columns.
+    The wrapping of rich cuts lines that contain characters with a width of two columns.
     """
     return "\n".join(
         line if cell_len(line) <= width else "\n".join(_fold_words(line.split(), width)) for line in cell.split("\n")

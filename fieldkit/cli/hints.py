@@ -15,7 +15,7 @@ from fieldkit.cli.parser import Parser
 from fieldkit.core import permissions
 
 _REPEATED_OPTIONS: Final = ("site", "backend", "topology", "protocol", "repeats", "record")
-"""Options that select robots and what is measured on them, by their names in the namespace of argparse."""
+"""Options that select robots and measurements, by their names in the namespace of argparse."""
 
 # Words in lower case: a command of fieldkit, and perhaps its subcommand, such as `lab up`.
 _COMMAND: Final = re.compile(r"\bfieldkit(?P<words>(?: [a-z][a-z-]*)+)(?P<rest>[^;\n`]*)")
@@ -33,7 +33,7 @@ class CliOptions:
         self._options: list[tuple[str, str]] = []
 
     def read(self, arguments: argparse.Namespace) -> None:
-        """Store the options to repeat from parsed arguments."""
+        """Store the parsed arguments that remedies repeat."""
         for name in _REPEATED_OPTIONS:
             value = getattr(arguments, name, None)
             values = value if isinstance(value, list) else [] if value is None else [value]
@@ -42,7 +42,7 @@ class CliOptions:
             self._options += [(permissions.option(name), "") for name in permissions.repeated(granted_names)]
 
     def completed(self, match: re.Match[str]) -> str:
-        """Return the matched command with those of the given options that it accepts."""
+        """Return the matched command, with the stored options that this command accepts added."""
         parser, words = self._parser, list[str]()
         for word in match["words"].split():
             subparser = parser.command(word)
@@ -65,7 +65,7 @@ _options: ContextVar[CliOptions | None] = ContextVar("options", default=None)
 
 @contextmanager
 def completing(parser: Parser) -> Iterator[CliOptions]:
-    """Make `completed` use the options that the yielded object reads, while the body runs."""
+    """Yield an object that stores options. While the body runs, `completed` adds these options to commands."""
     options = CliOptions(parser)
     token = _options.set(options)
     try:

@@ -32,7 +32,7 @@ def show_summary(cells: Sequence[Cell], *, show_all: bool = False, expected: Col
 
     Args:
         cells: The cells to show.
-        show_all: True to show all quantities, not only those of `table_lines.operator_lines`.
+        show_all: True to show all quantities, not only the quantities of `table_lines.operator_lines`.
         expected: Names of quantities with an expectation. They are always shown.
     """
     groups: dict[tuple[str | float | None, ...], list[Cell]] = {}
@@ -168,7 +168,7 @@ def _lost_all(cell: Cell) -> bool:
 
 
 def _next_distance(distances: Sequence[str]) -> str:
-    """Return the last distance plus its difference to the one before, or an empty string if distances are words."""
+    """Return the last distance increased by its difference to the previous one; empty if distances are words."""
     matches = [match for distance in distances[-2:] if (match := _LENGTH.fullmatch(distance))]
     if not matches:
         return ""

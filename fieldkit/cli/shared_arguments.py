@@ -155,7 +155,7 @@ def add_jobs(parser: argparse._ActionsContainer) -> None:
 
 
 def add_workers(parser: Parser) -> None:
-    """Add the options that choose where tasks run; `executors.Workers` has both."""
+    """Add the options that choose where tasks run; `executors.Workers` contains their values."""
     workers = parser.add_mutually_exclusive_group()
     add_jobs(workers)
     workers.add_argument(
@@ -167,7 +167,7 @@ def add_workers(parser: Parser) -> None:
 
 
 def add_show(parser: Parser, dest: str, what: str) -> None:
-    """Add `show NAME` to a listing command. `dest` is None if all are listed."""
+    """Add `show NAME` to a listing command. The argument `dest` is None if the command lists all items."""
     parser.usage = "%(prog)s [-h] [show NAME]"
     show = parser.add_commands(metavar="show NAME", prog=parser.prog).add_parser("show", help=f"show one {what}")
     show.add_argument(dest, metavar="NAME", help=f"name of the {what}")

@@ -231,7 +231,7 @@ def _channel(record: AttemptRecord, role: Role, topic: str, schema: Json, meanin
 
 
 def _named(topic: str, step: str) -> str:
-    """Return the name of a topic below that of its robot: `rtt`, or `rtt/busy` for a step with a name."""
+    """Return the name of a topic below the name of its robot: `rtt`, or `rtt/busy` for a step with a name."""
     return f"{topic}/{step}" if step else topic
 
 

@@ -29,7 +29,7 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns, those of every trial first.
+    """Write all columns; the columns of every trial come first.
 
     Raises:
         OSError: The file cannot be written.
@@ -49,7 +49,7 @@ def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
 
 
 def of_repeats(repeats: Repeats) -> Table:
-    """Return all columns except the source, those of every trial first, with units and meanings as metadata."""
+    """Return all columns except the source, with units and meanings as metadata; columns of every trial are first."""
     arrays = [
         _texts(repeats.texts[column.name])
         if column.name in repeats.texts

@@ -26,7 +26,7 @@ from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
 _Evidence = Callable[[Attempt], AttemptEvidence]
-"""Returns the evidence of an attempt; the same object while it is in use."""
+"""Returns the evidence of an attempt; returns the same object again while it is in use."""
 
 _OPEN_ATTEMPTS: Final = 2
 _LAPTOP: Final = "laptop"

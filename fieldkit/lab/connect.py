@@ -1,6 +1,6 @@
 """ProxyCommand of ssh: obtain a socket to a robot from the lab's process and pass it to ssh.
 
-Usage: connect.py SOCKET ROBOT. The script does not import fieldkit: it starts quickly, and in any directory.
+Usage: connect.py SOCKET ROBOT. The script does not import fieldkit, so that it starts quickly, in any directory.
 """
 
 import socket

@@ -207,7 +207,8 @@ class GazeboWorlds(Protocol):
         """Return the world of the robots as SDF.
 
         Args:
-            version: Names of the plugins, `fortress`, or `garden` for it and later versions.
+            version: Version of Gazebo, which determines the names of its plugins: `fortress`, or `garden` for Garden
+                and later.
 
         Raises:
             ConfigurationError: A profile is missing or invalid.

@@ -37,7 +37,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
 
     @override
     def refusals(self, plan: TrialOutline) -> Iterator[Refusal]:
-        """Yield a refusal for each robot without an autopilot link to land it."""
+        """Yield a refusal for each robot that cannot be landed, because its profile has no `mavlink`."""
         for role in self.root:
             if mavlink_of(plan.cast[role].profile) is None:
                 why = "on_abort must bring it down, but its profile has no mavlink"
@@ -61,7 +61,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
         return guarded(actions, plan, scene, shells)
 
     def guarded_roles(self, plan: TrialOutline) -> tuple[Role, ...]:
-        """Return the roles whose drones no step flies, so that a guard must watch them."""
+        """Return the roles of drones that no step flies; guards must watch these drones."""
         moved = plan.procedure.moved()
         return tuple(role for role in self.root if role not in moved)
 

@@ -1,4 +1,4 @@
-"""Stop the programs of the agent that drive or fly robots, including those of other instances of fieldkit."""
+"""Stop the programs of the agent that drive or fly robots, including programs of other instances of fieldkit."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -37,7 +37,7 @@ class Halted:
 def halt(shell: Shell, operator: str, deadline: Deadline) -> Halted:
     """Stop all programs that move a robot, from any trial, and the trial that has locked the robot.
 
-    The script is not installed for it, as for `jobs.abort`: a full disk must not prevent a stop.
+    The job script is not installed for this, because a full disk must not prevent a stop (as in `jobs.abort`).
 
     Args:
         shell: The robot.
@@ -73,7 +73,7 @@ def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Ha
 
 
 def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
-    """Return the liveness file of the pilot and the guard of a drone, then /proc/uptime; raises as `halt_attempt`."""
+    """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime; raises as `halt_attempt`."""
     return call(shell, "life_signs", file, deadline=deadline)
 
 

@@ -1,4 +1,4 @@
-"""Evidence of tests: a folder for each test that produces any; by default only those of failed tests are kept."""
+"""Evidence of tests: a folder for each test that produces any; by default only folders of failed tests are kept."""
 
 import hashlib
 import re

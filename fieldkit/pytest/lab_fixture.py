@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 
 def operator_of(config: pytest.Config, options: LabOptions, sink: Sink) -> Operator:
-    """Return the operator: none if the options say so, else the person at the terminal."""
+    """Return the operator: the person at the terminal, or nobody if the option `yes` is set."""
     return UNATTENDED if options.yes else Uncaptured(config, sink)
 
 
@@ -145,7 +145,7 @@ class OpenedLab:
         """Open the robots unless they are open; robots of another topology are closed first.
 
         Args:
-            topology: The topology; None for that of the open robots, or of the options.
+            topology: The topology; None for the topology of the open robots, or else of the options.
 
         Raises:
             ConfigurationError: The backend, the site file or the topology is wrong, several workers would share

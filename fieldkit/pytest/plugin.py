@@ -68,7 +68,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_call(item: pytest.Item) -> None:
-    """Separate the evidence of the test itself from that of its set-up, which it may share with other tests."""
+    """Separate the evidence of the test from the evidence of its set-up, which several tests may share."""
     if keeper := item.config.stash.get(_KEEPER, None):
         keeper.begin_test(item)
 
@@ -77,7 +77,7 @@ def pytest_runtest_call(item: pytest.Item) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Report the evidence of a failed test, and remove that of a passed one."""
+    """Report the evidence of a failed test, and remove the evidence of a passed test."""
     report = yield
     if keeper := item.config.stash.get(_KEEPER, None):
         keeper.process_report(item, call, report)

@@ -54,9 +54,9 @@ class TrialRunner:
         Args:
             procedure: Name of the procedure.
             distance: Distance of the robots: `30ft`.
-            topology: `master` or `masterless`; None for that of the options, or else of the procedure. Open robots of
-                another topology are closed.
-            protocol: `tcp`, `udp`, or both; empty for those of the procedure.
+            topology: `master` or `masterless`; None for the topology of the options, or else of the procedure. Open
+                robots of another topology are closed.
+            protocol: `tcp`, `udp`, or both; empty for the protocols of the procedure.
             repeats: Repeats per protocol; None for the procedure's value.
             record: Duration of each recording: `2s`; None for the procedure's value.
             notes: Notes in the trial's plan.

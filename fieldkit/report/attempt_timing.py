@@ -1,6 +1,6 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
-Times are those of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the payload of
+These are times of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the payload of
 transfers, and the panels of steps that draw them (`DrawsPanels`).
 """
 
@@ -65,7 +65,7 @@ class AttemptTimes:
         clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
         clocks: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
-        distances_m: Distances between those ends, with the start time of each; empty if unknown.
+        distances_m: Distances between the ends, with the start time of each; empty if unknown.
         ends: Roles of the first transfer's sender and receiver.
         jobs: Start and end of each job on a robot, by role and name.
         activities: Activities in order of time.

@@ -48,7 +48,7 @@ _ALWAYS_VISIBLE: Final = frozenset(
 
 
 _FIRST: Final = "expected and lab-defined figures"
-"""Quantities with an expectation, and quantities that a lab declares."""
+"""Heading of charts and tables of quantities with an expectation, and of quantities that a lab declares."""
 _SECTIONS: Final = (("loss", distance.LOSS), ("delay", distance.DELAY), ("rate", distance.RATE))
 _MAX_FURTHER: Final = 12
 """Maximum number of charts of quantities that are not defined by fieldkit."""
@@ -64,13 +64,13 @@ _MAX_IN_TABLE: Final = 8
 
 @dataclass(frozen=True)
 class CellTable:
-    """Cells of one protocol with the quantities that any of them has; for named steps, those of one step.
+    """Cells of one protocol, with each quantity that any of them has. Each named step has a separate table.
 
     Attributes:
         title: The protocol, and the step.
         quantities: Quantities of the visible columns.
         more: Quantities of collapsed columns.
-        lines: Cells, each with its condition as far as it differs from the others.
+        lines: Cells, each with the part of its condition in which the cells differ.
         notes: Text below the name of a quantity.
         words: Labels of text columns, by name of the column.
         missing: Reason for a missing figure, by the number of the line and the name of the quantity.
@@ -172,8 +172,8 @@ def build_contents(
         paths: The paths in it.
         quantities: Names of quantities to draw in addition to the default ones.
         unmeasured: Planned conditions without any attempt, in words.
-        sweep: Columns of the flow and the factors, each with the column that has its values as in the command, if
-            the repeats are the runs of sweeps.
+        sweep: If the repeats are runs of sweeps: columns of the flow and of the factors, each with the column that
+            contains its values as written in the command. None or empty for other repeats.
     """
     evidence = load_evidence(repeats, repeat)
     is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
@@ -217,7 +217,7 @@ def build_contents(
 def _against_distance(
     cells: Sequence[Cell], identities: Identities, evidence: Evidence, first: Sequence[str]
 ) -> Iterator[ChartSection]:
-    """Yield the charts of quantities that fieldkit defines; those with the plain names `first` come first."""
+    """Yield the charts of quantities that fieldkit defines; quantities with the plain names `first` come first."""
     for heading, names in (
         (_FIRST, first),
         *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),
@@ -240,10 +240,10 @@ def _further_charts(
         identities: Labels and styles of their series.
         evidence: The table and the available evidence.
         requested: Names of quantities that are drawn in any case.
-        first: Plain names of those that are drawn already.
+        first: Plain names of quantities that are drawn already.
     """
     drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
-    others: dict[str, str] = {}  # the first name with each plain name
+    others: dict[str, str] = {}  # by plain name, the first name
     for quantity in measured_in(cells):
         if (
             not quantity.is_builtin
@@ -267,8 +267,8 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) ->
     Args:
         cells: Conditions.
         evidence: The table and the available evidence.
-        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty, use the
-            repeat with the median loss among the valid repeats with losses of the condition with the highest loss.
+        requested: Folder of an attempt, `udp-07`, preceded by `TRIAL/` if several trials have it. If empty,
+            it is chosen from the condition with the highest loss: the valid repeat with the median of its losses.
 
     Returns:
         The row, or None if `requested` is empty and no evidence is available.

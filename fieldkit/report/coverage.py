@@ -36,7 +36,7 @@ class RepeatCounts:
     """Numbers of repeats under one condition by outcome.
 
     Attributes:
-        planned: Planned repeats by the available plans; without a plan, the started ones.
+        planned: Planned repeats according to the available plans; without a plan, the started repeats.
         valid: Repeats with a valid attempt.
         void: Repeats whose last attempt is void.
         failed: Repeats whose last attempt failed.
@@ -62,7 +62,7 @@ class Absence:
     Attributes:
         cell: The condition.
         reason: `nothing arrived`, `no value`, or `no valid repeat`.
-        count: Number of repeats without a value for this reason; of attempts if none is valid.
+        count: Number of repeats without a value for this reason; number of attempts if no repeat is valid.
         total: Number of all repeats or attempts.
     """
 
@@ -135,7 +135,7 @@ def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64
 
 
 def _all_lost(columns: Sequence[NDArray[np.float64]], count: int) -> Rows:
-    """Return a mask of the rows that have a loss and no partial one."""
+    """Return a mask of the rows in which at least one loss is known and every known loss is total."""
     if not columns:
         return np.zeros(count, dtype=np.bool_)
     is_known = np.any([np.isfinite(column) for column in columns], axis=0)
@@ -148,7 +148,7 @@ def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> I
     """Yield the missing values of a quantity under conditions in which it should have been measured.
 
     Args:
-        cells: Conditions. Those whose protocol and topology have no condition with the quantity are ignored.
+        cells: Conditions. A condition is ignored if no condition of its protocol and topology has the quantity.
         quantity: The quantity.
         evidence: The table and the available plans.
     """
@@ -159,7 +159,7 @@ def absences(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> I
 
 
 def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence: Evidence) -> bool:
-    """Return True if the repeats of a cell measure a quantity, by their plan or else by similar cells."""
+    """Return True if the repeats of a cell measure a quantity, according to their plan, or else to similar cells."""
     if quantity.name in cell.estimates:
         return True
     if (declared := evidence.declared(cell)) is not None:

@@ -24,7 +24,7 @@ _DODGE: Final = 0.026
 _ASIDE: Final = 0.009
 """Offset of single repeats from the interval of their estimate, as a share of the axis."""
 _FEWEST_JOINED: Final = 4
-"""Fewest distances whose points are joined. A line through fewer suggests a curve that was not measured."""
+"""Smallest number of distances whose points are joined. A line through fewer points suggests an unmeasured curve."""
 _MAX_WIDE: Final = 2
 """Maximum number of panels of a chart of several steps that are drawn large."""
 _MARGIN: Final = 0.06
@@ -69,7 +69,7 @@ def has_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> 
 
 
 def by_size(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Mapping[str, Sequence[Cell]]:
-    """Return the cells that have a quantity, for a round-trip time by the payload size of the pings, else by ""."""
+    """Return the cells that have a quantity: for a round-trip time by the pings' payload size, otherwise by ""."""
     measured_cells = [cell for cell in cells if quantity.name in cell.estimates]
     if plain_name(quantity.name) != "rtt_median_s":
         return {"": measured_cells} if measured_cells else {}
@@ -114,7 +114,7 @@ class _CurveDrawing:
     ranking: Ranking
 
     def chart(self, measured: Mapping[Quantity, Sequence[Cell]]) -> Iterator[Chart]:
-        """Yield the chart of a quantity, or of the same quantity of several steps, if it has several distances."""
+        """Yield the chart of a quantity, or of one quantity of several steps, if it has several distances."""
         if not any(
             is_curve(with_missing(self.cells, step_quantity, cells), step_quantity, self.evidence)
             for step_quantity, cells in measured.items()
@@ -154,7 +154,7 @@ class _CurveDrawing:
         )
 
     def _places(self, quantity: Quantity, group: Sequence[Cell], factor: float) -> list[_CurvePlace]:
-        """Return the conditions of a panel in order of distance, also those without a value."""
+        """Return the conditions of a panel in order of distance, including conditions without a value."""
         is_up = self.ranking.more_is_worse(quantity) is not False
         places = [_CurvePlace(cell, point(cell, quantity, factor, self.evidence)) for cell in group]
         places += [
@@ -268,7 +268,7 @@ def _series(
 
 
 def _breaks(places: Sequence[_CurvePlace], limits: tuple[float, float]) -> frozenset[int]:
-    """Return the points after which no line is drawn: a wide interval there, or missing values."""
+    """Return the points after which no line is drawn, because their interval is wide or values are missing."""
     breaks, index = set(), -1
     for place in places:
         if isinstance(place.content, Absence):

@@ -1,4 +1,4 @@
-"""Distribution functions of all round trips if the outputs of ping are available, else of the repeats."""
+"""Distribution functions of all round-trip times if outputs of ping are available, otherwise of values of repeats."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

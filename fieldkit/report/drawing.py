@@ -34,14 +34,14 @@ _ARROW: Final = 14.0
 _STRIP_LANE: Final = 7.5
 """Font size of lane names in panels of a fixed height."""
 _DARK: Final = 0.6
-"""Share of the colour scale of a heat map from which texts are light."""
+"""Position on the colour scale of a heat map, 0 to 1, from which texts are light."""
 _ON_LIGHT: Final = "#111111"
 _ON_DARK: Final = "#fefefe"
-"""They are not colours of the theme, because the colours of a heat map are the same in the dark theme."""
+"""Both are not colours of the theme, because the colours of a heat map are the same in the dark theme."""
 _LEVEL_CHARACTERS: Final = 40
-"""Number of characters of the labels below a heat map from which they are vertical."""
+"""Labels below a heat map are vertical if they need more than this number of characters in total."""
 _NOTE_COLUMNS: Final = 12
-"""Number of columns of a heat map from which its texts are smaller."""
+"""The texts of a heat map are smaller if it has more than this number of columns."""
 _SMALLEST: Final = 3.5
 """Smallest font size of texts in a heat map."""
 _EDGE_TEXT: Final = 34

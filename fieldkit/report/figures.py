@@ -44,10 +44,10 @@ _SNR_DB: Final = (0.0, 60.0)
 """Range of the colour scale: from almost no reception to more than any mode needs. It is equal in all figures."""
 _LABEL_BACKGROUND: Final = {"facecolor": LIGHT["paper"], "edgecolor": "none", "pad": 0.5}
 _EDGE: Final = 0.15
-"""Share of the world next to its edges in which labels are aligned inwards."""
+"""Width of the zone at each edge in which labels are aligned inwards, as a share of the world."""
 
 _MAX_LABELLED: Final = 15
-"""Maximum number of links that are labelled with their SNR: those of six robots."""
+"""Maximum number of links that are labelled with their SNR: the number of pairs of six robots."""
 _MIN_LABELLED: Final = 0.1
 """Minimum length of a labelled link, as a share of the drawing's width."""
 

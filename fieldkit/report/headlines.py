@@ -22,7 +22,7 @@ _LOSSES: Final = frozenset((*LOSSES, "topic_loss", "iperf3_loss", "iperf3_captur
 
 
 class Ranking:
-    """The order of quantities: those with an expectation, those that a lab declares, then the others.
+    """The order of quantities: quantities with an expectation, then quantities that a lab declares, then the others.
 
     Args:
         evidence: The available plans, which contain the expectations and the columns of a lab.
@@ -37,7 +37,7 @@ class Ranking:
         self._lab_columns = dict.fromkeys(name for plan in plans for name in _lab_columns(plan))
 
     def first(self, quantities: Iterable[Quantity]) -> list[Quantity]:
-        """Return the expected quantities, then those that a lab declares, without the others."""
+        """Return the expected quantities, then the quantities that a lab declares; others are omitted."""
         by_name = {quantity.name: quantity for quantity in quantities}
         return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
 
@@ -46,7 +46,7 @@ class Ranking:
         return name in self._lab_columns
 
     def more_is_worse(self, quantity: Quantity) -> bool | None:
-        """Return True if larger values are worse, by the expectation or else by unit; None if both are unknown."""
+        """Return True if larger values are worse, by the expectation or otherwise by the unit; None if unknown."""
         if (expectation := self._expected.get(quantity.name)) is not None:
             return expectation.is_below
         if quantity.name in self._lab_columns or quantity.kind is Kind.FLAG:
@@ -110,7 +110,7 @@ class Headline:
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
-    """Yield the outcomes of repeats, then quantities: expected ones, the lab's, those of each protocol.
+    """Yield the outcomes of repeats, then the expected, the lab's, and each protocol's quantities.
 
     Steps that differ only in their names share a headline, in which the step is part of the condition.
 
@@ -155,7 +155,7 @@ class _HeadlineWriter:
     differing: Collection[str]
 
     def repeats(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
-        """Return the number of valid repeats, and the conditions of the others, the worst first."""
+        """Return the number of valid repeats, and the conditions of the other repeats, the worst first."""
         silent = coverage.everything_lost(self.evidence.repeats)
         counted = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
         planned, valid = (sum(getattr(counts, name) for _, counts in counted) for name in ("planned", "valid"))
@@ -226,7 +226,7 @@ class _HeadlineWriter:
 def _missing(
     lacking: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
 ) -> Iterator[HeadlineLine]:
-    """Yield a line per reason for missing values, with the conditions; those without any value come first."""
+    """Yield a line per reason for missing values, with the conditions; conditions without any value come first."""
     ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].total)
     for reason in dict.fromkeys(absence.reason for _, absence in ordered):
         places = [
@@ -240,7 +240,7 @@ def _missing(
 def _worst_and_best(
     values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, is_whole: bool
 ) -> list[HeadlineLine]:
-    """Return the worst and the best of values that are sorted from worst to best, or the value that all have."""
+    """Return the worst and the best of values that are sorted from worst to best, or only one if all are equal."""
     worst, best = (wording.value(values[index][1]) for index in (0, -1))
     if worst == best and len(values) > 1:
         return [HeadlineLine("in all conditions" if is_whole else "in all others", worst, "", "")]
@@ -281,6 +281,6 @@ def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:
-    """Return the quantity called `name`, or those of named steps if no other step measures it."""
+    """Return the quantity called `name`, or the quantities of named steps if no other step measures it."""
     matching = with_plain_name(quantities, name)
     return matching[:1] if matching and not matching[0].step else matching

@@ -26,7 +26,7 @@ class _Axis:
     Attributes:
         column: The column of its values.
         name: The name that is shown.
-        labels: The labels of its values, which are those in the command.
+        labels: The labels of its values, as written in the command.
     """
 
     column: str
@@ -43,7 +43,8 @@ def charts(
         repeats: The runs of sweeps.
         sweep: The columns of the flow and of the factors; for each, the column with its values as in the command.
         requested: Names of quantities that are drawn in any case.
-        one_factor: Whether to draw one factor that has several values over the flows; otherwise two are needed.
+        one_factor: Whether one factor with several values is enough: the other axis is then the flow. Otherwise two
+            factors with several values are needed.
     """
     flow, *factors = sweep
     varied = [name for name in factors if len(set(repeats.column(name))) > 1]

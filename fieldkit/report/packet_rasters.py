@@ -31,7 +31,7 @@ class Raster:
     """A raster with a line per repeat and a column per packet.
 
     Attributes:
-        place: The condition, as far as it differs from the others of its group.
+        place: The part of the condition in which the rasters of its group differ.
         lines: Number of lines.
         columns: Number of columns of the longest line.
         lengths: Number of columns of each line.

@@ -26,7 +26,7 @@ class Identity:
     Attributes:
         label: `LOS`, with the procedure if several have this scenario, and the backend if there are several.
         style: Its style.
-        rank: Sort key: by scenario, within it the field backend first.
+        rank: Sort key: by scenario; within a scenario, the field backend is first.
     """
 
     label: str
@@ -110,9 +110,9 @@ class Point:
         value: The figure.
         low: Lower end of its 95 % interval; None if it has none.
         high: Upper end; None if it has no interval.
-        repeats: Values of single repeats, some of them if there are many.
-        bounds: True for each of these that is only a lower bound.
-        is_bound: True if the figure is only a lower bound because of them.
+        repeats: Values of single repeats; if there are many, only some of them.
+        bounds: True for each value in `repeats` that is only a lower bound.
+        is_bound: True if the figure is only a lower bound because of such values.
         note: Number of valid repeats with a value, if not all have one: `2 of 3`.
     """
 
@@ -146,11 +146,11 @@ class Point:
         return min(self.value, *self.repeats, *([] if self.low is None else [self.low]))
 
     def singles(self, are_bounds: bool) -> list[float]:
-        """Return the values of single repeats that are only lower bounds, or of those that are not."""
+        """Return the values of single repeats that are only lower bounds, or the values that are not."""
         return [value for value, is_bound in zip(self.repeats, self.bounds, strict=True) if is_bound is are_bounds]
 
     def is_vague(self, ends: tuple[float, float]) -> bool:
-        """Return True if the point has no interval, an open one, or one as wide as half of the axis."""
+        """Return True if the point has no interval, or its interval is open or wider than half of the axis."""
         if self.low is None or self.high is None or self.is_bound:
             return True
         return self.high - self.low > _VAGUE_FROM * (ends[1] - ends[0])

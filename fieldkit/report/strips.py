@@ -20,7 +20,7 @@ MAX_MARKS: Final = 2000
 MAX_OTHER_MARKS: Final = 2000
 """Maximum number of marks of void and failed attempts on a page, shared by its strips; more are omitted evenly."""
 FEWEST_MARKS: Final = 20
-"""Fewest marks of valid attempts, and of others, in a strip that has more attempts."""
+"""Minimum number of marks of valid attempts, and of other attempts, in a strip that has more attempts."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,8 @@ class Mark:
     Attributes:
         row: Its row in the table.
         status: Its status.
-        height: Its loss as a share of the highest one in strips of the same protocol; None unless valid and known.
+        height: Its loss divided by the highest loss in strips of the same protocol. None if the attempt is not valid
+            or its loss is unknown.
         title: Description for a tooltip or a screen reader.
     """
 
@@ -46,7 +47,7 @@ class Strip:
 
     Attributes:
         cell: The cell.
-        place: Its condition, as far as it differs from the others of its group.
+        place: The part of its condition in which the cells of its group differ.
         colour: Colour of its series.
         marks: Marks in order of time.
         left_out: Number of valid attempts without a mark.
@@ -63,7 +64,7 @@ class Strip:
 
 @dataclass(frozen=True)
 class StripGroup:
-    """Strips of one height.
+    """Strips with the same scale of heights.
 
     Attributes:
         title: Protocol and topology.
@@ -77,7 +78,7 @@ class StripGroup:
 
 
 def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) -> Iterator[StripGroup]:
-    """Yield the strips of all cells, those of a protocol and a topology together."""
+    """Yield the strips of all cells, grouped by protocol and topology."""
     differing = wording.differing(cells) - {"topology"}
     limits = [max(FEWEST_MARKS, limit // max(1, len(cells))) for limit in (MAX_MARKS, MAX_OTHER_MARKS)]
     for title, group in panels(cells).items():

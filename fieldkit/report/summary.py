@@ -44,7 +44,7 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str
     Args:
         cells: Conditions.
         evidence: The table and the available evidence.
-        sweep: Columns of the flow and the factors of a sweep, with those that are shown; empty for trials.
+        sweep: Columns of the flow and the factors of a sweep, each with the column that is shown; empty for trials.
     """
     repeats = evidence.repeats
     trials = format_count(len(set(repeats.texts["trial"].tolist())), "trial")

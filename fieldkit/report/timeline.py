@@ -29,7 +29,7 @@ _MARK: Final = Style("lost", "x", "none")
 _ROUND_TRIP: Final = Style("pink", "D", "none")
 _DISTANCE: Final = Style("orange", line="solid")
 _LINKS: Final = (Style("blue", line="solid"), Style("green", line="dashed"))
-"""Styles of the sending robot and of the other."""
+"""Styles of the sending robot and of the other robot."""
 _MIN_BAR: Final = 0.004
 """Minimum length of a bar, as a share of the axis; a shorter one would be invisible."""
 _TIME: Final = "time [s]"
@@ -203,9 +203,9 @@ def estimate_send_times(
     """Return approximate send times of requests without a reply, interpolated by sequence number.
 
     Args:
-        number: Sequence numbers of those requests.
+        number: Sequence numbers of the requests without a reply.
         answered: Sequence numbers of answered requests, ascending.
-        at_s: Times of the replies to these.
+        at_s: Times of the replies to the answered requests.
     """
     step_s = (
         (at_s[-1] - at_s[0]) / (answered[-1] - answered[0]) if len(answered) > 1 else 1.0

@@ -34,9 +34,9 @@ class Evidence:
         repeats: The table.
         plans: Plans by the `source` of rows; only sources that are folders of trials have one.
         unread: A sentence per plan that could not be read, and per trial whose evidence differs from its manifest.
-        changed: Folders of attempts whose evidence differs from the manifest. It counts as not available.
-        verified: The `source` of the trials whose evidence was compared with the manifest; that of others is not
-            available.
+        changed: Folders of attempts whose evidence differs from the manifest and therefore counts as not available.
+        verified: The `source` of the trials whose evidence was compared with the manifest. The evidence of other
+            trials counts as not available.
     """
 
     repeats: Repeats
@@ -66,7 +66,7 @@ class Evidence:
         return self._rows[tuple(cell.key[name] for name in DEFAULT_BY)]
 
     def declared(self, cell: Cell) -> Set[str] | None:
-        """Return the columns that the steps of a cell's trials measure, or None if no plan of them is available."""
+        """Return the columns that the steps of a cell's trials measure, or None if no plan is available."""
         key = tuple(cell.key[name] for name in DEFAULT_BY)
         if key not in self._declared:
             sources = dict.fromkeys(self.repeats.texts["source"][self.rows(cell)].tolist())
@@ -88,7 +88,7 @@ class Evidence:
         return chosen
 
     def observed(self, cell: Cell, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
-        """Return the values of a cell's valid repeats in order of time, and a mask of those that are lower bounds."""
+        """Return the values of a cell's valid repeats in order of time, and a mask of the lower bounds among them."""
         rows = self.rows(cell)
         rows = rows[self.repeats.texts["status"][rows] == Status.VALID]
         values, is_bound = (column[rows] for column in self.repeats.observed(quantity))
@@ -145,7 +145,7 @@ class Evidence:
 def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
     """Return a table of repeats with the evidence in its sources.
 
-    All plans are read. Of more than `MAX_TRIALS` trials, only the evidence of so many is available.
+    All plans are read. The evidence of at most `MAX_TRIALS` trials is available.
 
     Args:
         repeats: The table.
@@ -181,7 +181,7 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
 
 
 def _chosen(repeats: Repeats, plans: Mapping[str, Plan], first: Iterable[str]) -> list[str]:
-    """Return at most `MAX_TRIALS` sources with plans: `first`, one per condition, a second one, and so on."""
+    """Return at most `MAX_TRIALS` sources with plans: `first`, one per condition, then a second one, and so on."""
     if len(plans) <= MAX_TRIALS:
         return list(plans)
     condition_of = dict(zip(repeats.texts["source"].tolist(), repeats.keys(DEFAULT_BY), strict=True))

@@ -51,7 +51,7 @@ def metres(cell: Cell) -> float:
 
 
 def distance(cell: Cell) -> str:
-    """Return a cell's distance as the operator wrote it, `30ft`, or in metres if only these are known."""
+    """Return a cell's distance as the operator wrote it, `30ft`, or in metres if that text is missing."""
     if label := text(cell, "distance"):
         return label
     return "distance unknown" if cell.key["distance_m"] is None else without_breaks(f"{metres(cell):.2f} m")
@@ -69,7 +69,7 @@ def procedure(cell: Cell) -> str:
 
 
 def place(cell: Cell, *, differing: Collection[str]) -> str:
-    """Return the condition of a cell, as far as it differs from others: `LOS, master, 30ft, field`.
+    """Return the part of a cell's condition in which cells differ: `LOS, master, 30ft, field`.
 
     Args:
         cell: The cell.

@@ -1,4 +1,4 @@
-"""The columns of trial.csv: those that identify an attempt, and those that steps and the testbed declare."""
+"""The columns of trial.csv: some identify an attempt, and the others are declared by steps and the testbed."""
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
@@ -48,7 +48,7 @@ OTHERS: Final = Column("others", "text", "Robots in further roles of the procedu
 """The column is present only if a procedure has such roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS, *oracle_delays.WINDOW_COLUMNS)
-"""Columns that are measured with any steps."""
+"""Columns that are measured in every trial, whatever its steps are."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
 """Kinds of step whose columns are in every trial, in addition to `outage_columns.COLUMNS` of faults.
@@ -62,14 +62,14 @@ Row = Mapping[str, Value]
 
 @cache
 def measures() -> tuple[Column, ...]:
-    """Return every column that evidence fills in every trial: those of the testbed and of fieldkit's step kinds."""
+    """Return the columns that evidence fills in every trial: columns of the testbed and of fieldkit's step kinds."""
     of_kinds = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
     filled = dict.fromkeys((*ALWAYS, *of_kinds, *outage_columns.COLUMNS))
     return tuple(sorted(filled, key=lambda column: column.rank))
 
 
 def trial_columns(additional: Iterable[Column] = ()) -> tuple[Column, ...]:
-    """Return the columns of a trial.csv in order: those of every trial, then the others that its steps fill.
+    """Return the columns of a trial.csv in order: columns of every trial, then others that its steps fill.
 
     Args:
         additional: Columns that not every trial has, as in the trial's plan.
@@ -91,7 +91,7 @@ def of_step(step: Step) -> tuple[Column, ...]:
 def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
     """Return the columns of steps that are not in every trial, in the order of the steps.
 
-    These are the columns of named steps, additional columns that a step declares, and those of other packages' kinds.
+    These are columns of named steps, additional columns that a step declares, and columns of other packages' kinds.
     """
     return tuple(column for step in steps for column in of_step(step) if column.name not in _common_columns())
 
@@ -121,7 +121,7 @@ def column_conflict(column: Column, filled: Collection[str]) -> str | None:
 
 @cache
 def installed() -> tuple[Column, ...]:
-    """Return the columns of every trial, and those declared by the step kinds of other packages.
+    """Return the columns of every trial, and the columns that step kinds of other packages declare.
 
     Raises:
         ConfigurationError: As for `step_types`, or a kind declares an invalid column, or one that exists already.

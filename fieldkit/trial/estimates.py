@@ -59,7 +59,7 @@ def of_trial(plan: Plan, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
 
 
 def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
-    """Yield a sentence for each robot whose battery does not last for trials in sequence, by its profile."""
+    """Yield a sentence for each robot whose battery is, by its profile, too small for a series of trials."""
     duration = total(of_trial(plan, []) for plan in plans)
     for robot in plans[0].cast.values():
         battery_min = robot.profile.limits.battery_min
@@ -73,8 +73,8 @@ def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
 def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of a number of repeats of a trial.
 
-    Finished repeats at the same distance are the best basis. Otherwise those at the nearest shorter and longer
-    distances are used, of the same topology if there are any. If no finished repeat was at a longer distance, the
+    Finished repeats at the same distance are the best basis. Otherwise repeats at the nearest shorter and longer
+    distances are used, of the same topology if possible. If no finished repeat was at a longer distance, the
     link may be dead at this distance.
 
     Args:

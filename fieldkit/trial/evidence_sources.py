@@ -1,4 +1,4 @@
-"""The table of cross-checks: those of every attempt, and those that the kinds of step declare."""
+"""The table of cross-checks: the checks of every attempt, and the checks that kinds of step declare."""
 
 from collections.abc import Iterator
 from fnmatch import fnmatchcase

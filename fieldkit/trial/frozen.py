@@ -15,8 +15,8 @@ from fieldkit.core import files
 from fieldkit.core.columns import Column, Figure, Kind
 
 MAX_COLUMNS: Final = 2000
-"""Limit per trial, not counting the columns of every trial."""
-_MAX_FLOAT: Final = sys.float_info.max  # YAML is read without infinity, and no column has such a value
+"""Maximum number of columns of a trial that not every trial has."""
+_MAX_FLOAT: Final = sys.float_info.max  # the YAML reader rejects infinity, and no column has such a value
 
 
 class FrozenFigure(Strict):

@@ -20,9 +20,9 @@ REBOOTED: Final = "the robot rebooted during the repeat"
 def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step_errors: StepErrors) -> Iterator[str]:
     """Yield the robots' problems that make an attempt void, and the sections that are missing in their state files.
 
-    A section that a robot cannot provide is missing before and after; if it is missing in one of them only, it was
-    lost. If a step restarts a robot, only its jobs are judged, because its clock starts again. Exceptions of steps
-    are added to `step_errors`.
+    A section that a robot cannot provide is missing before and after the attempt. A section that is missing only
+    once was lost. If a step restarts a robot, only its jobs are judged, because its clock starts again. Exceptions
+    of steps are added to `step_errors`.
     """
     planned_jobs: list[Planned] = []
     for placed in procedure.walk():
@@ -59,8 +59,8 @@ def restarted(procedure: Procedure) -> frozenset[Role]:
 
 
 def without_effects(reasons: Sequence[str]) -> list[str]:
-    """Return the reasons why an attempt is void; if a robot rebooted, its other reasons are omitted."""
-    reasons = list(dict.fromkeys(reasons))  # a lost link fails the step and the fetching with the same reason
+    """Return the reasons why an attempt is void. For a robot that rebooted, this is the only reason."""
+    reasons = list(dict.fromkeys(reasons))  # after a lost link, step and fetching give the same reason
     rebooted_robots = [reason.removesuffix(REBOOTED) for reason in reasons if reason.endswith(f": {REBOOTED}")]
     return [
         reason for reason in reasons if reason.endswith(REBOOTED) or not reason.startswith(tuple(rebooted_robots))

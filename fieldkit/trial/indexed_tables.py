@@ -1,4 +1,4 @@
-"""Tables of trials with an index: which of them it covers, and the index of those that it does not cover yet."""
+"""Tables of trials and their index: find the tables that the index covers, and add the other tables to it."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,20 +20,20 @@ from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.tables import expected, frozen_columns, other_names
 
 MIN_TABLES: Final = 100
-"""Number of tables from which an index is made; fewer are read faster than their index."""
+"""Smallest number of tables for which an index is made; fewer tables are read faster without an index."""
 MIN_NEW: Final = 20
-"""Number of new or changed tables from which an existing index is written again; fewer are read from their files."""
+"""Smallest number of new or changed tables for which an index is written again; fewer are read from their files."""
 MAX_TABLE_BYTES: Final = 1 << 25
 """Largest table that is indexed."""
 _IN_PARALLEL: Final = 200
-"""Number of plans from which they are read in parallel; a plan takes 20 ms, and processes take a second to start."""
+"""Smallest number of plans that are read in parallel: reading a plan takes 20 ms, starting processes takes 1 s."""
 
 Note = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class IndexedTables:
-    """The tables that an index covers, and those that it will cover.
+    """The tables that an index covers, and the tables to be added to it.
 
     Attributes:
         path: The file of the index; None if there is no index.
@@ -61,7 +61,7 @@ class IndexedTables:
     def read(
         self, tables: Sequence[Path], declared: Mapping[str, Column]
     ) -> tuple[dict[str, Numbers], dict[str, Texts], list[int]] | None:
-        """Return the rows of tables, as `table_files.IndexedRows`; None if columns have other types now."""
+        """Return the rows of tables, as `table_files.IndexedRows`; None if the types of columns have changed."""
         if not self.index.has_types(declared.values()):
             return None
         entries = [self.entries[table] for table in tables]
@@ -72,11 +72,11 @@ NO_INDEX: Final = IndexedTables()
 
 
 def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
-    """Return the tables that the index in the user's cache covers, and the properties of those to add.
+    """Return the tables that the index in the user's cache covers, and the properties of the tables to add.
 
     Args:
         tables: The tables.
-        workers: Where plans are read.
+        workers: Processes that read the plans.
         note: Receives a note if the index cannot be used.
     """
     absolute = {table: table.absolute() for table in tables if table.suffix == ".csv"}
@@ -114,7 +114,7 @@ def _can_be_indexed(stamps: TableStamp, now_ns: int) -> bool:
 
 
 def _facts(tables: Sequence[Path], workers: Workers, note: Note) -> dict[Path, TableFacts]:
-    """Return the properties of tables, without those of which something is invalid; reading them raises the error."""
+    """Return the properties of valid tables. Invalid tables are omitted; reading them later raises the error."""
     names: dict[Path, tuple[str, ...]] = {}
     for table in tables:
         with suppress(FieldkitError):

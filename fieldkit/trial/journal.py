@@ -129,7 +129,7 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
     """Return the entries of a trial's journal after a check that their sequence is possible.
 
     Raises:
-        EvidenceError: As for `read`; or an entry cannot follow those before it, or its repeat is not in the plan.
+        EvidenceError: As for `read`; or an entry cannot follow the earlier entries, or its repeat is not in the plan.
     """
     entries = read(folder)
     for line, reason in _impossible_entries(entries, plan):
@@ -165,7 +165,7 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
 
 
 def ended(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that ended, in this order; failed attempts of a reopened repeat are returned as void."""
+    """Return the attempts that ended, in order of their ends; failed attempts of a reopened repeat are void."""
     started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
     planned_at = {entry.repeat: line for line, entry in enumerate(entries) if entry.status is Status.PLANNED}
 
@@ -189,7 +189,7 @@ def ended(entries: list[JournalEntry]) -> list[Attempt]:
 
 
 def interrupted(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that started and did not end, `running` or `measured`, because fieldkit was killed."""
+    """Return the attempts with status `running` or `measured`, which did not end because fieldkit was killed."""
     ended_attempts = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
     started = {
         (entry.repeat, entry.attempt): entry.utc_ns

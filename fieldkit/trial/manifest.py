@@ -1,6 +1,6 @@
 """The manifest of a trial: a SHA-256 checksum of each file, computed once when the file is stored.
 
-Its format is that of `sha256sum`.
+It has the format of `sha256sum`.
 """
 
 import hashlib
@@ -50,7 +50,7 @@ class Manifest:
         return attempt in self._lines
 
     def unchanged_lines(self, name: str) -> int | None:
-        """Return the number of lines that a top-level file had at its checksum; None if they have changed.
+        """Return the number of lines that the checksum of a top-level file covers; None if these lines have changed.
 
         An append-only file may have more lines now. The result is 0 for a file without a checksum.
         """
@@ -177,7 +177,7 @@ def is_positions(name: str) -> bool:
 
 
 def _unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of leading lines of a file that have this checksum, or None if no number of lines has it."""
+    """Return the number of leading lines of a file that have this checksum, or None if there is no such number."""
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)

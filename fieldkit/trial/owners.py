@@ -1,4 +1,4 @@
-"""Which robot may write which file of an attempt, from the jobs of the procedure and the role in the file name."""
+"""Determine which robot may write which file of an attempt, by the procedure's jobs and the role in the file name."""
 
 import re
 from collections.abc import Mapping

@@ -46,7 +46,7 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
             source, destination = recorded_positions.trajectories_of_pair(evidence, (ends[0], ends[1]))
             satellites = recorded_positions.samples_of(evidence, ends[0]).frame == WGS84
         except EvidenceError:
-            continue  # there are no distances then
+            continue  # without positions there is no distance
         times_ns = _times_ns(evidence, ends[0], source, destination)
         recorded_m = np.linalg.norm(destination.at_m(times_ns) - source.at_m(times_ns), axis=1)
         planned_m = float(np.linalg.norm(np.subtract(places_m[ends[1]], places_m[ends[0]])))

@@ -34,14 +34,14 @@ class Plan(Strict):
     """A trial's frozen inputs.
 
     Attributes:
-        schema_version: Version of the CSV columns at planning; a row has that of its own measurement.
+        schema_version: Version of the CSV columns at planning; each row has the version at its own measurement.
         trial: Name of the trial and of its folder.
-        versions: Versions of fieldkit, Python, the packages that measure, and those that add steps or backends.
+        versions: Versions of fieldkit, Python, packages that measure, and packages that add steps or backends.
         code_sha256: Hash over fieldkit's source.
         profiles_sha256: Hash over the profiles of the cast.
         procedure_sha256: Hash of the procedure.
         backend: Name of the backend.
-        session: Identifies the run of fieldkit in the robots' locks; a resumed trial uses the same again.
+        session: Identifies the run of fieldkit in the robots' locks; a resumed trial uses the same value.
         seed: Seed of all random numbers.
         notes: Notes of the operator.
         topology: Topology.
@@ -82,7 +82,7 @@ class Plan(Strict):
 
     @property
     def backend_with_simulators(self) -> str:
-        """Name of the backend, with its simulators if it has any: results of others are another condition."""
+        """Name of the backend, with its simulators if it has any. Other simulators are another condition."""
         return f"{self.backend} ({simulators_text(self.simulators)})" if self.simulators else self.backend
 
     @cached_property

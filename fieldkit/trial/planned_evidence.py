@@ -1,4 +1,4 @@
-"""Evidence that a repeat of a trial leaves, by its plan: transfers, pings, captures and recordings."""
+"""Evidence that a repeat leaves according to the plan of its trial: transfers, pings, captures and recordings."""
 
 from collections.abc import Mapping
 

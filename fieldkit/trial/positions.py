@@ -21,7 +21,7 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.rebuild import Rebuilt, rebuild
 
 MAX_BYTES: Final = 64 << 20
-"""One day at 10 Hz as GPX."""
+"""Maximum size of a position file: one day at 10 Hz as GPX."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,17 @@ class AttemptPositions:
 def set_positions(
     folder: Path, sources: Mapping[Role, Path | PositionSource], *, offset_s: float, gap_s: float, heights: bool
 ) -> Rebuilt:
-    """Store positions of robots with a trial, replacing those added before, and rebuild its tables.
+    """Store positions of robots with a trial, replace positions that were added before, and rebuild its tables.
 
     Args:
         folder: The trial's folder.
-        sources: GPX or CSV file, or a fixed place, by role; empty to remove those added before.
+        sources: GPX or CSV file, or a fixed place, by role; empty to remove positions that were added before.
         offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
         gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
         heights: Whether heights above the ellipsoid are used.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another fieldkit runs it, it has no such role, or a file is
+        ConfigurationError: `folder` is not a trial, another process runs it, it has no such role, or a file is
             missing.
         EvidenceError: A file cannot be read, or the trial's evidence has changed.
     """

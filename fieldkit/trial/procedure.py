@@ -51,7 +51,7 @@ Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 
 
 class Place(PathLeg):
-    """Place of a robot in a role that the procedure defines; its directions are those of a leg of a path.
+    """Place of a robot in a role that the procedure defines; directions are given as in a leg of a path.
 
     Attributes:
         near: The robot under test that the position is relative to: `sender`, `receiver` or `relay`. At least one of
@@ -110,7 +110,7 @@ class Procedure(catalog.Named, Sectioned):
     @classmethod
     @override
     def expanded(cls, document: schema.Document) -> schema.Document:
-        """Return the document with every `for:` written out."""
+        """Return the document with every `for:` expanded."""
         return loops.expand_loops(document, "steps")
 
     @schema.model_validator(mode="after")
@@ -246,7 +246,7 @@ class Procedure(catalog.Named, Sectioned):
         return self.model_copy(update={"steps": steps})
 
     def resolved(self, cast: Cast) -> "Procedure":
-        """Return this procedure with the values that its steps leave to the robots filled in."""
+        """Return this procedure with its steps completed by values of the robots, for example a maximum speed."""
         steps = tuple(resolved(entry, cast) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
@@ -359,7 +359,7 @@ def read_procedure(path: Path) -> Procedure:
 
 
 def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
-    """Return the procedures, with the expectation added to those that measure its figure.
+    """Return the procedures, with the expectation added to each procedure that measures its figure.
 
     Args:
         procedures: The procedures.

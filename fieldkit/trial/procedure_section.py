@@ -11,7 +11,7 @@ from fieldkit.steps.scene import Refusal, Scene, Shells
 
 
 class ProcedureOutline(Protocol):
-    """What sections need of a procedure."""
+    """The part of a procedure that sections use."""
 
     def moved(self) -> frozenset[Role]:
         """Return the roles whose robots are moved by steps."""
@@ -21,7 +21,7 @@ class ProcedureOutline(Protocol):
 
 
 class TrialOutline(Protocol):
-    """What sections need of a plan, which contains their procedure."""
+    """The part of a plan that sections use."""
 
     @property
     def cast(self) -> Mapping[Role, Robot]:
@@ -36,7 +36,7 @@ class ProcedureSection:
     """Base of the models of sections of a procedure; every method has a default."""
 
     def roles(self) -> frozenset[Role]:
-        """Return the roles that it names; the steps must have them, too."""
+        """Return the roles that the section names; steps must use these roles, too."""
         return frozenset()
 
     def refusals(self, plan: TrialOutline) -> Iterator[Refusal]:  # noqa: ARG002 (some work with every robot)

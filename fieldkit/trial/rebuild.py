@@ -1,4 +1,4 @@
-"""Rebuild a trial's tables from plan, journal and raw evidence alone: the same bytes, without a robot."""
+"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot; bytes are reproduced."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +34,7 @@ def rebuild(folder: Path) -> Rebuilt:
     """Write trial.csv and summary.csv of the trial in `folder` again.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another fieldkit runs it, or it cannot be written.
+        ConfigurationError: `folder` is not a trial, another process runs it, or it cannot be written.
         EvidenceError: The journal cannot be read, or the evidence differs from its checksums; nothing is written
             then.
     """

@@ -1,4 +1,4 @@
-"""The operator's request for a trial, and the plan that is made of it."""
+"""The operator's request for a trial, and the plan that is made from it."""
 
 import platform
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ class TrialRequest:
         procedure: The procedure.
         distance: The distance.
         topology: Topology.
-        protocols: Protocols; empty for those of the procedure.
+        protocols: Protocols; empty for the protocols of the procedure.
         repeats: Repeats per protocol.
         record_s: Duration of every recording, in seconds.
         seed: Seed.
@@ -46,7 +46,7 @@ class TrialRequest:
 
     @property
     def chosen_topology(self) -> Topology:
-        """The requested topology, or that of the procedure."""
+        """The requested topology, or the topology of the procedure."""
         return self.topology or self.procedure.topology
 
 
@@ -69,7 +69,7 @@ def make_plan(
         now: Start of the trial; it becomes part of its name.
         session: The run of fieldkit that the trial belongs to; None if it contains only this trial.
         lab_bytes: Maximum number of bytes that the lab itself adds to an attempt (`Backend.lab_bytes`).
-        simulators: Those of the backend (`simulators_of`).
+        simulators: Simulators of the backend (`simulators_of`).
 
     Raises:
         ConfigurationError: No robot has a role that the procedure or the topology needs, or the procedure needs a
@@ -121,7 +121,7 @@ def make_plan(
 
 
 def _robot_data(cast: Cast) -> dict[str, object]:
-    """Return the data that distinguishes the robots of this trial from those of other trials."""
+    """Return the data that distinguishes the robots of this trial from the robots of other trials."""
     # Earlier versions hashed the key also for a robot without this section; equal robots must have equal hashes.
     data: dict[str, object] = {
         role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()

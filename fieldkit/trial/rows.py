@@ -94,7 +94,7 @@ def _step_numbers(step: Step, row: Row) -> Iterator[str]:
 
 
 def _with_step_name(name: str, parts: Iterable[str]) -> Iterator[str]:
-    """Yield parts, the first preceded by the name of their step."""
+    """Yield the parts of a text; the name of their step precedes the first part."""
     for index, part in enumerate(parts):
         yield f"{name}: {part}" if name and not index else part
 
@@ -110,7 +110,7 @@ def _lost_all(row: Row) -> bool:
 
 
 def to_csv(rows: Iterable[Row], table: Sequence[Column]) -> str:
-    """Return the text of a trial.csv with these rows and columns; `table` is that of `Plan.table`."""
+    """Return the text of a trial.csv with these rows and columns; `table` is `Plan.table`."""
     return head(table) + "".join(line(row, table) for row in rows)
 
 

@@ -1,4 +1,4 @@
-"""Trials that a simulation reproduces: its evidence is measured by the same steps as that of robots.
+"""Trials that a simulation reproduces: the same steps measure its evidence and the evidence of robots.
 
 The simulation writes captures of both ends and the output of ping as files of an attempt. Columns whose evidence it
 does not write are missing.
@@ -28,7 +28,7 @@ from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 
 KINDS: Final = ("capture", "ping", "record", "transfer")
-"""Kinds of step that a simulation can reproduce; what `record` records is only a size."""
+"""Kinds of step that a simulation can reproduce. Of a recording, it reproduces only the size."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class SimulatedTrial:
         robots: The robot in each role.
         topology: The topology.
         distance: The distance.
-        record_s: Duration of every recording, in seconds; None for that of the procedure.
+        record_s: Duration of every recording, in seconds; None for the duration in the procedure.
         backend: Name of the simulation, for the column `backend`.
         seed: Seed of the simulation.
 
@@ -168,7 +168,7 @@ class SimulatedTrial:
 
         Args:
             simulated: The repeat.
-            identity: Columns that replace those of the plan, for example the name of the trial.
+            identity: Columns that replace columns of the plan, for example the name of the trial.
         """
         with TemporaryDirectory(prefix="fieldkit-simulated-") as name:
             folder = Path(name)
@@ -192,7 +192,7 @@ class SimulatedTrial:
 
 
 def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]) -> str:
-    """Return the columns that the evidence and the simulation know differently, as text; empty if there are none."""
+    """Return a text on the columns whose values in evidence and simulation differ; empty if there are none."""
     same_names = {"received_bytes": "tcp_received_bytes", "sent_bytes": "tcp_unique_bytes"}
     pairs = list(known_values.items())
     pairs += [(same_names[name], value) for name, value in known_values.items() if name in same_names]

@@ -26,7 +26,7 @@ from fieldkit.trial.plan import PLAN_FILE
 ALL_PROCESSORS: Final = Workers()
 
 _IN_PARALLEL: Final = 8
-"""Number of trials from which they are measured in parallel by default; processes take a second to start."""
+"""Smallest number of trials that are measured in parallel by default; starting processes takes a second."""
 
 Note = Callable[[str], None]
 """Shows a sentence about data that is left out or treated in an unexpected way."""
@@ -42,7 +42,7 @@ class Sources:
         columns: The columns of all tables.
         rebuild: Whether raw evidence is measured again instead; nothing is written.
         note: Receives notes.
-        workers: Where raw evidence is measured again.
+        workers: Processes that measure raw evidence again.
         row_filter: Chooses rows; None for all.
         indexed: The tables that are in an index.
     """
@@ -181,7 +181,7 @@ class Sources:
 
     def _rows(self, columns: Collection[str], content: Callable[[Path], bytes]) -> Repeats:
         if self.indexed.tables:
-            # Without the index, another of several invalid tables may be the first one, so the error is not used.
+            # Of several invalid tables, reading without the index may report another one, so this error is not used.
             with suppress(FieldkitError):
                 return table_files.read(self.tables, self.columns, columns, content, self.indexed)
         return table_files.read(self.tables, self.columns, columns, content)
@@ -220,7 +220,7 @@ def find(
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
         note: Receives notes.
         rebuild: Whether to measure raw evidence again.
-        workers: Where it is measured, and where many plans are read.
+        workers: Processes that measure it, and that read many plans.
         use_index: Whether to read many tables from an index; the result is the same.
 
     Raises:

@@ -40,7 +40,7 @@ def of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
 
 
 def changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
-    """Yield a sentence for each kind of step whose code differs from the plan's although its version does not."""
+    """Yield a sentence for each kind of step whose code differs from the plan although the version is equal."""
     for kind, current in of_kinds(planned).items():
         frozen = planned[kind]
         if (frozen.package, frozen.version) == (

@@ -16,7 +16,7 @@ from fieldkit.trial.columns import installed, trial_columns
 from fieldkit.trial.plan import PLAN_FILE
 
 Facts = Callable[[Path], TableFacts | None]
-"""Returns the properties of a table that are known without reading it; None if they are not."""
+"""Returns the properties of a table that are known without reading it; None if they are unknown."""
 
 
 def unknown(_: Path) -> None:
@@ -24,7 +24,7 @@ def unknown(_: Path) -> None:
 
 
 def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column, ...]:
-    """Return every column of the tables: those of every trial first, then others in the order of the tables.
+    """Return all columns of the tables: first the columns of every trial, then others in the order of the tables.
 
     A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
     kind of step, by its name with or without the name of the step; otherwise it is text
@@ -61,7 +61,7 @@ def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
 
 
 def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str, Column]:
-    """Return the columns of several plans by name; of compatible columns of one name, the first is kept.
+    """Return the columns of several plans by name; if columns of one name are compatible, the first is kept.
 
     Args:
         declared: Plans with their columns.
@@ -98,7 +98,7 @@ def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def frozen_columns(table: Path) -> tuple[Column, ...]:
-    """Return the columns that a dataset declares, or those in the plan in the folder of a table.
+    """Return the columns that a dataset declares, or the columns in the plan in the folder of a table.
 
     Raises:
         ConfigurationError: The plan cannot be read.
@@ -132,7 +132,7 @@ def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
 
 
 def _type_of(column: Column) -> tuple[object, ...]:
-    """Return the properties in which two columns must agree for their values to be combined; texts always can be."""
+    """Return the properties that must be equal to combine values of two columns; for texts they always are."""
     figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 

@@ -63,11 +63,11 @@ class ArduCopter:
     checks_present_mode = False
 
     def matches(self, autopilot: int, vehicle: int) -> bool:
-        """Return True for an ArduPilot on a multicopter or helicopter."""
+        """Return True if the autopilot is ArduPilot and the vehicle is a multicopter or helicopter."""
         return autopilot == _ARDUPILOT and vehicle in _COPTERS
 
     def is_guided(self, mode: int) -> bool:
-        """Return True in GUIDED."""
+        """Return True in GUIDED, the mode in which it follows set-points."""
         return mode == _GUIDED
 
     def is_program_controlled(self, mode: int) -> bool:
@@ -75,7 +75,7 @@ class ArduCopter:
         return mode in (_AUTO, _GUIDED)
 
     def lands_or_returns(self, mode: int) -> bool:
-        """Return True in RTL, LAND, SMART_RTL and AUTO_RTL."""
+        """Return True in the modes in which it lands automatically: RTL, LAND, SMART_RTL and AUTO_RTL."""
         return mode in (_RTL, _LAND, _SMART_RTL, _AUTO_RTL)
 
     def is_failsafe_hold(self, mode: int) -> bool:  # noqa: ARG002

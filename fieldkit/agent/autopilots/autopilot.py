@@ -1,6 +1,6 @@
 """State of a drone's autopilot, and commands to it, over MAVLink, for programs on the drone's computer.
 
-Messages, commands and their numbers are those of https://mavlink.io/en/messages/common.html.
+Messages, commands and their numbers are defined in https://mavlink.io/en/messages/common.html.
 """
 
 from __future__ import annotations
@@ -241,7 +241,7 @@ class AutopilotState:
         return self._yaw_rad if time.monotonic() - self._attitude_s < FRESH_S else None
 
     def receive(self) -> None:
-        """Process the frames that have arrived. Damaged frames and those of other systems are ignored."""
+        """Process the frames that have arrived. Damaged frames and frames of other systems are ignored."""
         for frame in self.link.receive():
             if not is_intact(frame):
                 continue

@@ -1,6 +1,6 @@
 """Interface of a flight dialect: the modes, commands and parameters of one family of autopilots.
 
-Commands and their numbers are those of https://mavlink.io/en/messages/common.html.
+Commands and their numbers are defined in https://mavlink.io/en/messages/common.html.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class FlightDialect(Protocol):
         """Return True if it lands, or returns and lands, automatically in a mode."""
 
     def is_failsafe_hold(self, mode: int) -> bool:
-        """Return True if a mode is the one in which its failsafe for missing set-points holds the position."""
+        """Return True if its failsafe for missing set-points holds the position in this mode."""
 
     def mode_name(self, mode: int) -> str:
         """Return the name of a mode, or its number if the mode is unknown."""

@@ -138,7 +138,7 @@ class FlightRecorder:
             self._missing.discard(message.kind)
 
     def send(self) -> None:
-        """Send heartbeats, and the requests for messages until the link server has them."""
+        """Send heartbeats, and send each request for a message until the link server has it."""
         now_s = time.monotonic()
         if now_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = now_s + _HEARTBEAT_S

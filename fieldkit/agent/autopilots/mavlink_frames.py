@@ -120,7 +120,7 @@ class FrameWriter:
         return bytes((_MAGIC_2,)) + body + checksum(body + bytes((CRC_EXTRA[kind],))).to_bytes(2, "little")
 
     def heartbeat(self, vehicle: int = TYPE_LOG) -> bytes:
-        """Return a heartbeat. By default from a logger: no autopilot starts a failsafe when it stops."""
+        """Return a heartbeat, by default of a logger: no autopilot starts a failsafe when a logger stops."""
         return self.frame(HEARTBEAT, struct.pack("<IBBBBB", 0, vehicle, NO_AUTOPILOT, 0, _ACTIVE, _VERSION))
 
     def command(self, target: tuple[int, int], command: int, *parameters: float) -> bytes:

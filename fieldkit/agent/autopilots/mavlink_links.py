@@ -24,7 +24,7 @@ class FlightLink(Protocol):
     def send(self, frame: bytes) -> None:
         """Send a frame; it is dropped if the connection is closed or busy.
 
-        A request for the interval of a message goes to the link server, which combines those of all programs.
+        A request for the interval of a message goes to the link server, which combines the requests of all programs.
         """
 
     def close(self) -> None:

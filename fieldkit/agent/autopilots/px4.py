@@ -46,20 +46,20 @@ class Px4:
     checks_present_mode = True
 
     def matches(self, autopilot: int, vehicle: int) -> bool:  # noqa: ARG002 (all vehicles have the same modes)
-        """Return True for each PX4."""
+        """Return True if the autopilot is PX4, on any vehicle."""
         return autopilot == _PX4
 
     def is_guided(self, mode: int) -> bool:
-        """Return True in OFFBOARD."""
+        """Return True in OFFBOARD, the mode in which it follows set-points."""
         return _mode_parts(mode)[0] == _OFFBOARD
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True in OFFBOARD and in AUTO modes for programs; AUTO.LOITER follows each take-off and each move."""
+        """Return True in OFFBOARD and in AUTO modes for programs. AUTO.LOITER begins after each take-off and move."""
         main, sub = _mode_parts(mode)
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
 
     def lands_or_returns(self, mode: int) -> bool:
-        """Return True in AUTO.RTL, AUTO.LAND and AUTO.PRECLAND."""
+        """Return True in the modes in which it lands automatically: AUTO.RTL, AUTO.LAND and AUTO.PRECLAND."""
         main, sub = _mode_parts(mode)
         return main == _AUTO and sub in (_RTL, _LAND, _PRECLAND)
 

@@ -1,7 +1,7 @@
 """Drive a ground robot along its path by its velocity topic, in a closed loop on its odometry.
 
-The laptop renews its order repeatedly (`orders`). If it does not do so within the lease of the task, the laptop or
-the link to it is lost, and the robot stops. Twists are published `RATE_HZ` times per second; the base of a robot
+The laptop renews its order repeatedly (`orders`). If no order arrives within the lease of the task, the laptop or the
+link to it is lost, and the robot stops. Twists are published `RATE_HZ` times per second; the base of a robot
 stops when no more Twists arrive.
 """
 
@@ -28,7 +28,7 @@ RATE_HZ = 20.0
 _MIN_STOP_S = 0.5
 """Minimum time for which zero Twists are published at the end, because one may be lost."""
 _MAX_STOP_S = 1.5
-"""Maximum time for which they are published while odometry shows that the robot still moves."""
+"""Maximum time for which zero Twists are published while odometry shows that the robot still moves."""
 _TIMEOUT_S = 15.0
 """Timeout for a subscription to the velocity topic, and for the first odometry."""
 _LOG_INTERVAL_S = 0.1
@@ -111,7 +111,7 @@ def twist(velocity: DriveVelocity, *, cdr: bool) -> bytes:
 
 
 def read_odometry(data: bytes, *, cdr: bool) -> OdometryPose | None:
-    """Return the pose in a serialized `nav_msgs/Odometry`, or None if the data are not a valid one.
+    """Return the pose in a serialized `nav_msgs/Odometry`, or None if the data are invalid.
 
     The pose follows a header (in ROS 1 with a sequence number before the time), the frame id of the header and the
     child frame id. Strings follow their length; in CDR they end with a zero byte, and doubles are aligned to 8 bytes.

@@ -38,8 +38,8 @@ _STILL_M, _STILL_RAD, _STILL_S = 0.05, 0.05, 0.4
 """A robot whose odometry changes by less than this distance and angle during this time is stationary."""
 _WAITS, _RETURNS = "waits", "returns"
 _STUCK_M, _STUCK_S = 0.5, 2.0
-"""Progress is checked after a commanded distance of `_STUCK_M` plus that of `_STUCK_S` at full speed; at least a
-quarter of it must be driven."""
+"""Progress is checked after a commanded distance: `_STUCK_M`, plus the distance of `_STUCK_S` at full speed. At least
+a quarter of it must have been driven."""
 
 
 class OdometryPose(NamedTuple):
@@ -274,7 +274,7 @@ class Driver:
     def _makes_progress(self, relative_pose: OdometryPose, elapsed_s: float) -> bool:
         """Return True if the robot moves as commanded.
 
-        This detects odometry that repeats one pose, which is neither silent nor beyond the fence.
+        This detects odometry that repeats one pose, which the timeout and the fence do not detect.
         """
         self._commanded_m += self._velocity.forward_m_s * elapsed_s
         self._moved_m = max(self._moved_m, math.dist(self._progress_position, (relative_pose.x_m, relative_pose.y_m)))

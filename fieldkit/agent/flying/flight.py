@@ -42,7 +42,7 @@ _SLOW_M_S = 0.2
 _LIFTED_M = 0.3
 """A drone that is higher than this above the ground has taken off."""
 _RISEN_FRACTION = 0.9
-"""Fraction of the height of a take-off by command after which set-points are sent."""
+"""After a take-off by command, set-points are sent from this fraction of the target height."""
 _SET_POINTS_S = 1.0
 """Set-points are sent for this time before the mode that follows them is selected (PX4 user guide, offboard mode)."""
 _COORDINATES_S = 3.0

@@ -32,7 +32,7 @@ class OriginError(Exception):
 
 @dataclass(frozen=True)
 class FlightOrigin:
-    """Position and heading of a drone at its first start in a trial. The fields are those of a `MotionOrigin`.
+    """Position and heading of a drone at its first start in a trial. The fields are the same as in `MotionOrigin`.
 
     Attributes:
         frame: `FRAME`.
@@ -85,7 +85,7 @@ def frame_id(computer: str, booted_s: float) -> str:
 
 
 def is_same_frame(identifier: str, other_identifier: str) -> bool:
-    """Return True if two identifiers of `frame_id` denote the same frame, without a reboot between."""
+    """Return True if two identifiers of `frame_id` denote the same frame, without a reboot between them."""
     (computer, _, booted), (other_computer, _, other_booted) = (
         identifier.rpartition(" "),
         other_identifier.rpartition(" "),
@@ -100,7 +100,7 @@ def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> Flight
     """Return the origin of a flight in the frame of its start.
 
     The heading of a recorded origin is kept. If latitude and longitude of both positions are known, they give its
-    position in the frame of the start; otherwise the frame must be the one of the first start.
+    position in the frame of the start; otherwise the frame must be the same as at the first start.
 
     Args:
         recorded: The origin of the trial; None for its first start, which becomes the origin.

@@ -40,7 +40,7 @@ class AutopilotSession:
         self._next_heartbeat_s = 0.0
 
     def exchange(self, duration_s: float) -> None:
-        """Receive and send messages for this time in seconds; at least receive those that have arrived."""
+        """Receive and send messages for this time in seconds; 0 s receives the messages that have arrived."""
         end_s = time.monotonic() + duration_s
         if time.monotonic() > self._next_heartbeat_s:
             self._next_heartbeat_s = time.monotonic() + _HEARTBEAT_INTERVAL_S

@@ -157,7 +157,7 @@ def _make_struct(name: str, topic: Topic, struct_by_name: dict[str, type]) -> ty
 def padded(data: bytes) -> bytes:
     """Return a sample as sent: padded to a multiple of 4 bytes, with the number of added bytes in its header.
 
-    RTPS 2.5, section 10.2 (the two lowest bits of the encapsulation's options, of XTypes 1.3, section 7.6.3.1.2).
+    RTPS 2.5, section 10.2 (the two lowest bits of the encapsulation options; XTypes 1.3, section 7.6.3.1.2).
     """
     added = -len(data) % 4
     return data if not added else data[:3] + bytes([data[3] & ~3 | added]) + data[4:] + bytes(added)

@@ -1,9 +1,9 @@
-"""The log of a publisher or subscriber: a magic number and records of fixed size, of which a kill loses none.
+"""The log of a publisher or subscriber: a magic number and records of fixed size. No record is lost by a kill.
 
-The log is mapped into memory. A store into the mapping survives the process, as data passed to `write`, but needs no
-system call, so that logging does not delay samples. The file grows in pieces that are allocated on disk before they
-are mapped: a full disk causes an error then, instead of SIGBUS at a later store. (A failing disk still causes
-SIGBUS.) If a log was not closed, zeros follow its last record.
+The log is mapped into memory. Data in the mapping survive the process, like data passed to `write`, but a store needs
+no system call, so that logging does not delay samples. The file grows in pieces. A piece is allocated on disk before
+it is mapped, so that a full disk causes an error then, instead of SIGBUS at a later store. (A failing disk still
+causes SIGBUS.) If a log was not closed, zeros follow its last record.
 
 `fieldkit.ros.streams.topic_samples` reads it.
 """
@@ -18,9 +18,9 @@ import zlib
 
 MAGIC = b"fieldkit topic 1"
 RECORD = struct.Struct("<HHIqqq")
-"""Kind, unused, size in bytes, sequence number, send time, local time; times in nanoseconds since 1970 UTC.
+"""Fields of a record: kind, unused, size in bytes, sequence number, send time, local time.
 
-The local time of a record is never 0, so a record of zeros is an unused one.
+Times are in nanoseconds since 1970 UTC. The local time of a record is never 0, so a record of zeros is an unused one.
 """
 
 SAMPLE = 1

@@ -29,7 +29,7 @@ def start(network: Network) -> Ros2Middleware:
 
 
 def environment(network: Network) -> dict[str, str]:
-    """Return the environment variables for these network settings; all others are those of the robot.
+    """Return the environment variables for these network settings. Other variables are unchanged on the robot.
 
     docs.ros.org, "Improved Dynamic Discovery": with `LOCALHOST` there is no multicast on the network, but static
     peers are contacted. Available since ROS 2 Iron; earlier versions support multicast only.

@@ -1,7 +1,7 @@
 """Zenoh with the binding of the package `eclipse-zenoh`, compatible with rmw_zenoh. Only this module imports it.
 
-By docs/design.md of github.com/ros2/rmw_zenoh the key expression contains the type's name and hash, each sample has
-an attachment, and each node and endpoint a liveliness token. The laptop computes the key expressions
+According to docs/design.md of github.com/ros2/rmw_zenoh, a key expression contains the type's name and hash, each
+sample has an attachment, and each node and endpoint has a liveliness token. The laptop computes the key expressions
 (`fieldkit.ros.interfaces.names`).
 """
 

@@ -41,12 +41,12 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "completion": "print a shell script for Tab completion",
     }
 )
-"""The order is that of the help."""
+"""The help lists the commands in this order."""
 LISTINGS: Final = ("robots", "procedures", "columns")
 """Commands in the module `listings`."""
 
 FROM_ENTRY_POINTS: Final = frozenset({"bag", "bridge", "middleware", "stop"})
-"""Commands whose modules are found by entry points (`plugin_targets`); without these the help omits them."""
+"""Commands whose modules are found by entry points (`plugin_targets`). The help omits a command without one."""
 
 
 def add_all(commands: Commands) -> None:

@@ -98,7 +98,7 @@ def _robots_of_lab() -> list[str]:
 
 
 def _trials(prefix: str) -> Iterator[str]:
-    """Yield trials and other folders whose paths start with `prefix`; without a prefix also those in `trials`."""
+    """Yield trials and other folders whose paths start with `prefix`; without a prefix also trials in `trials`."""
     folder = os.path.dirname(prefix)  # noqa: PTH120 (a Path drops `./` and a trailing slash)
     for parent in (folder,) if prefix else ("", _TRIALS):
         try:

@@ -53,7 +53,7 @@ def _list_or_show(kind: locations.Kind, summary: Callable[[str], str], name: str
     """List all files of `kind`, or show the file called `name`."""
     if name is None:
         rows = [(item, str(path), summary(item)) for item, path in locations.names(kind).items()]
-        table(("name", "file", "summary"), rows)  # only the last column may be folded; a path must not be
+        table(("name", "file", "summary"), rows)  # only the last column is folded, so paths are not
     else:
         summary(name)  # raises if the file has an error
         print_text(locations.find(kind, name).read_text(encoding="utf-8"), end="")
@@ -75,7 +75,7 @@ _SHOW: Final = "show"
 
 
 def run_columns(arguments: argparse.Namespace) -> int:
-    """List all columns or those of a procedure, or show one."""
+    """List all columns or the columns of a procedure, or show one."""
     if arguments.filled not in {None, _SHOW}:
         if arguments.column is not None:
             raise ConfigurationError(
@@ -104,7 +104,7 @@ def _columns_of(procedure: str) -> int:
 
 
 def _columns(name: str | None) -> int:
-    """List the columns of all files, or those called `name`."""
+    """List the columns of all files, or the columns called `name`."""
     from fieldkit.analysis.quantities import DEFAULT_BY
     from fieldkit.trial.columns import installed
 

@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     from fieldkit.cli import cli_options, results
     from fieldkit.trial.running import resumption
 
-    resumption.resumable(arguments.trial)  # raise errors of the trial before those of site files and backends
+    resumption.resumable(arguments.trial)  # raise errors of the trial before errors of site files and backends
     with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         folder = arguments.trial.resolve().parent

@@ -65,7 +65,8 @@ COLUMNS: Final = columns(
 _OUT: Final = frozenset({"out", "there"})
 _PHASES: Final = frozenset({"waits", "back", HOME}) | _OUT
 _SPEED_INTERVAL_S: Final = 0.5
-"""Interval of speeds: one odometry message more or less changes a speed by 3 % at 50 Hz and by 7 % at 30 Hz."""
+"""Interval over which a speed is computed. One odometry message more or less changes it by 3 % at 50 Hz and by 7 %
+at 30 Hz."""
 _ROUNDING: Final = 1e-4
 
 

@@ -60,7 +60,7 @@ def time_contradictions(log: Sequence[MotionMoment], window: tuple[int, int] | N
     """Yield the contradictions between the times of a log, one sentence each.
 
     Args:
-        log: Its lines; those without a time by the robot's clock are not checked.
+        log: Its lines; lines without a time by the robot's clock are not checked.
         window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
     timed = [moment for moment in log if moment.utc_ns]

@@ -20,7 +20,7 @@ from fieldkit.measure.evidence.sequence import NUMBERS, SILENCE_US
 _MIN_MESSAGES: Final = 10
 """A stream with fewer messages is not counted."""
 _MIN_INTERVALS: Final = 3
-"""Minimum number of intervals without a missing number from which a period is estimated."""
+"""Minimum number of intervals without a missing sequence number that are needed to estimate a period."""
 _REQUEST_TOLERANCE: Final = 0.25
 """Maximum relative difference between the observed and the requested period of a granted request. A station that
 changes the rate changes it by more. The observed mean is too short, because long intervals contain a missing number
@@ -33,8 +33,8 @@ _PHASE_GAIN: Final = 0.03
 """Share of a deviation by which the schedule is corrected. With a larger gain, late messages shift the schedule; with
 a smaller one, it does not follow the drift of a period that is known to 0.1 %."""
 _SKIP_COST: Final = 1.0
-"""Cost of a period that the autopilot skipped, in squared periods: more than the deviation of a late message,
-less than two of them."""
+"""Cost of a period that the autopilot skipped, in squared periods: more than the squared deviation of one late
+message, less than the sum for two."""
 _HYPOTHESES: Final = 4
 """Number of hypotheses that are kept; after late messages two or three are still possible."""
 

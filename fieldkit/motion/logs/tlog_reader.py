@@ -241,7 +241,7 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
     """Yield time of arrival in us, the autopilot's time in ms, three coordinates and the heading of each message.
 
     The coordinates of `LOCAL_POSITION_NED` are metres east, north and up; those of `GLOBAL_POSITION_INT` are latitude
-    and longitude in degrees, and metres up. The heading is that of the last ATTITUDE, in radians from east to north.
+    and longitude in degrees, and metres up. The heading is from the last ATTITUDE, in radians from east to north.
     """
     decoder, heading_rad, rows = TlogDecoder(), math.nan, []
     for frame in frames(data):

@@ -2,9 +2,8 @@
 
 A guard runs on the drone's computer while the steps run, and exits without an action when they are done. It lands the
 drone or lets it return if the attempt's jobs are stopped (Ctrl-C, an error, `fieldkit abort`), or if no order arrives
-from the laptop for `piloting.LEASE_S`; but not while a person or a failsafe controls the drone
-(`fieldkit.agent.flying.guard`).
-A step `fly` has a separate guard.
+from the laptop for `piloting.LEASE_S`. It does nothing while a person or a failsafe controls the drone
+(`fieldkit.agent.flying.guard`). The step `fly` starts a separate guard for its drone.
 """
 
 from collections.abc import Iterator, Mapping

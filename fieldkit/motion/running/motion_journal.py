@@ -80,7 +80,7 @@ _CODEC: Final = Codec(MotionEntry)
 
 
 def journal_of(trial: Path) -> Path:
-    """Return the path of the journal of motions of a trial, which is that of its campaign if it belongs to one."""
+    """Return the path of the journal of motions: in the folder of the campaign if there is one, else of the trial."""
     campaign = trial.parent
     return (campaign if (campaign / laptop_files.CAMPAIGN).is_file() else trial) / MOTION_FILE
 
@@ -94,7 +94,7 @@ def place_of(role: Role, placement: Placement) -> str:
 
 
 def origins(entries: Sequence[MotionEntry]) -> Mapping[str, MotionEntry]:
-    """Return the entry of the valid origin of each robot by name; a robot has none after a person moved it back."""
+    """Return the entry with the valid origin of each robot, by name. A confirmation by a person ends its validity."""
     by_robot: dict[str, MotionEntry] = {}
     for entry in entries:
         if entry.event is MotionEvent.ORIGIN:
@@ -244,7 +244,7 @@ class JournaledOrigins:
 
     @contextmanager
     def moving(self, role: Role) -> Iterator[RobotMotion]:
-        """Record start and end of a motion; a motion that is not over when the body ends leaves the robot held."""
+        """Record start and end of a motion. If the motion is not over when the body ends, the robot is held."""
         self.require()
         name, motion, why = self._robots[role], RobotMotion(), "it stopped on its path"
         self._journal.add(MotionEvent.BEGUN, name)

@@ -20,7 +20,7 @@ def arming_need(robot: Robot, role: Role, plan: FlightPlan) -> Need:
 
 
 def _judge(result: CommandResult) -> tuple[Verdict, str, str]:
-    """Return verdict, detail and remedy from the output of the agent's `arming`; grave faults come first."""
+    """Return verdict, detail and remedy from the output of the agent's `arming`; severe faults come first."""
     try:
         *faults, status = (json.loads(line) for line in result.text.splitlines())
         faults.sort(key=lambda fault: not fault["grave"])

@@ -21,7 +21,7 @@ from fieldkit.remote.shell import Shell
 START_S: Final = 40.0
 """Time for the start of Python, the middleware and both topics."""
 _RENEWALS: Final = 5
-"""Renewals per lease."""
+"""Number of renewals within the duration of a lease."""
 _SILENT_S: Final = 10.0
 STATUS: Final = "drive.status"
 """File with the status of the driver; its name is prefixed as `driving.planned` describes."""
@@ -80,9 +80,9 @@ class DriveLease(LeaseKeeper):
 
     @property
     def end_state(self) -> str:
-        """Why the drive has ended, `home` if the robot is back at its place; empty while it drives.
+        """Reason why the drive has ended, `home` if the robot is back at its place; empty while it drives.
 
-        The driver writes its status ten times a second. A driver without a new status has exited or is out of reach.
+        The driver writes its status ten times a second. If there is no new one, it has exited or cannot be reached.
         """
         status, silent_s = self.status, self.unchanged_s
         if isinstance(ended := status.get("ended"), str) and ended:

@@ -295,7 +295,7 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
 def _bring_back(
     testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
 ) -> str:
-    """Let a robot drive back; if it fails and `by_hand` is set, let the operator bring it.
+    """Let a robot drive back; if this fails and `by_hand` is set, ask the operator to bring it back.
 
     Return `DriveLease.end_state`.
 

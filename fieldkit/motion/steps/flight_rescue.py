@@ -24,7 +24,8 @@ SILENCE_TIMEOUT_S: Final = 0.6
 increments its counter ten times a second."""
 _POLL_S: Final = 0.15
 _MAX_STEP_S: Final = 0.4
-"""Maximum time that is counted between two polls, because the programs still run after a suspension of the robot."""
+"""Maximum time that one poll adds to the silence. If the whole robot was suspended, two polls are far apart although
+the programs still run."""
 
 
 class LivenessMonitor:

@@ -49,14 +49,14 @@ _Distance = Annotated[Length, Field(gt=0)] | None
 _MOTORS_OFF_S: Final = 60.0
 """Timeout until the motors are off; after an aborted attempt the drone may still be landing."""
 _SLACK_S: Final = 30.0
-"""Additional time for the change of mode, the motors and the last metre; again for the landing."""
+"""Additional time of a take-off for the change of mode, the motors and the last metre; the same for a landing."""
 _SLOWEST_M_S: Final = 0.3
 """Lower bound of the landing speed. PX4 lands at 0.7 m/s (MPC_LAND_SPEED), slower near the ground (MPC_LAND_CRWL)."""
 _LIMIT_S: Final = 3600.0
 _AT_REST_S: Final = 3.0
 """Approximate time that the log covers before the take-off and after the landing."""
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
+"""Growth of the log: ten lines a second (`agent/flying/flight_log.py`), each of about 200 bytes."""
 
 
 class FlyLeg(PathLeg):
@@ -188,7 +188,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
 
     @property
     def _lease_s(self) -> float:
-        """Lease of the guard, which must not expire before the pilot's."""
+        """Lease of the guard, which must not expire before the lease of the pilot."""
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
@@ -297,7 +297,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, may_send=may_send)
 
     def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, flight: piloting.FlightLease) -> None:
-        """Give the orders of the flight; the origin is stored before the first one that moves the drone."""
+        """Give the orders of the flight; the origin is stored before the first order that moves the drone."""
         name = scene.robot(self.robot).name
         self._wait_for_start(scene, flight)
         with origins_of(scene).moving(self.robot) as motion:

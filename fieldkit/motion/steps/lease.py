@@ -24,8 +24,8 @@ from fieldkit.steps.scene import Announce, Scene
 
 _POLL_S: Final = 0.25
 
-# Writes the order $3 atomically into the file $2 and prints the program's output file $4; prints the exit code, which
-# is in the file $1 after the program has exited, to standard error.
+# Writes the order $3 atomically into the file $2, and prints the program's output file $4. After the program has
+# exited, the file $1 contains its exit code, which is printed to standard error.
 _ORDER: Final = (
     'printf "%s\\n" "$3" >"$2.$$" && mv -f "$2.$$" "$2" && { cat "$4" 2>/dev/null; [ ! -s "$1" ] || cat "$1" >&2; }'
 )
@@ -54,7 +54,7 @@ class LeaseKeeper:
         order: The first order.
         lease_s: Time in seconds until an order expires.
         renewals: Number of renewals in that time.
-        silent_lease_s: Time until an order expires if nothing may be sent meanwhile; None to renew the order.
+        silent_lease_s: Time until an order expires if nothing may be sent meanwhile; None if orders are renewed.
 
     Attributes:
         output: Content of the output file at the last renewal.

@@ -58,7 +58,8 @@ _FRAME_BYTES: Final = 40
 _STAMP_BYTES: Final = 8
 _START_S: Final = 2.0
 _READY_S: Final = 75
-"""Longer than the timeout of the recorder, 60 s. ArduCopter sends LOCAL_POSITION_NED about 30 s after its boot."""
+"""Timeout for the start of the recorder, whose own timeout is 60 s: ArduCopter sends LOCAL_POSITION_NED about 30 s
+after its boot."""
 _ON_GROUND_M: Final = 0.1
 """Lower heights are noise of the position estimate of a drone on the ground."""
 _EXTRA_S: Final = 2
@@ -74,7 +75,7 @@ def _is_message(name: str) -> str:
 class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, WritesOnLaptop, Summarizes):
     """Records the telemetry of a robot's autopilot while the steps in `during` run.
 
-    That is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
+    Telemetry is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
     the columns. The profile of the robot needs `mavlink`. Writes `mavlink.tlog`, `mavlink.json` (counters of the
     recorder) and `ROLE-mavlink.log`; with `positions` also `positions.json` and the columns of a `track`.
 
@@ -164,7 +165,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """Yield the check of the connection to the autopilot; over the radio its loss is a measurement instead."""
+        """Yield the check of the connection to the autopilot; none over the radio, whose losses are measured."""
         if self.recorder == self.robot:
             yield link_need(scene.robot(self.recorder), self.recorder, self._connection(scene), ("recorder",))
 

@@ -38,7 +38,7 @@ from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.view import View
 
 _LOG_BYTES_PER_S: Final = 2200.0
-"""Ten lines a second (`agent/driving/drive.py`), each of about 220 bytes."""
+"""Growth of the log: ten lines a second (`agent/driving/drive.py`), each of about 220 bytes."""
 _FENCE_MARGIN_M: Final = 0.5
 """Distance between the fence and the end of a shortened path, because the robot may overshoot."""
 
@@ -59,16 +59,16 @@ class MoveStep(
 
     So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
     on the ground of their world, and return instantly; in the field the operator is asked to start the motion and
-    to bring the robot back. Ground robots that [fieldkit drives](motion.md) do both, with `--allow-motion`, and
-    leave `drive.jsonl`. `--dry-run` describes the path. A move may be inside another one of another robot, with a
-    `name` for one of them, since each may leave such a file; a `fault` may be inside a move, but not a move inside
-    a fault.
+    to bring the robot back. Ground robots that [fieldkit drives](motion.md) move and return automatically, with
+    `--allow-motion`, and write `drive.jsonl`. `--dry-run` describes the path. A move may be inside a move of another
+    robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move, but not
+    a move inside a fault.
 
     Attributes:
         robot: Role that moves.
         path: Its path, a list of straight segments; each begins where the previous one ends.
-        speed: Speed, `0.2m/s`; at most `limits.max_speed_m_s` of its profile, or the trial is refused. Without it,
-            that speed.
+        speed: Speed, `0.2m/s`; by default `limits.max_speed_m_s` of its profile. A trial with a higher speed is
+            refused.
         within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
             as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
             Otherwise the trial is refused.
@@ -89,7 +89,7 @@ class MoveStep(
 
     @override
     def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
-        """Return the step with a speed, and with `within_limits` reduced to the robot's limits."""
+        """Return the step with a speed. With `within_limits`, path and speed are reduced to the robot's limits."""
         robot = cast[self.robot]
         fastest_m_s, fence_m = robot.profile.limits.max_speed_m_s, robot.profile.limits.fence_m
         speed_m_s = fastest_m_s if self.speed is None else self.speed
@@ -247,7 +247,7 @@ class MoveStep(
 
     @override
     def measure(self, view: View) -> Measured:
-        """Return the values of the drive, without those that other sources of the robot's position contradict."""
+        """Return the values of the drive, without values that other sources of the robot's position contradict."""
         if not self.driven:
             return Measured()
         log = view.evidence.read_or_none(drive_log.read, self._log)

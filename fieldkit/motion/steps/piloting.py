@@ -37,8 +37,8 @@ LEASE_S: Final = 15.0
 READY: Final = " ready"
 _GUARD_S: Final = 86_400.0
 _RESCUE_S: Final = 900.0
-"""Longer than any landing, and shorter than the time until the robot's lock expires, so that the start of the rescue
-need not extend the lock."""
+"""Time limit of the rescue's job: longer than any landing, and shorter than the lifetime of the robot's lock, so that
+the lock need not be extended when the rescue starts."""
 _RENEWALS: Final = 3
 """Renewals per lease, so that one may be late."""
 _GUARD_EXIT_S: Final = 10.0
@@ -242,7 +242,7 @@ class FlightLease(LeaseKeeper):
         """Wait until the program reports that it has reached a state.
 
         Args:
-            mark: The state, as at the end of a line of the log.
+            mark: The state, as printed at the end of a line of the log.
             within_s: Timeout in seconds.
 
         Raises:

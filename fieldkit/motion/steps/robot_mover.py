@@ -19,7 +19,7 @@ _REPLY_S: Final = 3.0
 """After this time without an answer a robot is reported as out of reach; a control connection answers in 0.1 s."""
 _POLL_S: Final = 0.5
 _LANDING_S: Final = 600.0
-"""Maximum wait for a landing, equal to that of the pilot (`fieldkit.agent.flying.landing`)."""
+"""Maximum wait for a landing; the pilot waits equally long (`fieldkit.agent.flying.landing`)."""
 
 
 class RobotMover(NamedTuple):

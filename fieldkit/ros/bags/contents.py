@@ -61,7 +61,7 @@ class BagContents:
 
     @property
     def messages(self) -> int:
-        """Number of messages by its index."""
+        """Number of messages according to its index."""
         return sum(topic.messages for topic in self.topics)
 
 

@@ -1,9 +1,9 @@
 """Discovery time and gaps of recorded topics, from the recorder's log and its bag; both use the robot's clock.
 
 rosbag of ROS 1 logs `[ INFO] [1795208123.219164628]: Subscribing to /scan` before it queries the master for the
-publishers, and that of ROS 2 `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...` before it
-starts discovery. The bag has the time of each message by the same clock (recorder.cpp of ros_comm 1.15 and of
-rosbag2).
+publishers. The recorder of ROS 2 logs `[INFO] [1795208123.219164628] [rosbag2_recorder]: Listening for topics...`
+before it starts discovery. The bag has the time of each message by the same clock (recorder.cpp of ros_comm 1.15 and
+of rosbag2).
 """
 
 import re

@@ -53,7 +53,7 @@ def answer(request: Json) -> Json:
 
 
 def inspect(bag: BagFiles, *, read_all: bool) -> Json:
-    """Return the contents of a bag by its index, and its problems; `read_all` reads and decodes all messages."""
+    """Return the contents of a bag from its index, and its problems; `read_all` reads and decodes all messages."""
     result: Json = {"topics": [], "started_utc_ns": 0, "duration_s": 0.0, "compression": "none"}
     problems = list(_unclosed(bag))
     if not problems:

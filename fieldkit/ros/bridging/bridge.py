@@ -1,8 +1,8 @@
 """Bridge topics between two middlewares as serialized messages: ROS 1, DDS and Zenoh.
 
-Between ROS 1 and ROS 2 rosbags converts the bytes without deserializing them. `seq` of a header, which ROS 2 does not
-have, is dropped towards ROS 2, and 0 towards ROS 1. Samples do not loop: each side ignores the samples that it has
-published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
+Between ROS 1 and ROS 2 rosbags converts the bytes without deserializing them. Headers of
+ROS 2 have no `seq`: it is omitted in messages to ROS 2, and is 0 in messages to ROS 1. Samples do not loop: each side
+ignores the samples that it has published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
 """
 
 import os
@@ -128,7 +128,7 @@ def bridged(
     """Bridge two sides while the body runs.
 
     Args:
-        near: The source of topics, and the target of those with `Crossing.back`.
+        near: The source of topics, and the target of topics with `Crossing.back`.
         far: The other side.
         crossings: The topics.
         types: The message types.
@@ -158,7 +158,7 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
         ConfigurationError: A topic cannot be bridged.
     """
     if near.over == far.over:
-        # Forwarded samples could not be recognized: both sides are the same node, or share a network.
+        # Forwarded samples could not be recognized, because both sides are the same node, or share a network.
         raise ConfigurationError(
             f"a bridge cannot connect {near.over} with {far.over}", remedy="name two different middlewares"
         )

@@ -2,7 +2,8 @@
 
 Most types have the same name and members in both. Time and duration are messages of `std_msgs` in ROS 1 and of
 `builtin_interfaces` in ROS 2, with the same two numbers (ros1_bridge maps them in the same way). Since Iron,
-`sensor_msgs/Range` has an additional last member: it is 0 in messages from ROS 1, and is dropped towards ROS 1.
+`sensor_msgs/Range` has an additional last member: it is 0 in messages from ROS 1, and is removed from messages to
+ROS 1.
 """
 
 import struct
@@ -27,7 +28,7 @@ ROS2_NAMES: Final[Mapping[str, str]] = MappingProxyType(
 _ROS1_NAMES: Final = {ros2: ros1 for ros1, ros2 in ROS2_NAMES.items()}
 
 ADDED: Final[Mapping[str, Mapping[str, bytes]]] = MappingProxyType(
-    {"sensor_msgs/msg/Range": {"variance": bytes(4)}}  # float32, of which 0 is "unknown" (Range.msg)
+    {"sensor_msgs/msg/Range": {"variance": bytes(4)}}  # a float32; 0 means "unknown" (Range.msg)
 )
 """Members that ROS 2 adds at the end of a type, with their bytes in messages from ROS 1."""
 
@@ -56,7 +57,7 @@ class Counterparts:
             return bytes(types.ros2.ros1_to_cdr(data + self.added, self.ros2))
 
     def to_ros1(self, types: MessageTypes, data: bytes) -> bytes:
-        """Return a message in CDR in the serialization of ROS 1.
+        """Return a CDR message in the serialization of ROS 1.
 
         Raises:
             SerdeError: The data are not a message of this type.
@@ -70,7 +71,7 @@ class Counterparts:
 
 @contextmanager
 def _any_error_as_serde_error(kind: str) -> Iterator[None]:
-    """Convert exceptions of rosbags for truncated messages to `SerdeError`, as it raises for other invalid ones."""
+    """Convert exceptions for truncated messages to `SerdeError`, which rosbags raises for other invalid messages."""
     try:
         yield
     except (ValueError, IndexError, AssertionError, struct.error) as error:

@@ -1,8 +1,8 @@
 """ROS message types by name: definitions, MD5 sums of ROS 1, type hashes of ROS 2, and fields.
 
-rosbags contains the standard types of ROS except tf2_msgs; this and the custom types of a lab are parsed from their
-definitions. The MD5 sum is that of gentools (wiki.ros.org/ROS/Technical Overview), the type hash is RIHS01 of
-REP-2016: SHA-256 of the type's description as JSON.
+rosbags contains the standard types of ROS except tf2_msgs. The types of tf2_msgs and the custom types of a lab are
+parsed from their definitions. The MD5 sum is defined by gentools (wiki.ros.org/ROS/Technical Overview). The type hash
+is RIHS01 of REP-2016: SHA-256 of the type's description as JSON.
 """
 
 from collections.abc import Mapping
@@ -44,7 +44,7 @@ class Distribution(StrEnum):
 
     @property
     def gid_bytes(self) -> int:
-        """Length of a GID in its rmw_dds_common."""
+        """Length in bytes of a GID in the messages of its rmw_dds_common."""
         return 16 if self.has_type_hashes else 24
 
 

@@ -11,8 +11,8 @@ from types import MappingProxyType
 from typing import Final
 
 _DDS: Final = {
-    # Default 14720 B: a datagram of ten IP packets is lost if one of them is lost. With these settings it is one
-    # packet, with one fragment (default 1344 B) and its headers. docs.ros.org, How-To-Guides/DDS-tuning, on IP
+    # Default 14720 B: a datagram of ten IP packets is lost if one of them is lost. With these settings, a datagram is
+    # one packet, with one fragment (default 1344 B) and its headers. docs.ros.org, How-To-Guides/DDS-tuning, on IP
     # fragments; defaults: CycloneDDS, docs/manual/config/config_file_reference.rst.
     "General/MaxMessageSize": "1400 B",
     "General/FragmentSize": "1300 B",

@@ -3,8 +3,8 @@
 A candidate is a middleware with its settings and its quality of service. It passes only if it meets the criterion in
 every cell, that is, for every sample size at every place. Missing data never counts as good: a candidate stays
 undecided if there are too few valid repeats, if a delay was withheld, or if a publisher found no subscription. The
-rule is that of expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or `90 % of loss <= BOUND` if a
-share is given.
+rule is the same as for expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or
+`90 % of loss <= BOUND` if a share is given.
 """
 
 import json
@@ -80,8 +80,8 @@ class Assessment:
     def rank(self) -> tuple[float, float]:
         """Largest loss of any cell and largest delay of any repeat; smaller is better.
 
-        The ends of the intervals are not used: the interval of repeats without a loss is wider than that of repeats
-        with few losses.
+        The ends of the intervals are not used: the interval of repeats without a loss is wider than the interval of
+        repeats with few losses.
         """
         losses = [math.inf if cell.loss is None else cell.loss.value for cell in self.cells]
         return max(losses), max(cell.largest_delay_s for cell in self.cells)
@@ -112,7 +112,7 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
 
 
 def _attempts_by_step(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOptions, str, str]]:
-    """Yield the attempts of each trial with each of its `topics` steps, its column prefix, and its RMW."""
+    """Yield the attempts of each trial, once for each `topics` step, with the step, its column prefix and RMW."""
     for folder in dict.fromkeys(attempts.texts[SOURCE]):
         if not folder or not Path(folder).is_dir():
             continue  # a CSV file without its trial does not contain the plan

@@ -15,7 +15,8 @@ from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.core.columns import Kind, step_prefixed
 
 MIN_REPEATS: Final = 5
-"""Losses over TCP may be bimodal (docs/studies/middleware-link.md): fewer repeats may all be of one mode."""
+"""Default number of valid repeats that a cell needs. Losses over TCP may be bimodal
+(docs/studies/middleware-link.md): a smaller number of repeats may all be in the same mode."""
 _DECIMALS: Final = 12
 """Decimals to which a bound is rounded: 2.9 % is stored as slightly less than 0.029, but a loss of 29 of 1,000 must
 not exceed it."""
@@ -34,11 +35,11 @@ class LinkCriterion:
     """The requirements that a middleware must meet on the link in each repeat.
 
     Attributes:
-        max_loss: Share of the samples that may be lost, 0 to 1; those that were never sent count as lost.
+        max_loss: Share of the samples that may be lost, 0 to 1; samples that were never sent count as lost.
         max_delay_s: Limit for the delay of 95 % of all samples sent; None without a limit.
         size_bytes: Only samples of this size count; None for all.
         repeats: Number of valid repeats that a cell needs.
-        share: Share of all repeats that must meet it, shown with 95 % confidence; None if each measured repeat must.
+        share: Share of repeats that must meet it, with 95 % confidence; None if every measured repeat must meet it.
     """
 
     max_loss: float

@@ -75,7 +75,7 @@ _RECORD_BYTES: Final = 60
 _BAG_BYTES: Final = 16_384
 
 SUBSCRIBED: Final = "log:Subscribed to topic"
-"""Line of `ros2 bag record` when it starts to record. Its start takes seconds, which must not count."""
+"""Line of `ros2 bag record` when it starts to record. Its start takes seconds, which are not part of the duration."""
 
 
 class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):

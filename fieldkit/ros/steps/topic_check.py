@@ -28,7 +28,7 @@ LONGEST_S: Final = 20.0
 MESSAGES: Final = 2
 """Number of messages that the recording waits for on a slow topic, for `LONGEST_S` at most."""
 TOLERANCE: Final = 0.5
-"""Allowed deviation of a topic's rate, as a share of it."""
+"""Allowed deviation of a topic's rate, as a fraction of the rate."""
 
 # A recorder that is stopped from outside also needs time to start: ros2 takes 3 s to load on a small computer.
 _START_S: Final = 4.0
@@ -67,7 +67,7 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: R
 
 
 def can_record(plan: Plan, role: Role, probed: Probed) -> bool:
-    """Return True if nothing that a recording needs is known to be missing on the robot."""
+    """Return True unless something that a recording needs is known to be missing on the robot."""
     ros = plan.cast[role].profile.ros
     if ros is None or not recorded(plan, role):
         return True

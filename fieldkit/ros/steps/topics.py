@@ -48,8 +48,8 @@ MASTER: Final = "rosmaster"
 """Program of the ROS master."""
 
 KEPT_BYTES: Final = 256
-"""Bytes of a frame that contain the head of each sample. After an Ethernet header it ends at byte 138 for DDS, at 154
-if DDS names the reader, and at about 190 for Zenoh, after attachment and key expression."""
+"""Bytes of a frame that contain the head of each sample. After an Ethernet header, the head ends at byte 138 for DDS,
+at 154 if DDS names the reader, and at about 190 for Zenoh, after attachment and key expression."""
 
 BUFFER_KIB: Final = 32_768
 """Kernel buffer of a capture around a topic. In immediate mode a frame needs about 400 bytes of it with `KEPT_BYTES`,
@@ -100,7 +100,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             argv=agent_commands.agent_command(
                 robot, verb, self.agent_arguments(scene, role), self._file(role), environment=self.environment(robot)
             ),
-            # The limit of the subscriber must be longer than that of the publisher.
+            # The time limit of the subscriber must be longer than the limit of the publisher.
             limit_s=duration_s if publishes else 2 * duration_s,
             log=self._log(role),
             ready=None if publishes else "log:up,",

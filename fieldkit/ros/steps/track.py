@@ -52,7 +52,7 @@ class Spot(Strict):
     """A fixed position of a robot: degrees and metres on the earth, or metres in the frame of a tracker.
 
     Attributes:
-        lat: Degrees north, together with robots that publish `NavSatFix`.
+        lat: Degrees north, if the other robots publish `NavSatFix`.
         lon: Degrees east.
         alt: Metres above the ellipsoid.
         frame: A tracker's frame, the `frame_id` of its messages.
@@ -99,8 +99,8 @@ class TrackedRobot(Strict):
             robot at the other end of its link; `towards`: towards that robot; `left` and `right`: to the left and to
             the right of the direction `away`.
         child: Frame of the robot in a tree of transforms, whose parent is the tracker's frame.
-        times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, for stamps of
-            another clock.
+        times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, if the
+            stamps are from another clock.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         at: A fixed position, instead of a topic.
     """
@@ -131,7 +131,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     Attributes:
         robots: Source of each robot's position, by role.
-        heights: Whether heights above the ellipsoid are used; those of satellite receivers are often wrong by 10 m.
+        heights: Whether heights above the ellipsoid are used; heights of satellite receivers are often wrong by 10 m.
         during: Steps that run at the same time.
     """
 

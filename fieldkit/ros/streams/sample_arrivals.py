@@ -1,4 +1,4 @@
-"""Arrivals of samples: the times in a subscriber's log compared with those in its capture."""
+"""Arrivals of samples: the times in a subscriber's log compared with the times in its capture."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from fieldkit.measure.captures.arrays import Floats, Ints, Mask
 from fieldkit.ros.streams.topic_samples import SampleFlow, SampleHeads, TopicSamples
 
 STAMP_NS: Final = 2_000
-"""tcpdump truncates times to microseconds, and the kernel may stamp a packet with a time read 1 us later."""
+"""Tolerance of packet times: tcpdump truncates them to microseconds, and the kernel may read them 1 us too late."""
 MAX_LATENCY_NS: Final = 5_000_000
 MAX_LATENCY_FEW_NS: Final = 20_000_000
 MIN_SAMPLES: Final = 20
@@ -26,9 +26,9 @@ class SampleArrivals:
     """Samples in the subscriber's log that are also in its capture.
 
     Attributes:
-        after_ns: Time of the record minus that of the first packet with the sample's head.
-        latency_s: Time of the record minus that of the packet that completed the sample and all earlier ones, for
-            samples for which that packet is known; None if it is known for no sample.
+        after_ns: Time of the sample's record in the log minus time of the first packet with the sample's head.
+        latency_s: Time of the record minus time of the packet that completed the sample and all earlier ones. Only
+            for samples for which this packet is known; None if it is known for no sample.
     """
 
     after_ns: Ints
@@ -36,7 +36,7 @@ class SampleArrivals:
 
     @classmethod
     def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "SampleArrivals":
-        """Return the arrivals of samples that occur once; the flags are those of `CapturedTopic` and `TopicPlan`."""
+        """Return the arrivals of samples that occur once; for the flags see `CapturedTopic` and `TopicPlan`."""
         heads = subscriber.heads.first()
         _, logged, captured = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
         at_ns, head_ns = samples.at_ns[logged], heads.at_ns[captured]

@@ -99,7 +99,7 @@ class StreamOptions(Strict):
         bytes: Size of a sample's data, 24 B to 16 MB.
         qos: Quality of service.
         discovery: `multicast` or `peers` for `dds`; `multicast`, `peers` or `router` for `zenoh`; `master` for
-            `ros1`; `environment` (that of the robot), `multicast` or `peers` for `ros2`. The first of these is the
+            `ros1`; `environment` (the robot's own), `multicast` or `peers` for `ros2`. The first of these is the
             default.
         server: Role that runs the router or the master.
         duration: How long it streams.
@@ -216,7 +216,7 @@ class StreamOptions(Strict):
         }
 
     def environment(self, robot: Robot) -> dict[str, str]:
-        """Return the agent's environment variables: for ROS 2 those of the robot and the settings, else empty."""
+        """Return the agent's environment variables: for ROS 2, the robot's variables and the settings; else none."""
         return {**robot.ros_environment, **self.middleware_settings} if self.over is MiddlewareName.ROS2 else {}
 
     def need(self, role: Role, robot: Robot) -> Need:

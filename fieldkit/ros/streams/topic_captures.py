@@ -31,8 +31,9 @@ from fieldkit.ros.streams.topic_columns import first_arrivals
 from fieldkit.ros.streams.topic_samples import SampleFlow, SampleHeads, TopicLog, TopicSamples
 
 SLOW_S: Final = 0.02
-"""A delay is withheld if the subscriber's program caused more than this and more than a tenth of it: such a program
-cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100 delays was 0.3 to 13 ms."""
+"""A delay is withheld if the subscriber's program caused more than this time and more than a tenth of the delay: such
+a program cannot be distinguished from a log with wrong times. On two idle hosts the maximum of 100 delays was
+0.3 to 13 ms."""
 
 PROGRAM_DELAY_FIGURES: Final = {
     "topic_delay_median_s": "median",
@@ -51,7 +52,7 @@ PROGRAM_DELAY_FIGURES: Final = {
 """Time columns, and the statistic of the delay in the subscriber's program with which each is compared."""
 
 _GRACE_NS: Final = 300_000_000
-"""Within this time of the match or of the end of the subscriber's log, a captured sample may be missing in it."""
+"""The subscriber's log may lack a captured sample that is within this time of the match or of the end of the log."""
 
 
 _READ_BURST_NS: Final = 1_000_000
@@ -144,7 +145,7 @@ def withheld(
     ).latency_s
     if latency_s is None or not len(latency_s):
         return {}
-    # Samples whose latency is unknown count as late as the latest known one: they determine the columns as well.
+    # A sample of unknown latency affects the columns, too. It is assumed to have the largest known latency.
     latency_s = np.append(latency_s, np.full(len(arrived) - len(latency_s), latency_s.max()))
     figures_s = {
         "median": float(np.median(latency_s)),
@@ -199,7 +200,7 @@ def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
 
 
 def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
-    """Yield a contradiction if a log has samples more often than the capture."""
+    """Yield a contradiction if a log contains samples more often than the capture does."""
     numbers, copies = np.unique(samples.sequence, return_counts=True)
     captured_numbers, captured_copies = np.unique(subscriber.heads.sequence, return_counts=True)
     is_captured = np.isin(numbers, captured_numbers)
@@ -270,7 +271,8 @@ def _is_received(
         return _is_acknowledged(heads, subscriber)
     has_all_bytes = heads.is_complete | complete
     if plan.reliable:
-        # No sample is delivered after a gap; a sample that arrives before a later one is delivered precedes it.
+        # No sample is delivered after a gap. If a later sample was delivered after this one had arrived, there was no
+        # gap before it, so this one was delivered, too.
         gapless = np.logical_and.accumulate(heads.sequence == np.arange(len(heads)))
         numbers, first = np.unique(samples.sequence, return_index=True)
         next_index = np.searchsorted(numbers, heads.sequence, side="right")
@@ -309,7 +311,7 @@ def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_m
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
-    """Return the number of samples missing in a log by the TCP bytes that arrived, if the capture has no heads."""
+    """Return how many samples a log lacks, from the TCP bytes that arrived, if the capture has no heads."""
     if not subscriber.is_tcp:
         return 0
     max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES

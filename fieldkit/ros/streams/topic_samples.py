@@ -1,12 +1,12 @@
-"""Samples of topics: those in logs that the agent writes on a robot, and those in a capture, by their heads.
+"""Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
 
 Logs (`fieldkit.agent.messaging.records`) are fixed-size records after a magic. A log whose writer was killed ends
 with zeros, because the file grows by blocks.
 
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
 by the head (`fieldkit.agent.messaging.stream`): magic, sequence number and time of sending. The head is visible if
-that part of the packet was captured: always if a sample starts a packet, but not if TCP or a middleware put it after
-another sample.
+that part of the packet was captured. This is always the case if a sample starts a packet, but may not be if TCP or a
+middleware put it after another sample.
 """
 
 import struct
@@ -39,7 +39,7 @@ _SAMPLE, BEGUN, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
-"""Value in an end record whose size field is a checksum; logs of versions without origin records have no checksum."""
+"""Marks an end record whose size field is a checksum. Older logs, without origin records, have no checksum."""
 _SIZE_AT: Final = 4
 
 
@@ -216,7 +216,7 @@ _LAYOUT: Final = struct.Struct("<III")
 
 @dataclass(frozen=True, eq=False)
 class SampleHeads(Table):
-    """Heads of samples in the order of a capture, including those of retransmitted samples.
+    """Heads of samples in the order of a capture, including heads of retransmitted samples.
 
     Attributes:
         sequence: Sequence number of the sample.

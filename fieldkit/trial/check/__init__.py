@@ -1,1 +1,1 @@
-"""Checks before a trial: of each robot, whose state a shell script reads once, and of the plan."""
+"""Checks of the robots and of the plan before a trial. One shell script reads the state of a robot."""

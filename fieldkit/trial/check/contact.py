@@ -11,8 +11,8 @@ from fieldkit.trial.check.report import Report
 CONTACT_S: Final = 15.0
 WARN_S: Final = 1.0
 WRONG_CLOCK_S: Final = 1800.0
-"""A clock that differs by half an hour or more does not drift but is wrong, for example by its time zone, or because
-the board has no battery."""
+"""Offset from which a clock is set incorrectly and has not only drifted, for example because of a wrong time zone or
+because the board has no battery."""
 
 
 def log_in(shell: Shell) -> None:
@@ -25,7 +25,7 @@ def log_in(shell: Shell) -> None:
 
 
 def judge(shell: Shell, report: Report) -> Offset | None:
-    """Report that the robot answers; return its clock's offset, or None without a time; errors as for `log_in`."""
+    """Report that the robot answers. Return the offset of its clock; None if it sent no time. Raises as `log_in`."""
     log_in(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)
     fastest_s = min((exchange.response_ns - exchange.request_ns for exchange in exchanges), default=0) / 1e9

@@ -11,7 +11,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check import tools
 
-# In addition to the time of the tools; a command can hang, such as df on a dead network drive.
+# The other commands have 20 s in total; one of them can hang, for example df on a dead network drive.
 PROBE_S: Final = 20.0 + tools.PROBE_S
 
 _SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").read_text(encoding="ascii")
@@ -32,7 +32,7 @@ def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]
         commands: Further commands by the name of their section.
 
     Raises:
-        LinkError: The robot did not answer, or not in `PROBE_S`.
+        LinkError: The robot did not answer within `PROBE_S`.
         RobotError: Its output exceeds the limit of a probe.
     """
     completed = shell.run(
@@ -50,7 +50,7 @@ def script(commands: Mapping[str, Sequence[str]]) -> str:
 
 
 def parse(text: str) -> Sections:
-    """Return the sections of a probe's output; of sections with the same name the first is used."""
+    """Return the sections of a probe's output. If several sections have the same name, the first is used."""
     sections: dict[str, CommandResult] = {}
     parts = _HEAD.split(text)[1:]
     for name, code, section_text in zip(parts[::3], parts[1::3], parts[2::3], strict=True):

@@ -22,7 +22,7 @@ _OFFLOADS: Final = {
     "TSO": "tcp-segmentation-offload",
     "GRO": "generic-receive-offload",
 }
-# iw 5.19: link.c, interface.c, station.c.
+# The output of iw 5.19, as its link.c, interface.c and station.c print it.
 _FACTS: Final = {
     "type": r"^[ \t]*type (.{1,30})$",
     "channel": r"^[ \t]*channel ([0-9]{1,3}) \(",
@@ -113,7 +113,7 @@ def _judge_offloads(sections: Sections, report: Report) -> None:
 
 
 def facts(sections: Sections) -> Mapping[str, str]:
-    """Return the values printed by `iw info` and `iw link`, by the names in `_FACTS`; others are missing."""
+    """Return the values that `iw info` and `iw link` printed, by the names in `_FACTS`."""
     text = "\n".join(sections.get(name, MISSING_SECTION).text for name in ("wifi-info", "wifi-link"))
     matches = {name: re.search(pattern, text, re.MULTILINE) for name, pattern in _FACTS.items()}
     return {name: match[1] for name, match in matches.items() if match}

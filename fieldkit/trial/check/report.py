@@ -18,7 +18,7 @@ class UserTools:
 
     Attributes:
         root: Whether the user is root.
-        programs: Available programs among those used in remedies.
+        programs: The available programs that remedies can use.
     """
 
     root: bool
@@ -58,7 +58,7 @@ class Report:
         self.findings.append(Finding(self.robot, check, status, detail or "no answer", remedy))
 
     def _adapted_remedy(self, remedy: str) -> str:
-        """Adapt a remedy to this robot's user; steps write remedies for Debian and a user with sudo."""
+        """Adapt a remedy to this robot's user. Remedies of steps are written for Debian and a user with sudo."""
         if self.user_tools is None:
             return remedy
         if "apt-get" not in self.user_tools.programs:

@@ -1,4 +1,4 @@
-"""Expectations that a plan cannot decide, for example with too few repeats."""
+"""Find expectations that cannot be decided by a plan's repeats, for example because there are too few."""
 
 from collections.abc import Iterator
 
@@ -7,5 +7,5 @@ from fieldkit.trial.plan import Plan
 
 
 def of_plan(plan: Plan) -> Iterator[str]:
-    """Yield a sentence for each expectation of a plan that it cannot decide."""
+    """Yield a sentence for each expectation of a plan that its repeats cannot decide."""
     return sample_size.unmet_requirements(plan.procedure.expectations, plan.procedure.figures, plan.repeats)

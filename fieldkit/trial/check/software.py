@@ -1,4 +1,4 @@
-"""Checks of a robot's programs by the probe: those that steps start, and other requirements of steps."""
+"""Checks of a robot's programs by the probe: programs that steps start, and other requirements of steps."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -142,7 +142,7 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
     except RobotError as error:
         report.fail(_TOOLS, error.what, error.remedy)
         return variants.expected(profile)
-    # A netcat is shown by its variant: some print no version, and the formats of the others differ.
+    # For netcat, the variant is shown: some variants print no version, and the formats of the others differ.
     words = [
         f"{detected.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in detected.versions.items()
     ]
@@ -165,7 +165,7 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
 
 
 def needs_of(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
-    """Return the needs of steps on the robot without duplicates: those checked by the probe, or by the agent."""
+    """Return the needs of steps on the robot that the probe checks, or that the agent checks, without duplicates."""
     scene = plan.scenes()[0]
     steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, HasNeeds))
     needs = (need for step in steps for need in step.needs(scene) if need.role is role)

@@ -184,7 +184,7 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
         if default
         else Recorder.SQLITE3.removeprefix("ros2-")
     )
-    offered = _STORAGES.search(text)  # Foxy and older do not list them
+    offered = _STORAGES.search(text)  # ROS 2 Foxy and older do not list the storages
     kinds = {"sqlite3": Recorder.SQLITE3, "mcap": Recorder.MCAP}
     if offered and storage not in re.split(r"[,\s]+", offered["ids"]):
         return Recorder.NONE

@@ -66,7 +66,7 @@ class Attempts:
         self._reached: Status | None = None
 
     def make(self, repeat: RepeatId) -> str:
-        """Make another attempt at a repeat, and store it with any result.
+        """Make another attempt at a repeat, and store it whatever its result is.
 
         Returns:
             The remedy of a failed step; empty if none failed.
@@ -122,7 +122,7 @@ class Attempts:
         )
         committed = store.unjournalled_attempt(self._folder, interrupted_attempt.folders)
         evidence_folder = committed or store.reopen_attempt(self._folder, interrupted_attempt.repeat)
-        # Partial evidence of an interrupted attempt is stored like that of any void attempt.
+        # Partial evidence of an interrupted attempt is stored like the evidence of any void attempt.
         missing = [] if committed else self._robots.fetch(remote, evidence_folder, clean=was_measured)
         verdict = self._judge(interrupted_attempt, evidence_folder)
         if not committed:

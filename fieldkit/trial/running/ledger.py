@@ -22,8 +22,9 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.running.stop import Stop
 
 TABLE_SHARE: Final = 0.01
-"""Table and manifest are rewritten when this share of the attempts is missing in them: after each one in a trial of
-up to 100 attempts. Therefore the total amount written grows linearly with the trial, not with its square."""
+"""Table and manifest are rewritten when this share of the attempts is missing in them; in a trial of up to 100
+attempts, after each attempt. Therefore the total amount written grows linearly with the trial, not with its square.
+"""
 
 
 class Ledger:
@@ -150,7 +151,7 @@ class Ledger:
         return cells
 
     def _rename(self, attempt: Attempt) -> None:
-        """Rename the folder of an attempt that failed before its repeat was reopened to that of a void attempt."""
+        """If an attempt failed before its repeat was reopened, rename its folder as for a void attempt."""
         if not attempt.reopened:
             return
         before = attempt.repeat.folder(Status.FAILED, attempt.number)
@@ -179,7 +180,7 @@ class Ledger:
         yield from manifest.differences(self._folder).items()
 
     def _unchanged_lines(self, ended: int) -> list[str]:
-        """Return the unchanged lines of the table, if they are not more than the attempts that ended."""
+        """Return the unchanged lines of the table; none if it has more lines than attempts that ended."""
         line_count = self._manifest.unchanged_lines(store.TRIAL_CSV)
         if not line_count:
             return []

@@ -20,14 +20,14 @@ from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
 """Lifetime of a lock that is not renewed; `evidence.begin` renews it after half of this time.
-It is longer than any attempt, and than robots are carried to another place."""
+It is longer than any attempt, and longer than carrying robots to another place takes."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of a lock on robots, and its purpose. Only letters, digits and `._@-` of a text are used, at most 80.
+    """Holder of a lock on robots, and its purpose. Of each text, at most 80 letters, digits and `._@-` are used.
 
     Attributes:
         token: Identifies the trial; a holder with the same token can lock its robots again.
@@ -42,7 +42,7 @@ class Holder:
 
 @contextmanager
 def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
-    """Lock all robots while the body runs, as the only process of this machine with the holder's token.
+    """Lock all robots while the body runs. Only one process of this machine can use the holder's token.
 
     Raises:
         ConfigurationError: Another process has the token; it would use the same locks and release them.
@@ -87,7 +87,7 @@ def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) ->
     )
     try:
         for shell in in_order:
-            attempted.append(shell)  # added before it answers, because the answer of a successful lock may be lost
+            attempted.append(shell)  # before the answer, which may be lost
             words = (word(holder.token), str(ttl_s), word(holder.user), word(holder.purpose))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield

@@ -82,7 +82,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
 
 def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
     """Return the permission of a trial; raises as `MotionSupport.permission`."""
-    # A campaign without moves in this trial may have a robot that a fault stopped in another one.
+    # Even if this trial has no moves, a fault in another trial of its campaign may have stopped a robot.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
     return _control().permission(plan, testbed, folder) if plan.procedure.moved() or has_journal else _NoMotion()
 

@@ -92,7 +92,7 @@ def check(plan: Plan, shells: Shells, out: Path, *, all_checks: bool) -> Checked
 
 
 def check_before_trial(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
-    """Run the preflight checks, store the findings in the folder of the trial and report those that are not ok.
+    """Run the preflight checks, store all findings in the trial's folder, and report findings that are not ok.
 
     Returns:
         The tools of each robot.

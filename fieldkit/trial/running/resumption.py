@@ -1,4 +1,4 @@
-"""Resume a trial: code, backend and robots must be those with which it started."""
+"""Resume a trial: code, backend and robots must be the same as at its start."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,8 +35,8 @@ def resume(
         The outcome; None if the operator skipped the trial.
 
     Raises:
-        FieldkitError: The trial is not of this fieldkit, of this backend or of these robots; or as for `opened` and
-            `resume_trial`.
+        FieldkitError: The trial was started by other code, on another backend or with other robots; or as for
+            `opened` and `resume_trial`.
     """
     plan = resumable(folder)
     for change in step_packages.changes(plan.step_packages):
@@ -77,7 +77,7 @@ def continue_trial(
         failed: Whether failed repeats are repeated too, each with as many attempts as the procedure allows.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, other code started it, or another fieldkit runs it now.
+        ConfigurationError: `folder` is not a trial, other code started it, or another process runs it now.
         EvidenceError: Its journal is damaged.
         FieldkitError: As for `begin`.
     """
@@ -97,7 +97,7 @@ def resumable(folder: Path) -> Plan:
     """
     plan = store.read_plan(folder)
     versions = plan.versions
-    # Packages that add steps or a backend have no hash here; fieldkit's hash is more precise than its version.
+    # Packages that add steps or a backend are compared by version, fieldkit by its hash, which is more precise.
     added = {name: now for name, now in plugins.versions().items() if name != "fieldkit"}
     changed = [f"{name} {versions[name]}" for name, now in added.items() if versions.get(name, now) != now]
     if plan.code_sha256 != code_hash():
@@ -137,7 +137,7 @@ _NO_SIMULATORS: Final = "no simulators"
 
 
 def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) -> None:
-    """Raise an error if a trial would be resumed on other simulators: one table has the results of one of them.
+    """Raise an error if a trial would be resumed on other simulators, because one table must not mix simulators.
 
     Args:
         plan: The trial.
@@ -145,7 +145,7 @@ def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) 
         folder: The trial's folder.
 
     Raises:
-        ConfigurationError: It was started on others.
+        ConfigurationError: It was started on other simulators.
     """
     if simulators != plan.simulators:
         raise ConfigurationError(

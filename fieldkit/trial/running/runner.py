@@ -153,7 +153,7 @@ def run_repeats(
                     if ledger.is_finished(repeat):
                         finished.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
                     remaining = [other for other in repeats if not ledger.is_finished(other)]
-                    # Inside the context, so that a repeat that a stop request let finish is reported too.
+                    # Inside the context, so that a repeat that ends after a stop request is reported too.
                     sink(
                         _repeat_event(plan, ledger, len(repeats), _remaining_time(plan, remaining, finished), remedy)
                     )

@@ -54,7 +54,7 @@ class UnfetchedEvidence:
             self.mark(role, remote, into, reason)
 
     def restore(self, ended: Attempt, stored_folder: Path) -> None:
-        """Mark the evidence of an attempt in an earlier run as unfetched, if its stored folder is marked so."""
+        """Mark the evidence of an attempt in an earlier run as unfetched if its stored folder has such a mark."""
         if ended.status is not Status.VALID and not self._transient:
             for role, folders in self.folders.items():
                 if (stored_folder / unfetched_file(role)).is_file():
