@@ -31,7 +31,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors and the cost of a run. Values that no packet determines are nan.
+    """The errors and the cost of a run. A value for which there are no packets is nan.
 
     Attributes:
         packets: Number of packets whose fate is decided in both runs.
@@ -43,7 +43,7 @@ class Errors:
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.
         fate_disagreement: Share of packets that arrived in one run only.
-        first_disagreement: The packet of these that was sent first, or None.
+        first_disagreement: The first of these packets by time of sending, or None.
         first_disagreement_s: Time when it was sent, or nan.
         causality_violations: Number of arrivals at a time that the receiver had already passed.
         late_s: Time by which the receiver had passed the time of arrival, over all arrivals.

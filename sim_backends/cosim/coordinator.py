@@ -38,7 +38,7 @@ _MAX_EMPTY_WINDOWS: Final = 1000
 """Number of successive windows of length 0 after which the policy has failed."""
 _PROGRESS_EVERY_S: Final = 0.2
 _NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
-"""A window without packets, see `Coordinator._enter`, and the fates decided in it."""
+"""The results of `Coordinator._enter` for a window without packets, and the fates decided in the window."""
 
 Progress = Callable[[int, float], None]
 """Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
@@ -233,7 +233,7 @@ class Coordinator:
             return to_ns
         try:
             end_ns = index(end_ns)
-        except TypeError as error:  # the policy may be of another package
+        except TypeError as error:  # the policy may come from another package
             raise FederateError(
                 f"policy {self.policy.name} returned {end_ns!r} as the end of {window}",
                 remedy="return a whole number of nanoseconds, or None",
@@ -319,7 +319,7 @@ class Coordinator:
     def _enter(
         self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
     ) -> tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]:
-        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before.
+        """Record the packets that enter in a window: sent in it or, if sends are deferred, in the previous one.
 
         Returns:
             Their fates; the packets that the network must carry; the fates of the others, which are dropped.

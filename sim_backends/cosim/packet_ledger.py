@@ -27,14 +27,14 @@ def transmitters(network: object) -> tuple[str, ...]:
 
 
 def fixed_emitters_m(network: object) -> tuple[Vector, ...]:
-    """Return the positions of sources of interference that are not agents: the network's optional attribute."""
+    """Return the positions of sources of interference that are not agents, an optional attribute of the network."""
     return tuple(getattr(network, "fixed_emitters_m", ()))
 
 
 def position_error_m(fate: Fate) -> float:
     """Return the largest error, in metres, of the relative positions that the network assumed for a packet.
 
-    The positions are those of at least sender and receiver, at the time of sending.
+    It includes at least the positions of sender and receiver, at the time of sending.
     """
     if fate.position_error_m is not None:
         return fate.position_error_m
@@ -50,7 +50,7 @@ def max_position_error_m(
         assumed: States of the agents that the network assumes.
         true: True states of the agents in `names`, in the same order.
         names: The agents to include.
-        has_fixed_emitters: True to include a point that never moves, too.
+        has_fixed_emitters: True to also include a point that never moves.
     """
     offsets_m = _offsets_m([assumed[name] for name in names], true)
     return _max_distance_m([*offsets_m, STILL] if has_fixed_emitters else offsets_m)

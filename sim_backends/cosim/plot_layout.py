@@ -88,7 +88,7 @@ class ObstacleOutline:
 
 
 def outlines(world: World) -> Iterator[ObstacleOutline]:
-    """Yield the outline of each part of a world's obstacles, those of higher ground first."""
+    """Yield the outline of each part of a world's obstacles, beginning with higher ground."""
     for obstacle in sorted(world.obstacles, key=lambda obstacle: not isinstance(obstacle, Raised | Ramp)):
         for part in obstacle.parts():
             shape = part.shape
@@ -224,7 +224,7 @@ def _cost(box: LabelBox, point: Point, bounds: LabelBox, obstacles: Sequence[Lab
 
 
 def curve_boxes(curves: Sequence[Sequence[Point]], half_width: float) -> Iterator[LabelBox]:
-    """Yield boxes that cover curves: squares of `2 half_width` around their markers, and along the lines between."""
+    """Yield squares with sides of `2 half_width` that cover curves, around markers and along the lines between."""
     for points in curves:
         for x, y in _interpolated(points, half_width):
             yield LabelBox(x - half_width, y - half_width, 2 * half_width, 2 * half_width)

@@ -88,7 +88,7 @@ class CountsMisses(Transport, Protocol):
     """A transport that also records which hosts miss a broadcast."""
 
     def missed(self, packet: IpPacket, host: str, reason: str) -> None:
-        """Record, as by `lost`, that a packet without a single destination will not arrive at a host."""
+        """Record, like `lost`, that a packet without a single destination will not arrive at a host."""
         ...
 
 

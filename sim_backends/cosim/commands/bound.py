@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bound`: exchanges that keep a bound, with `error_bounded` and fixed windows."""
+"""`fieldkit cosim shootout SCENARIO --bound`: the exchanges that `error_bounded` and fixed windows need."""
 
 import argparse
 import math

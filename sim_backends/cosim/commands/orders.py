@@ -34,7 +34,7 @@ from sim_backends.cosim.studies.seeds import Task, run_many
 
 WINDOWS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 START_TIMES: Final = 20
-"""Number of times in the exact reference of each seed at which a window of each policy starts."""
+"""Number of start times for the windows of each policy, in the exact reference of each seed."""
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "actual window, mean", 1e3),

@@ -17,7 +17,7 @@ Value = str | int | float | None
 """A cell; nan and None are missing values."""
 
 _MAX_WIDTH: Final = 98
-"""Largest line length of legends, also in a wider terminal."""
+"""Largest line length of legends; it also applies in a wider terminal."""
 
 _MISSING: Final = "-"
 _NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
@@ -104,7 +104,7 @@ class Sheet:
 
 
 def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
-    """Print several tables in one of `FORMS`: JSON has all by their names, CSV the first one only.
+    """Print several tables in one of `FORMS`: JSON contains all of them by name, CSV only the first one.
 
     Args:
         sheets: The tables by name, the main one first.

@@ -9,9 +9,9 @@ a time t it is at most x + v t + a t^2 / 2. Before this can reach the bound, the
 less than one step of the physics remains, the window ends. So the bound holds for any motion, and no margin is lost
 to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
 
-The pairs are those of all agents that send, receive, forward or interfere. A bound in metres adds the pairs of each
-agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound in dB
-adds the pairs of each agent and a fixed source of interference.
+The policy examines the pairs of all agents that send, receive, forward or interfere. A bound in metres adds the pairs
+of each agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound
+in dB adds the pairs of each agent and a fixed source of interference.
 
 The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
 the error grows by u q between two steps. The step is that of the physics if u q is at most an eighth of the bound;
@@ -102,7 +102,8 @@ class ErrorBounded:
         end_ns = self.extended_end_ns(situation)
         if end_ns > now_ns:
             return end_ns
-        # At least until the next whole step: within a step, dead reckoning is as accurate as states at steps can be.
+        # The window ends at the next whole step or later: within a step, dead reckoning is as accurate as states at
+        # steps can be.
         end_ns = _step_begin_ns(situation) + situation.physics_step_ns
         use_ns = situation.next_use_ns
         if use_ns is not None and use_ns < end_ns:

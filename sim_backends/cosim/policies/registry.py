@@ -35,7 +35,7 @@ _KINDS: Final[tuple[type[SyncPolicy], ...]] = (
     ErrorBounded,
 )
 BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
-"""Every built-in policy by its name, exact ones first."""
+"""Every built-in policy by its name; the exact ones are first."""
 
 _WINDOW_S: Final = 0.001
 """The paper's initial window, section V."""

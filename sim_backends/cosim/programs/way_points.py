@@ -63,7 +63,8 @@ _APPROACH_PER_S: Final = 1.0
 class DriveThrough(NeverSends):
     """Drives a wheeled body from point to point, and stops at the last.
 
-    It turns towards a point at a rate proportional to the heading error, and drives slower the larger that error is.
+    It turns towards a point at a rate proportional to the heading error, and the larger the error is, the slower it
+    drives.
 
     Args:
         points_m: The waypoints, metres east and north.

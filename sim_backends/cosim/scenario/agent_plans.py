@@ -208,7 +208,7 @@ class _Traffic(Strict, ABC):
 
     @property
     def flow_ends(self) -> tuple[tuple[str, str, str], ...]:
-        """Name, source and destination of every flow, including those of replies."""
+        """Name, source and destination of every flow, including the flows of replies."""
         return tuple((flow, self.source, to) for flow, to in self.flows.items())
 
     @property
@@ -218,7 +218,7 @@ class _Traffic(Strict, ABC):
 
     @abstractmethod
     def packets(self, duration_s: float) -> float:
-        """Return the approximate maximum number of packets that it sends in a scenario of a duration."""
+        """Return the approximate maximum number of packets that it sends in a scenario of this duration."""
 
 
 class StreamTraffic(_Traffic):
@@ -252,7 +252,7 @@ class BagTraffic(_Traffic):
 
     The defaults are the paper's: 10 s of accelerometer data. The size is that of a serialized `sensor_msgs/Imu` with
     the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and 72 of
-    covariance with each. The rate is that of the Husky's simulated IMU.
+    covariance with each of the three. The rate is that of the Husky's simulated IMU.
 
     Attributes:
         kind: `bag`.
@@ -321,8 +321,8 @@ class PingTraffic(_Traffic):
         kind: `ping`.
         count: Number of requests.
         interval: Time between requests.
-        size_bytes: Size of a request and of its reply, without the header: ping reports 56 as 64 bytes, because
-            ICMP's header has 8 bytes, as UDP's.
+        size_bytes: Size of a request and of its reply, without the header: ping reports 56 as 64 bytes, because the
+            header of ICMP has 8 bytes, like the header of UDP.
     """
 
     kind: Literal["ping"]

@@ -246,7 +246,7 @@ def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> 
             bag = file_pieces(traffic.size_bytes, traffic.piece_bytes)
         case BagTraffic():
             bag = generated_bag(
-                # The stream depends on the bag only, because every receiver gets the same bag.
+                # The random stream depends on the bag only, because every receiver gets the same bag.
                 RandomStream(seed, traffic.title, "recorded"),
                 length_ns=_ns(traffic.length),
                 rate_hz=traffic.rate,

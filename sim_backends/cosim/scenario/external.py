@@ -1,4 +1,4 @@
-"""External federates of a scenario: the one place where the co-simulation starts, connects or makes them."""
+"""External federates of a scenario; only this module of the co-simulation starts, connects or makes them."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ def has_addresses(scenario: CosimScenario) -> bool:
 
 
 def writes_captures(scenario: CosimScenario) -> bool:
-    """Return True if the network is a program that writes captures of the IP packets of its own transports."""
+    """Return True if the network is a program that itself writes captures of the IP packets of its transports."""
     where = None if scenario.network.transports == "builtin" else scenario.network.federate
     federate = None if where is None else named(where, NETWORK)
     return isinstance(federate, ProgramFederate) and federate.writes_captures
@@ -88,7 +88,7 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
 
 
 def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
-    """Return the configuration as JSON; the order of agents is that of the scenario, as results may depend on it."""
+    """Return the configuration as JSON; agents are in the order of the scenario, because results may depend on it."""
     radios = antennas(scenario)
     options = (scenario.physics if role == PHYSICS else scenario.network).options
     configuration = {
@@ -165,7 +165,7 @@ def open_network(
     """Start, connect or make the scenario's external network, if it has one; otherwise as `open_physics`.
 
     Args:
-        scenario: As for `open_physics`, like the next ones.
+        scenario: The scenario.
         world: The world.
         bodies: The bodies.
         seed: The seed.
@@ -205,7 +205,7 @@ def open_network(
 
 
 def carried_radio(network: NetworkFederate, names: Sequence[str]) -> RadioModel[Fragment]:
-    """Return the radio of built-in transports whose IP packets an external network carries between stations."""
+    """Return the radio for built-in transports that uses an external network to carry IP packets."""
     return IpRadio(network, names)
 
 

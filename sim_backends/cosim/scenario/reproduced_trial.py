@@ -27,12 +27,13 @@ class ReproducedTrial(Strict):
     """The trial of robots that a scenario reproduces.
 
     A run with `--out` has a row for each protocol, with the columns of this trial, measured from captures as in a
-    trial of robots. The traffic must agree with the procedure: port of the transfer, number, interval and size of
-    the echo requests. Topology, line, robots and distance are those of the scenario.
+    trial of robots. These settings of the traffic must agree with the procedure: the port of the transfer, and the
+    number, interval and size of the echo requests. The scenario determines topology, line, robots and distance.
 
     Attributes:
         procedure: Name of the procedure.
-        record: Duration of every recording, as by `--record` of `fieldkit trial`; omitted, that of the procedure.
+        record: Duration of every recording, as with `--record` of `fieldkit trial`; if omitted, the duration that the
+            procedure states.
         tcp: The traffic under TCP.
         udp: The traffic under UDP.
     """

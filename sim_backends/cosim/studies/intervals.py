@@ -51,10 +51,10 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
 
     Args:
         value: The statistic of all repeats.
-        leave_one_out: The statistic of all repeats but one, for each, shape (n,).
+        leave_one_out: For each repeat, the statistic of all other repeats, shape (n,).
 
-    The variance over these is n - 1 times smaller than that of the statistic (Efron and Stein 1981, Ann. Stat.
-    9:586).
+    The variance of these values is n - 1 times smaller than the variance of the statistic (Efron and Stein 1981, Ann.
+    Stat. 9:586).
     """
     count = len(leave_one_out)
     if count < 2 or not np.isfinite(leave_one_out).all():

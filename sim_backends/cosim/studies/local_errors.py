@@ -31,7 +31,7 @@ position of sender and receiver; share of packets with another fate; position er
 TAIL_NS: Final = 200_000_000
 """Time that forks continue after the window, so that the fates of the affected packets are decided."""
 _LONGEST_NS: Final = 3_600_000_000_000
-"""A time that is longer than any window if there are events."""
+"""A time that is longer than any window as long as there are events."""
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ class RunFailure:
         reason: Why the last one failed.
         remedy: What to do; may be empty.
         exit_code: Exit code of the error.
-        rows: Columns of its flows until then.
+        rows: Columns of its flows until the failure.
         is_final: Whether another attempt would end in the same way.
     """
 

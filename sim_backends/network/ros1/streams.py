@@ -19,7 +19,8 @@ Lost = Callable[[str], None]
 class TcpStreams:
     """Carries messages over TCP connections, and reports delivery and loss to the ends by callbacks.
 
-    It is the `Wire` of its TCP; on the wire below, segments are packets of the transport to which it belongs.
+    It is the `Wire` of its TCP. On the wire below, segments are packets of the transport to which this object
+    belongs.
 
     Args:
         wire: The network below.

@@ -1,6 +1,7 @@
 """The congestion window: slow start and congestion avoidance of RFC 5681, and CUBIC (RFC 9438).
 
-CUBIC uses integer bytes and nanoseconds, so that results are equal on every machine. For Linux's see `linux_cubic`.
+CUBIC uses integer bytes and nanoseconds, so that results are equal on every machine. The CUBIC of Linux is in
+`linux_cubic`.
 """
 
 from typing import ClassVar, Final
@@ -60,7 +61,7 @@ class NewReno:
         self._credit = 0
 
     def on_timeout(self, flight_bytes: int, *, again: bool) -> None:
-        """Reduce the window after a timeout (RFC 5681, 3.1); `again` means without progress since the last one."""
+        """Reduce the window after a timeout (RFC 5681, 3.1); `again` if there was no progress since the last one."""
         if not again:
             self.threshold_bytes = self._reduced_threshold(flight_bytes)
         self.window_bytes = self._segment_bytes

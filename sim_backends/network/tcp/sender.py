@@ -105,7 +105,7 @@ class Sender:
             self._on_ack(segment)
 
     def close(self) -> None:
-        """Stop sending and all timers."""
+        """Stop sending, and stop all timers."""
         self._open = False
         self._timer.stop()
         self._reordering_timer.stop()

@@ -1,8 +1,8 @@
 """The reader of a flow: reassembles and orders samples, and requests missing ones from its writer.
 
-The times at which it responds, and at which it is silent so that data in flight is not requested twice, are those of
-CycloneDDS (`ddsi_acknack.c`, `ddsi_receive.c`): it responds to heartbeats immediately; it requests new data
-immediately, and the same data again after a delay, or when the writer has reported what it sent.
+The reader responds at the same times as CycloneDDS (`ddsi_acknack.c`, `ddsi_receive.c`), and it is also silent at the
+same times, so that data in flight is not requested twice. It responds to heartbeats immediately. It requests new data
+immediately, and the same data again after a delay or when the writer has reported what it sent.
 """
 
 from collections.abc import Callable
@@ -155,7 +155,7 @@ class TopicReader:
         self._complete[number] = data.sample
         data.sample.held = True
         if not self._reliable:
-            # Samples that were overtaken are not expected any more, and are discarded if they arrive.
+            # Samples that were overtaken are no longer expected, and are discarded if they arrive.
             self._skip(self._next, number)
         self._deliver_in_order()
 

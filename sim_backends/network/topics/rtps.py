@@ -31,7 +31,7 @@ class Sample:
         number: Its sequence number at its writer; 0 until it is sent.
         times_sent: Number of transmissions of each fragment.
         in_flight: Number of messages with a part of it that have neither arrived nor been lost.
-        held: True if its reader has it complete, possibly waiting for an earlier one.
+        held: True if its reader has received all of it, even if it cannot be delivered before an earlier sample.
         given_up: Reason why its writer will not send it again; empty while the writer may send it.
         settled: True if it was delivered or dropped.
         endpoint_flow: For a sample of the discovery, the flow whose endpoint it describes.
