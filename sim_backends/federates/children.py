@@ -18,7 +18,7 @@ _EXIT_S: Final = 1.0
 _POLL_S: Final = 0.005
 _TAIL_BYTES: Final = 4096
 _TAIL_LINES: Final = 10
-"""Lines of a stack trace that contain its cause, whether it is first or last."""
+"""Number of last lines that are shown: enough for the cause of an error in a stack trace."""
 
 
 class Child:

@@ -83,7 +83,7 @@ def encode_states(
 
 
 def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]:
-    """Return time and states of a physics' answer; the states have the limits.
+    """Return time and states of a physics' answer; the states include the limits.
 
     Raises:
         MalformedFrameError: It is malformed.

@@ -78,7 +78,7 @@ _KINDS: Final = {int(kind): kind for kind in MessageKind}
 
 
 class MalformedFrameError(ValueError):
-    """A frame is not as the protocol describes it.
+    """A frame does not follow the protocol.
 
     Args:
         position: Number of the wrong byte, from the beginning of the frame.
@@ -179,7 +179,7 @@ class FrameReader:
         """Return the next values.
 
         Raises:
-            MalformedFrameError: The frame ends before.
+            MalformedFrameError: The frame ends too early.
         """
         at, self._at = self._at, self._at + layout.size
         if self._at > len(self._body):
@@ -190,7 +190,7 @@ class FrameReader:
         """Return the next bytes.
 
         Raises:
-            MalformedFrameError: The frame ends before.
+            MalformedFrameError: The frame ends too early.
         """
         at, self._at = self._at, self._at + size
         if self._at > len(self._body):

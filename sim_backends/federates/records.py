@@ -52,7 +52,7 @@ def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:
     """Return commands to agents.
 
     Raises:
-        ValueError: A command has no layout, or is to an agent that was not announced.
+        ValueError: A command has no layout, or is for an agent that was not announced.
     """
     parts = [count_bytes(len(commands))]
     for name, command in commands.items():

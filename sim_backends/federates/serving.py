@@ -23,7 +23,8 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
         make: Called with the `Hello` of each run; returns the federate, for example its class.
         address: None for standard input and output, which then belong to the protocol: what the federate prints goes
             to standard error. Otherwise an address of a transport (`transports.transport_table`).
-        runs: Number of runs after which to return; None for one run if this side does not listen, else no limit.
+        runs: Number of runs after which to return; None means one run if this side does not listen, otherwise no
+            limit.
         **properties: Other attributes of `FederateService`.
 
     Raises:

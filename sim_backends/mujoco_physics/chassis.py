@@ -124,15 +124,15 @@ BURGER: Final = Chassis(
 )
 """ROBOTIS TurtleBot3 Burger: `turtlebot3_description/urdf/turtlebot3_burger.urdf.xacro`
 (github.com/ROBOTIS-GIT/turtlebot3) with the mass of the laser scanner; the stall torque of its motors (XL430-W250,
-e-Manual). Its centre of mass is not published; ours is in the middle of its body, because that of the URDF, above the
-axle, would let it fall over.
+e-Manual). Its centre of mass is not published; ours is in the middle of its body, because the robot would fall over
+with the centre of mass of the URDF, which is above the axle.
 """
 
 CASTER_RADIUS_M: Final = 0.01
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:
-    """Return the robot on wheels of a kind; an unknown one is a TurtleBot3 Burger of its size."""
+    """Return the robot on wheels of a kind; an unknown kind is a TurtleBot3 Burger scaled to its size."""
     if profile == "husky":
         return HUSKY
     factor = limits.radius_m / TURTLEBOT3_BURGER.radius_m
@@ -143,6 +143,6 @@ _IRIS_INERTIA_KG_M2: Final = (0.029125, 0.029125, 0.055225)
 
 
 def quadrotor_inertia_kg_m2(limits: QuadrotorLimits) -> Vector:
-    """Return the moments of inertia of a quadrotor: those of PX4's Iris (`models/iris`), scaled by mass and size."""
+    """Return the moments of inertia of a quadrotor: PX4's Iris (`models/iris`), scaled by mass and size."""
     factor = limits.mass_kg / IRIS.mass_kg * (limits.radius_m / IRIS.radius_m) ** 2
     return _scaled(_IRIS_INERTIA_KG_M2, factor)

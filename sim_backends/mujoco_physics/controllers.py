@@ -146,7 +146,7 @@ class FlightController:
         )
         targets, first = registers.mocap_quat, 4 * mocap
         if not self._is_powered:
-            # Towards its present attitude, the control of attitude has no torque except damping.
+            # With its present attitude as the target, the attitude control applies no torque except damping.
             registers.ctrl[motor] = 0.0
             for index in range(4):
                 targets[first + index] = registers.xquat[4 * body + index]

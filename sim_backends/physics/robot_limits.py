@@ -16,5 +16,5 @@ BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
 
 
 def quadrotor(profile: str) -> QuadrotorLimits:
-    """Return the limits of a drone of this profile; those of the paper's drone if the profile is unknown."""
+    """Return the limits of a drone of this profile; the limits of the paper's drone if the profile is unknown."""
     return QUADROTORS.get(profile, DUCKIEDRONE)

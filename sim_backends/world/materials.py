@@ -32,7 +32,7 @@ class Solid:
     d: float
 
     def permittivity(self, frequency_hz: float) -> complex:
-        """Return the relative permittivity, its imaginary part not above 0: ITU-R P.2040-1, eq. 9."""
+        """Return the relative permittivity; its imaginary part is not above 0: ITU-R P.2040-1, eq. 9."""
         ghz = frequency_hz / 1e9
         return complex(self.a * ghz**self.b, -_LOSS_FACTOR * self.c * ghz**self.d / ghz)
 

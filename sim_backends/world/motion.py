@@ -33,7 +33,7 @@ class Lifetime(NamedTuple):
 
     Attributes:
         appears_ns: Its beginning.
-        disappears_ns: Its end, at which the robot does not exist any more; None for never.
+        disappears_ns: Its end: the robot does not exist from this time on; None for never.
     """
 
     appears_ns: int = 0
@@ -200,7 +200,7 @@ class DeadReckoned(Mapping[str, State]):
         self._current = states
 
     def at(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states at `now_ns`, not before the reference time; the same object during a whole step."""
+        """Return the states at `now_ns`, at or after the reference time; the same object during a whole step."""
         steps = (now_ns - self.since_ns) // self.step_ns
         if steps != self._steps:
             self._steps = steps

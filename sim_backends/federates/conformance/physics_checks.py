@@ -20,7 +20,7 @@ _SAME_M: Final = 1e-6
 """Largest difference between positions that must be equal; results may depend on the order of additions."""
 _MOVED_M: Final = 0.02
 _JUMP_M: Final = 0.05
-"""A body moves at most this much, and by twice its speed, in a step."""
+"""In a step, a body moves at most by this length plus its motion at twice its speed."""
 _UNKNOWN_TYPE: Final = 32767
 _LIMIT_STEPS: Final = 10
 _COMMANDED_STEPS: Final = 1000

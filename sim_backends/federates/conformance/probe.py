@@ -40,7 +40,7 @@ class Opener(Protocol):
     """Starts or connects a fresh federate."""
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
-        """Return its session, as `open_session`."""
+        """Return its session, like `open_session`."""
         ...
 
 
@@ -221,7 +221,7 @@ class Target:
         return self.hello.role == PHYSICS
 
     def open(self, hello: Hello | None = None) -> FederateProbe:
-        """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time.
+        """Return a fresh federate after the last one has ended: a listening federate may serve one run at a time.
 
         Args:
             hello: The hello that it receives, if it is not that of the target.

@@ -105,7 +105,7 @@ class Ros1Address:
     Attributes:
         name: Its name.
         master: URI of the master.
-        host: Address of this machine for other nodes; empty for the one from which the master is reached.
+        host: Address of this machine for other nodes; empty for the address from which the master is reached.
         listens: See `TransportAddress`.
     """
 

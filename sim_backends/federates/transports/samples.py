@@ -1,7 +1,7 @@
 """Channels over a bus of samples, a pair of topics of DDS or ROS 1.
 
-The coordinator writes `requests` and reads `answers`, the federate the reverse. A sample is the `run`, a u64 that the
-coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run. DDS: topics
+The coordinator writes `requests` and reads `answers`; the federate does the reverse. A sample is the `run`, a u64
+that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run. DDS: topics
 `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type `fieldkit::Frame { sequence<octet> data; }` in plain
 CDR, reliable, keep all, volatile. ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type
 `std_msgs/UInt8MultiArray` without dimensions.

@@ -61,7 +61,7 @@ class NewReno:
         self._credit = 0
 
     def on_timeout(self, flight_bytes: int, *, again: bool) -> None:
-        """Reduce the window after a timeout (RFC 5681, 3.1); `again` if there was no progress since the last one."""
+        """Reduce the window after a timeout (RFC 5681, 3.1); `again` is True without progress since the last one."""
         if not again:
             self.threshold_bytes = self._reduced_threshold(flight_bytes)
         self.window_bytes = self._segment_bytes
@@ -191,7 +191,7 @@ class Cubic(NewReno):
             self._cwnd_prior_bytes = window_bytes
 
     def _avoid_congestion(self, now_ns: int, acked_bytes: int, round_trip_ns: int) -> None:
-        """Increase the window by the cubic function, or like Reno if that is more (RFC 9438, 4.2 to 4.5)."""
+        """Increase the window by the cubic function, or like Reno if this is larger (RFC 9438, 4.2 to 4.5)."""
         if self._epoch_ns is None:
             self._start_epoch(now_ns)
             assert self._epoch_ns is not None
