@@ -260,7 +260,7 @@ class Coordinator:
         # A network without dead reckoning assumes that agents do not move.
         moving = begin if self._extrapolates else {name: State(state.position_m) for name, state in begin.items()}
         step_ns = situation.physics_step_ns
-        # The states are those of the last physics step, which may be before the beginning of the window.
+        # The states are from the last physics step, which may be before the beginning of the window.
         since_ns = begin_ns // step_ns * step_ns
         self._update_situation(begin_ns, begin, moving, sent=())
         reckoning_step_ns = policy.reckoning_step_ns(situation)
@@ -344,7 +344,7 @@ class Coordinator:
         self._select_present()
 
     def _select_present(self) -> None:
-        """Set the pairs and the other agents of the situation to those that are present, if some have been absent."""
+        """Limit the pairs and the other agents of the situation to present agents, if some have been absent."""
         if not self._agents.has_changed:
             return
         situation = self.situation

@@ -18,7 +18,7 @@ ABSENT: Final = "agent absent"
 
 
 def transmitters(network: object) -> tuple[str, ...]:
-    """Return the agents that forward or interfere in a network, in addition to those that send and receive.
+    """Return the agents that forward or interfere in a network, in addition to the senders and receivers.
 
     They are the value of the network's optional attribute `transmitters`.
     """
@@ -169,7 +169,7 @@ class PacketLedger:
         return fates
 
     def is_withdrawn(self, packet_id: int) -> bool:
-        """Return True once for a packet that was withdrawn, whose fate the network now reports."""
+        """Return True if a reported packet was withdrawn before; a second call for it returns False."""
         if packet_id not in self._withdrawn:
             return False
         self._withdrawn.remove(packet_id)

@@ -24,8 +24,8 @@ class Curve:
 
     Attributes:
         name: Its name; the name of a sync policy determines its colour and marker.
-        x: Above 0, at least one.
-        y: At least 0, one for each x.
+        x: Values above 0, at least one.
+        y: Values of at least 0, one for each x.
         label: Text next to it; if empty, its name.
     """
 

@@ -25,7 +25,8 @@ class Fate:
         arrived_ns: Time when the network delivered it, or None.
         counted_ns: Time from which the arrival counts for its receiver: `arrived_ns` or the end of the window,
             depending on the policy.
-        late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; else 0.
+        late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
+            0.
         reason: The reason why it never arrived; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
             affect the packet; None if only its source and destination affect it (`packet_ledger.position_error_m`).

@@ -122,7 +122,7 @@ def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[
             time.sleep(_POLL_S)
         if _has_exited(process.pid):
             break
-    # SIGKILL to the group also ends processes that the command started, and suspended ones.
+    # SIGKILL to the group also ends processes that the command started, and suspended processes.
     _signal_group(process.pid, signal.SIGKILL)
     process.wait()
     stderr.close()

@@ -32,7 +32,8 @@ class CompiledProgram:
 
     Attributes:
         name: Its name in messages and file names.
-        source: The file. Its own headers are beside it; those for all federates are in `sim_backends/federates/cpp`.
+        source: The file. Its own headers are beside it; headers for all federates are in
+            `sim_backends/federates/cpp`.
         packages: Names of its libraries for pkg-config.
         install: Command that installs the compiler and the libraries.
         flags: Other options of the compiler.

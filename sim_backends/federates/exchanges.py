@@ -45,7 +45,7 @@ _STATES_HEAD: Final = struct.Struct("<qII")
 
 
 def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any], agents: AgentTable) -> bytes:
-    """Return the body of a request to a physics; raises as `commands_bytes`.
+    """Return the body of a request to a physics; errors as for `commands_bytes`.
 
     Args:
         to_ns: Time to advance to.

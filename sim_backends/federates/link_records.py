@@ -69,5 +69,5 @@ def _or_nan(value: float | None) -> float:
 
 
 def _or_none(value: float) -> float | None:
-    """Return a number, or None if it is not finite: an unknown one is NaN."""
+    """Return a number, or None if it is not finite: NaN means unknown."""
     return value if math.isfinite(value) else None

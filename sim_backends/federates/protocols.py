@@ -1,4 +1,4 @@
-"""Protocols of federates, and the errors that name the one that failed or did not answer."""
+"""Protocols of federates, and the errors that name the federate that failed or did not answer."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol

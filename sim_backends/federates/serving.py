@@ -35,7 +35,7 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
 
 
 def serve_service(service: FederateService, *, address: str | None = None, runs: int | None = None) -> None:
-    """Serve a federate and its properties; otherwise as `serve`."""
+    """Serve a federate and its properties; arguments and errors as for `serve`."""
     parsed = None if address is None else parse_address(address)
     if address is not None and parsed is None:
         raise ValueError(f"{address!r} is not one of {', '.join(FORMS)}")

@@ -47,7 +47,7 @@ class SimulatorOptions(Strict):
         return {}
 
     def to_json(self) -> dict[str, Any]:
-        """Return all options as JSON values, defaults included, without those that are None."""
+        """Return all options as JSON values, including defaults, without options that are None."""
         return self.model_dump(mode="json", by_alias=True, exclude_none=True)
 
 

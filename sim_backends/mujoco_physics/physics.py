@@ -1,4 +1,4 @@
-"""The physics federate in MuJoCo: the one module that imports it."""
+"""The physics federate in MuJoCo; the only module that imports MuJoCo."""
 
 import copy
 import json

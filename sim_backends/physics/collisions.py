@@ -242,7 +242,7 @@ def _push_out(
 def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
     """Return the direction and distance out of an obstacle that a cylinder overlaps.
 
-    The direction is vertical if the cylinder came from above or below, else horizontal. A driving body is moved
+    The direction is vertical if the cylinder came from above or below, otherwise horizontal. A driving body is moved
     neither up nor down but back: on a ramp it may touch something above itself.
     """
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])

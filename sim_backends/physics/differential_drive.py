@@ -101,8 +101,8 @@ class Arc:
 
     Attributes:
         start: Its initial pose.
-        speed_m_s: Initial speed, equal to that of the initial pose except for rounding.
-        turn_rad_s: Initial yaw rate, equal to that of the initial pose except for rounding.
+        speed_m_s: Initial speed, equal to the speed of the initial pose except for rounding.
+        turn_rad_s: Initial yaw rate, equal to the yaw rate of the initial pose except for rounding.
         acceleration_m_s2: Change of the speed per second.
         turn_acceleration_rad_s2: Change of the yaw rate per second.
         steps: See `Course.steps`.

@@ -203,7 +203,7 @@ class Glide:
 
     Attributes:
         start: Its initial pose.
-        velocity_m_s: Its velocity, equal to that of the initial pose except for rounding.
+        velocity_m_s: Its velocity, equal to the velocity of the initial pose except for rounding.
         step_s: Length of a step.
     """
 

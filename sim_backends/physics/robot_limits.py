@@ -12,7 +12,7 @@ BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
     "turtlebot3_burger": TURTLEBOT3_BURGER,
     **QUADROTORS,
 }
-"""All robots; those with a robot profile also have a radio."""
+"""All robots; robots with a robot profile also have a radio."""
 
 
 def quadrotor(profile: str) -> QuadrotorLimits:

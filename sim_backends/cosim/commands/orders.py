@@ -112,7 +112,8 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
         return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 
     def policy_for(window_s: float) -> SyncPolicy:
-        # The windows of error_bounded are as long as those of other policies unless its bound requires shorter ones.
+        # The windows of error_bounded are as long as the windows of other policies unless its bound requires shorter
+        # ones.
         longest_s = window_s if task.policy == ErrorBounded.name else max(window_s, scenario.policy.longest)
         return make_policy(task.policy, **scenario.policy.parameters | {"window_s": window_s, "longest_s": longest_s})
 

@@ -345,7 +345,7 @@ def seed_result(
         run: The record.
         states: States of agents in the form of `Recording.states`, at least for time 0.
         ended_by: The exception that ended it early, or None.
-        starts: States of all agents at their starts; None for the first ones in `states`.
+        starts: States of all agents at their starts; None for the first states in `states`.
         lateness: Lateness of its windows; None if it was not a run in real time.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0

@@ -85,7 +85,7 @@ class Sheet:
         return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
 
     def legend(self, part: SheetPart, explained: Collection[str] = ()) -> dict[str, str]:
-        """Return the meanings of the headings of a part, without those that are already explained."""
+        """Return the meanings of the headings of a part, except headings that are already explained."""
         columns = [column for column in self.columns if column.name in part.columns and column.meaning]
         meanings = {column.head.partition(" (")[0]: column.meaning for column in columns}
         return {head: meaning for head, meaning in meanings.items() if head not in explained}

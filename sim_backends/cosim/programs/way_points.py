@@ -231,7 +231,7 @@ class VelocityProfile(NeverSends):
         begin_ns: Beginning of the first leg.
 
     Raises:
-        ConfigurationError: There are no legs, or the duration of one is not above 0.
+        ConfigurationError: There are no legs, or a duration is not above 0.
     """
 
     def __init__(self, legs: Sequence[ProfileLeg], *, begin_ns: int = 0) -> None:

@@ -29,7 +29,7 @@ _MULTICAST: Final = IPv4Address("239.255.0.1").packed
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
 """Ports of DDS: of the first participant of a host, and of discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
 _FIRST_PORT: Final = 40_000
-"""Destination port of the first flow; each further flow has the next."""
+"""Destination port of the first flow; each further flow has the next port."""
 _FIRST_EPHEMERAL_PORT: Final = 50_000
 """Source port of the first flow: a dynamic port (RFC 6335, section 6), not 49152, which tcpdump decodes specially."""
 _PORTS: Final = 9_000
@@ -53,7 +53,7 @@ class CapturedFlow:
 
     Attributes:
         port: Destination port; None for any free port.
-        ping: Name of the ping whose echo requests or replies (ICMP) the packets are; empty for UDP and TCP.
+        ping: Name of the ping if the packets are its ICMP echo requests or replies; empty for UDP and TCP.
         is_reply: True for replies of the ping.
     """
 
@@ -70,7 +70,7 @@ NO_FLOWS: Final[Mapping[str, CapturedFlow]] = MappingProxyType({})
 
 
 def addresses(names: Sequence[str]) -> dict[str, IPv4Address]:
-    """Return the addresses of robots in captures: the first is 10.0.0.1, each further one has the next address.
+    """Return the addresses of robots in captures: the first is 10.0.0.1, each further robot has the next address.
 
     Args:
         names: The robots, in the order of their names.

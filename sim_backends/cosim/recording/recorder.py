@@ -55,7 +55,7 @@ class StateSamples:
         recorder: The recorder, or None.
 
     Attributes:
-        states: Time in nanoseconds, agent, state, as `Recording.states`.
+        states: Time in nanoseconds, agent and state, in the form of `Recording.states`.
         log_ip: The recorder's method; missing if the recorder does not accept IP packets.
     """
 

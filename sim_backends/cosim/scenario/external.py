@@ -123,7 +123,7 @@ class SimulatorName(NamedTuple):
 
 
 def simulators() -> list[SimulatorName]:
-    """Return the built-in simulators and those of installed packages; none of them is imported.
+    """Return the built-in simulators and the simulators of installed packages; none of them is imported.
 
     Raises:
         ConfigurationError: The package of a simulator cannot be loaded.
@@ -136,7 +136,7 @@ def simulators() -> list[SimulatorName]:
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
 ) -> PhysicsFederate | None:
-    """Start, connect or make the scenario's external physics, if it has one; arguments as `make_hello`.
+    """Start, connect or make the scenario's external physics, if it has one; arguments as for `make_hello`.
 
     Raises:
         ConfigurationError: The name, the command or the address cannot be used.
@@ -162,7 +162,7 @@ def open_network(
     *,
     captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect or make the scenario's external network, if it has one; otherwise as `open_physics`.
+    """Start, connect or make the scenario's external network, if it has one; errors as for `open_physics`.
 
     Args:
         scenario: The scenario.

@@ -76,7 +76,7 @@ def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) ->
 
     Args:
         data: A scenario file.
-        changes: Values that replace those of the file, by their keys.
+        changes: Values that replace values of the file, by their keys.
     """
     for role in ROLES.values():
         section = data.get(role) if isinstance(data, dict) else None

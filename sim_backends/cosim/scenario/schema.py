@@ -143,7 +143,7 @@ class AgentPlan(Strict):
         aside_m: Distance of the start from that line, to the left.
         height: Height of the start over the ground, for agents that fly.
         heading_deg: Initial heading, from east towards north.
-        radio: Its radio, instead of that of its robot profile.
+        radio: Its radio, instead of the radio of its robot profile.
         motion: Its motion.
         phase: Time of its controller's first command, within the 50 ms between commands; if omitted, it is random.
         appears: Time when it appears at its start. Its motion begins at this time, and its traffic at this time or
@@ -201,7 +201,7 @@ class CosimScenario(Named):
     `fieldkit cosim schema` prints its JSON schema, with which an editor completes and checks it, see [the Python
     API](cosim-api.md#scenario-files). `robot` is the name of a robot profile, which has a radio. Bodies of `husky`,
     `iris`, `turtlebot3_burger` and `duckiedrone` are built in; another robot has the body of the TurtleBot, or of the
-    Duckiedrone, with its own top speed. The keys of `radio` are those of `emulated.radio` in the [site
+    Duckiedrone, with its own top speed. `radio` has the same keys as `emulated.radio` in the [site
     file](reference/site-file.md).
 
     Attributes:

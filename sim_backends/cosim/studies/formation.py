@@ -238,7 +238,7 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
 
 
 def mean_formation(formations: Sequence[Formation]) -> Formation:
-    """Return the formations of several runs as one: means, or the largest of maxima.
+    """Return the combined formation of several runs: means, or the largest of maxima.
 
     Args:
         formations: At least one.

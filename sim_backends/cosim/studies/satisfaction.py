@@ -27,7 +27,7 @@ class Round:
     Attributes:
         window_s: Its initial w.
         median_window_s: Median of the windows that the rule computed from it.
-        loss: Share of packets lost, of those whose fate is decided.
+        loss: Share of lost packets among the packets whose fate is decided.
         errors: Errors relative to the reference.
         exchanges: Number of windows.
     """

@@ -75,7 +75,7 @@ def check_start(target: Target) -> None:
 
 
 def check_remainders(target: Target) -> None:
-    """In windows of 1.1 steps, the states are always those at the last complete step."""
+    """In windows of 1.1 steps, the states are always the states at the last complete step."""
     probe = target.open()
     step_ns = probe.welcome.step_ns
     window_ns = step_ns + max(step_ns // 10, 1)

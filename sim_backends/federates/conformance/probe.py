@@ -111,7 +111,7 @@ class FederateProbe:
     def request(
         self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
     ) -> Any:  # noqa: ANN401 (of `decode`)
-        """Send a request, and return the decoded answer; errors as `FederateSession.request`."""
+        """Send a request, and return the decoded answer; errors as for `FederateSession.request`."""
         what = kind.name.lower().replace("_", " ")
         return self._session.request(kind, copy, body, answer, decode=decode, what=lambda: what)
 
@@ -224,7 +224,7 @@ class Target:
         """Return a fresh federate after the last one has ended: a listening federate may serve one run at a time.
 
         Args:
-            hello: The hello that it receives, if it is not that of the target.
+            hello: The hello that it receives, if it is not the hello of the target.
         """
         self.close()
         self.exchange |= {"request": "hello", "answer": "none"}

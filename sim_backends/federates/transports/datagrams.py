@@ -81,7 +81,7 @@ def pack_datagram(header: DatagramHeader, data: bytes | memoryview = b"") -> byt
 
 
 def unpack_datagram(datagram: bytes) -> DatagramHeader | None:
-    """Return the header of a datagram, or None if it is not one of this transport."""
+    """Return the header of a datagram, or None if it is not a datagram of this transport."""
     if len(datagram) < DATAGRAM_HEADER_BYTES:
         return None
     magic, version, kind, _, *numbers = _HEADER.unpack_from(datagram)
@@ -191,7 +191,7 @@ class DatagramChannel:
         self._socket.close()
 
     def handle(self, datagram: bytes) -> None:
-        """Handle a received datagram; one that does not belong to this connection is ignored."""
+        """Handle a received datagram; a datagram of another connection is ignored."""
         header = unpack_datagram(datagram)
         if header is None or (header.connection, header.cookie) != self._identity:
             return

@@ -165,7 +165,7 @@ class RemoteCalls:
             serve: Executes the call at the callee and returns the response; a call that is repeated may be executed
                 twice.
             retry: Times of retries; None for no retry.
-            topic: Topic of the call if it has a separate connection, else empty.
+            topic: Topic of the call if it has a separate connection, otherwise empty.
         """
         connection = f"xmlrpc {caller} {callee} {topic}".rstrip()
 

@@ -1,4 +1,4 @@
-"""Sent segments that are not acknowledged: those that arrived (by SACK), those lost, those in flight (RFC 6675)."""
+"""Sent segments that are not acknowledged: segments that arrived (by SACK), are lost, or are in flight (RFC 6675)."""
 
 import heapq
 from bisect import bisect_left

@@ -1,4 +1,4 @@
-"""Options of TCP; the defaults are those of Linux."""
+"""Options of TCP, with the defaults of Linux."""
 
 from dataclasses import dataclass
 from typing import Final, Literal

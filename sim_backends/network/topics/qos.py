@@ -11,7 +11,7 @@ SECOND: Final = 1000 * MS
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """Quality of service of a flow; durability is always volatile. The defaults are those of ROS 2.
+    """Quality of service of a flow; durability is always volatile. The defaults are the same as in ROS 2.
 
     Attributes:
         reliability: `reliable`, or `best_effort`.

@@ -38,7 +38,8 @@ class _Response:
     """The response that a reader may send now.
 
     Attributes:
-        kind: Kind of response; silent ones are not sent; a suppressed one acknowledges without requesting data.
+        kind: Kind of response; a silent response is not sent; a suppressed response acknowledges without requesting
+            data.
         numbers: Requested samples.
         missing_fragments: Requested fragments of the sample after them.
         is_timed_repeat: True if it is a request only because enough time has passed since the same request.

@@ -106,7 +106,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class AckNack:
-    """ACKNACK: the samples that a reader has, and those that it lacks (8.3.8.1).
+    """ACKNACK: the samples that a reader has, and the samples that it lacks (8.3.8.1).
 
     Attributes:
         base: It has all samples before this one.

@@ -40,8 +40,8 @@ class TopicWriter:
 
     Attributes:
         on_reader_start: Called when its reader starts, or starts again.
-        share_heartbeat: Called with separate heartbeats at whole periods, to send them with those of other writers;
-            None sends them directly.
+        share_heartbeat: Called with separate heartbeats at whole periods, to send them together with heartbeats of
+            other writers; None sends them directly.
     """
 
     def __init__(
