@@ -83,8 +83,9 @@ class SensedStates(Mapping[str, State]):
 class MujocoPhysics:
     """Moves the agents of a run in MuJoCo.
 
-    Its time is a number of steps. A command applies at the first step that is not before it. The result does not
-    depend on how the time is divided into calls. Agents that are absent are parked far away from the others.
+    Its time is a number of steps. A command applies at the first step that is not before the time at which it was
+    given. The result does not depend on how the time is divided into calls. Agents that are absent are parked far
+    away from the others.
 
     Args:
         hello: The run: agents, step, and configuration with `world` and `robots`, both optional.

@@ -29,7 +29,7 @@ class Footprint:
         reach_m: Radius around that point: the radius of a round obstacle, 0 for one with edges.
         low_m: Height of its lower face.
         high_m: Height of its upper face.
-        wall_m: Returns the height up to which it is an obstacle at a point of it; None if that is `high_m`
+        wall_m: Returns the height up to which it is an obstacle at one of its points; None if this is `high_m`
             everywhere.
     """
 

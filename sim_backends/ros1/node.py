@@ -75,7 +75,7 @@ class RosPublisher:
         stream.sendall(pack(pack_header(self._header)))
         with self._lock:
             self._streams.append(stream)
-        # Subscribers send nothing more, so that the end of the stream is all that can be read.
+        # Subscribers send nothing more, so only the end of the stream can be read.
         ended = select.poll()
         ended.register(stream, select.POLLIN)
         ended.poll()

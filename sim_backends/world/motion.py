@@ -54,7 +54,7 @@ class Motion(Protocol):
 
     @property
     def end_ns(self) -> int | None:
-        """Time after which all of them stay at rest, nanoseconds; None if it is unknown."""
+        """Time in nanoseconds after which all robots stay at rest; None if it is unknown."""
         ...
 
     def at(self, time_ns: int) -> Mapping[str, State]:

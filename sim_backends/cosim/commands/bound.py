@@ -37,7 +37,7 @@ _COLUMNS: Final = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search for the fixed window that keeps the bound, with each seed, and print the cost of both.
+    """Search for the fixed window that keeps the bound, with each seed; print its cost and that of `error_bounded`.
 
     Raises:
         ConfigurationError: An option is given that applies to other modes only.

@@ -45,7 +45,7 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
 
     Args:
         scenario: The scenario with the faults.
-        run: A run of it.
+        run: A run of the scenario.
     """
     reached_ns = run.windows_ns[-1] if run.windows_ns else 0
     all_recoveries = []
@@ -134,7 +134,7 @@ class FlowResult:
         destination: The receiving agent.
         protocol: Its transport.
         sent: Number of packets whose fate is decided.
-        arrived: Number of them that arrived.
+        arrived: Number of these packets that arrived.
         under_way: Number of packets whose fate is not decided.
         sent_bytes: Total size of sent packets.
         arrived_bytes: Total size of packets that arrived.

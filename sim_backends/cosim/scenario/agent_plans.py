@@ -52,7 +52,7 @@ class StandingPlan(Strict):
 
 
 class WayPointsPlan(Strict):
-    """The agent moves from point to point, and stays at the last.
+    """The agent moves from point to point, and stays at the last point.
 
     Attributes:
         kind: `way-points`.
@@ -105,7 +105,7 @@ class FollowPlan(Strict):
 
     Attributes:
         kind: `follow`.
-        leader: The agent that it follows or, if it flies, a list of several.
+        leader: The agent that it follows or, if it flies, a list of several agents.
         distance: Distance behind the leader at standstill, or height above it; from antenna to antenna.
         headway: Time headway behind the leader, in addition to the distance.
         timeout: Time without a state after which it stops.
@@ -137,7 +137,7 @@ MotionPlan = Annotated[
 Protocol = Literal["udp", "tcp", "topic", "ros1", "ros1-udp"]
 
 _MAX_BYTES = 65_000
-"""Largest packet: UDP carries 65,507 bytes (RFC 768, RFC 791), which must also hold the header of a topic."""
+"""Largest packet: UDP carries 65,507 bytes (RFC 768, RFC 791), which include the header of a topic."""
 
 _MAX_MESSAGES = 10**6
 """Largest bag: it is in memory as a whole, 100 bytes per message, even if only a part of it is played."""
@@ -290,13 +290,13 @@ class BagTraffic(_Traffic):
 
 
 class FileTraffic(_Traffic):
-    """A file is sent as fast as possible, as by netcat.
+    """A file is sent as fast as possible, as netcat does.
 
     Attributes:
         kind: `file`.
         size_bytes: Size of the file.
         piece_bytes: Size of each write to the transport: netcat uses 8192 bytes.
-        port: Destination port in captures; a free one if omitted.
+        port: Destination port in captures; a free port if omitted.
     """
 
     kind: Literal["file"]

@@ -113,7 +113,8 @@ def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: 
     Args:
         scenario: The scenario.
         bodies: The body of each agent.
-        seed: Seed of the phases that the scenario does not set; controllers of different robots are not synchronous.
+        seed: Seed of the phases that the scenario does not set; the controllers of different robots do not run at the
+            same times.
     """
     programs = {
         name: _controller(plan, bodies[name], plan.lifetime.appears_ns, _phase_ns(name, plan, seed))

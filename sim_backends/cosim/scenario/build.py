@@ -102,7 +102,7 @@ def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
 
 
 def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
-    """Return the description of captures with the headers of `Captures`; None if the network writes none."""
+    """Return the description of captures with the headers of `Captures`; None if the network writes no captures."""
     if not writes_captures(scenario):
         return None
     flows = captured_flows(scenario.traffic)
@@ -248,7 +248,7 @@ def build(
             receives the programs' packets as IP packets.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
-        network: Replaces the scenario's network; faults of the radio are then its responsibility.
+        network: Replaces the scenario's network; it must then also apply the faults of the radio.
         measures_all: As for `Coordinator`.
         captures: Folder of captures for a network that writes them itself; the recorder then receives no IP packets.
 

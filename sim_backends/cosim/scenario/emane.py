@@ -80,7 +80,7 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         self._publish(states)
 
     def window(self, window: Window) -> None:
-        """Publish the states at the end of a window if they are due; a run in real time waits for their wall time."""
+        """Publish the states at the end of a window if they are due; in real time, this waits for their wall time."""
         if self._observer is not None:
             self._observer.window(window)
         if self._sampling.is_due(window.end_ns):

@@ -170,7 +170,7 @@ def open_network(
         bodies: The bodies.
         seed: The seed.
         deadline_s: The deadline.
-        captures: Description of the captures that a network with `writes_captures` writes; None for none.
+        captures: Description of the captures that a network with `writes_captures` writes; None if it writes none.
     """
     where = scenario.network.federate
     if where is None:
@@ -213,7 +213,7 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     """Return a federate in this process.
 
     Raises:
-        ConfigurationError: It does not support the scenario, or something is not installed.
+        ConfigurationError: It does not support the scenario, or required software is not installed.
     """
     service = federate.load()
     try:

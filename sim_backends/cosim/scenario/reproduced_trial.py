@@ -1,4 +1,4 @@
-"""The trial of robots that a scenario reproduces, so that both can be compared: its section of a scenario file."""
+"""Section of a scenario file: the trial of robots that the scenario reproduces, so that both can be compared."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -58,7 +58,7 @@ class ReproducedTrial(Strict):
         return {protocol: chosen for protocol, chosen in flows.items() if chosen is not None}
 
     def problems(self, traffic: Sequence[Traffic]) -> Iterator[tuple[str, Location]]:
-        """Yield each contradiction to the traffic of its scenario, with the keys of the wrong value."""
+        """Yield each contradiction between procedure and traffic, with the keys of the wrong value."""
         by_name = {entry.title: entry for entry in traffic}
         ends: set[tuple[str, ...]] = set()
         for protocol, flows in self.flows.items():

@@ -77,8 +77,8 @@ class PhysicsOptions(Strict):
         federate: An [external federate](federates.md) that replaces the built-in physics: the name of an installed
             simulator, a command, or an address of `tcp`, `udp`, `dds` or `ros1` (addresses: `fieldkit docs
             federates`). A command is started for each run of the scenario.
-        options: Options of the federate, for [installed simulators](reference/simulator-options.md), the options in
-            its table.
+        options: Options of the federate; each [installed simulator](reference/simulator-options.md) has a table of
+            its options.
     """
 
     step: Annotated[Duration, Field(ge=1e-6, le=1)] = 0.001

@@ -224,7 +224,7 @@ class RowSource(NamedTuple):
     Attributes:
         labels: Labels of the row.
         setup: Name of the setup.
-        flow: Name of the flow in it.
+        flow: Name of the flow in the setup.
         printed: The paper's delay and loss.
     """
 

@@ -34,7 +34,7 @@ def _states(probe: FederateProbe) -> dict[str, State]:
 
 
 def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
-    """Return packets between the first two agents, in both directions in turns."""
+    """Return packets between the first two agents, alternately in both directions."""
     ends = [agent.name for agent in probe.hello.agents[:2]]
     if len(ends) < 2:
         raise NotDeclaredError("the scenario has only one agent")

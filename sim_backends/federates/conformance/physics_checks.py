@@ -198,7 +198,7 @@ def check_determinism(target: Target) -> None:
 
 
 def check_lifetimes(target: Target) -> None:
-    """An agent has states from when it appears, at its start, until it disappears, if the federate removes agents."""
+    """An agent has states from its appearance at its start until it disappears, if the federate removes agents."""
     appears_steps, disappears_steps = 100, 300
     name = target.hello.agents[0].name
     step_ns = target.hello.step_ns

@@ -96,7 +96,7 @@ class TcprosLink:
         self._streams.send(upstream, f"{self._name} {connection}", size_bytes, accept, reconnect)
 
     def publish(self, packet: Packet) -> None:
-        """Send a message, at the publisher."""
+        """Send a message from the publisher."""
         if not self._publisher_connection:
             self._wire.drop(packet.packet_id, NOT_CONNECTED)
             return
@@ -220,7 +220,7 @@ class UdprosLink:
         self.connected = True
 
     def publish(self, packet: Packet) -> None:
-        """Send a message, at the publisher."""
+        """Send a message from the publisher."""
         if not self.connected:
             self._wire.drop(packet.packet_id, NOT_CONNECTED)
             return

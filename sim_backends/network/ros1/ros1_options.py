@@ -24,7 +24,7 @@ PUBLISHER_UPDATE_BYTES: Final = 425
 PUBLISHER_UPDATED_BYTES: Final = 364
 GET_KEEPALIVE_BYTES: Final = 370
 KEEPALIVE_BYTES: Final = 402
-"""A call of `getParam`, and its response that the parameter does not exist."""
+"""Sizes of a call of `getParam`, and of the response that the parameter does not exist."""
 PUBLISHER_BYTES: Final = 56
 """Size of a publisher's address in the response to a subscriber and in a publisher update."""
 REQUEST_TOPIC_BYTES: Final = 508

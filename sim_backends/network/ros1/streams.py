@@ -1,4 +1,4 @@
-"""Messages of ROS 1 over TCP, a transport on top of another transport; and calls by XML-RPC.
+"""Messages of ROS 1 over TCP (a transport on top of another transport), and calls by XML-RPC.
 
 Calls between nodes and their master are requests and responses over TCP, with retries.
 """

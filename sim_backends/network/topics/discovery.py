@@ -77,7 +77,7 @@ class SharedHeartbeats:
 
 @dataclass(slots=True)
 class _Remote:
-    """State of a remote participant at a participant.
+    """State of a remote participant, as one participant records it.
 
     Attributes:
         lease: Fires when the lease may have expired.

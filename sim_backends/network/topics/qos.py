@@ -52,7 +52,7 @@ class TopicFlow:
     Attributes:
         publisher: Agent with the writer.
         subscriber: Agent with the reader.
-        qos: Quality of service of both.
+        qos: Quality of service of writer and reader.
         topic: Name of the topic in ROS; its length affects the size of discovery messages.
         type_name: DDS name of its type; its length also affects their size.
     """

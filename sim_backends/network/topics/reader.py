@@ -269,7 +269,7 @@ class TopicReader:
         age_ns = self._wire.now_ns - self._matched_ns
         factor = next((factor for until_ns, factor in _INITIAL_BACKOFF if age_ns <= until_ns), 10)
         self._response_timer.bring_forward(self._wire.now_ns + factor * self._timing.first_acknack_repeat_ns)
-        # CycloneDDS sends the count 0, for which its writers have an exception; a normal count needs none.
+        # CycloneDDS sends the count 0, for which its writers have an exception; a normal count needs no exception.
         acknack = AckNack(self._next, (), self._next_count(), final=False)
         self._transmit((acknack,), ("acknack", self._response_count))
 

@@ -1,6 +1,6 @@
 """Messages of RTPS and their sizes (OMG DDSI-RTPS 2.5, clause 9.4), as far as they are used here.
 
-A message is a header and submessages. Message sizes include the headers of IP and UDP.
+A message consists of a header and submessages. Message sizes include the headers of IP and UDP.
 """
 
 from dataclasses import dataclass, field
