@@ -77,7 +77,7 @@ _CHANGE: Final = ""
 
 
 class Agents:
-    """Advances bodies and programs together. A program reads the state of its body at the current time in any window.
+    """Advances bodies and programs together. In any window, programs read the current state of their bodies.
 
     An agent is absent outside of its lifetime. If the attribute `agents_disappear` of the physics is True, an agent
     is also absent while the physics returns no state for it. The program of an absent agent does not wake.

@@ -66,8 +66,8 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised after that.
 
     Raises:
-        ConfigurationError: The physics does not move an agent that may send or receive, or it lacks something that a
-            physics federate needs.
+        ConfigurationError: The physics does not move an agent that may send or receive, or the physics lacks a member
+            of a physics federate.
         FederateError: The physics failed, or does not move an agent that runs a program.
     """
 

@@ -34,7 +34,7 @@ def fixed_emitters_m(network: object) -> tuple[Vector, ...]:
 def position_error_m(fate: Fate) -> float:
     """Return the largest error, in metres, of the relative positions that the network assumed for a packet.
 
-    It includes at least the positions of sender and receiver, at the time of sending.
+    The error includes at least the positions of sender and receiver, at the time of sending.
     """
     if fate.position_error_m is not None:
         return fate.position_error_m

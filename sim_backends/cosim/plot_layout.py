@@ -133,7 +133,7 @@ class LabelBox:
     height: float
 
     def overlap(self, other: "LabelBox") -> float:
-        """Return the area that both cover."""
+        """Return the area of the overlap with another rectangle."""
         width = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
         height = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
         return max(width, 0.0) * max(height, 0.0)

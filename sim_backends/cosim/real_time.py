@@ -76,7 +76,7 @@ class Pace:
 
         Raises:
             RealTimeError: A window was later than the bound.
-            FieldkitError: For the reasons of `Simulation.run`.
+            FieldkitError: As for `Simulation.run`.
         """
         coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
         bound_ns = round(self.late_bound_s * 1e9)

@@ -80,8 +80,8 @@ class EventDigest:
     """Hashes windows in order: packets that entered the network, arrivals, drops, and the end of each window.
 
     A window is hashed after its end, so the digest of a run that stops within a window covers the windows before it.
-    States are not hashed: the last bit of a position may differ between two mathematical libraries; times do not
-    differ.
+    States are not hashed, because the last bit of a position may differ between two mathematical libraries. Times are
+    the same with every library.
 
     Attributes:
         quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together. For a window

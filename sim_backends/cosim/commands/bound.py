@@ -37,7 +37,7 @@ _COLUMNS: Final = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search for the fixed window that keeps the bound, with each seed; print its cost and that of `error_bounded`.
+    """Search for the fixed window that keeps the bound, for each seed; print its cost and the `error_bounded` cost.
 
     Raises:
         ConfigurationError: An option is given that applies to other modes only.

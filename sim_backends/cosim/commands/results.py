@@ -138,7 +138,7 @@ class FlowResult:
         under_way: Number of packets whose fate is not decided.
         sent_bytes: Total size of sent packets.
         arrived_bytes: Total size of packets that arrived.
-        delay_s: Time in the network, of packets that arrived.
+        delay_s: Time in the network of the packets that arrived.
         first_to_last_s: Time from the first arrival to the last.
         jitter_s: Interarrival jitter after the last packet (RFC 3550, section 6.4.1); nan for fewer than two packets.
         added_s: Mean delay that the sync policy added, before and after the network.

@@ -119,7 +119,7 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
 
 
 def number_text(value: float, digits: int = 3) -> str:
-    """Return a number with that many significant digits, without an exponent unless it would be long."""
+    """Return a number with `digits` significant digits, without an exponent unless it would be long."""
     if value == 0 or 1e-4 <= abs(value) < 1e3:
         return f"{value:.{digits}g}"
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"

@@ -5,9 +5,10 @@ many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Phy
 network: arrivals count from the end of the window, so nothing that they do in the window depends on the network. At
 the time that they have reached, a pair of agents has an error x, the distance between their true relative position
 and the relative position that the network assumes. It grows at a speed v, which changes by at most the acceleration
-limit a: after a time t it is at most x + v t + a t^2 / 2. Before this can reach the bound, the policy evaluates the
-errors again; if less than one step of the physics remains, the window ends. So the bound holds for any motion, and no
-margin is lost to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
+limit a: after a time t it is at most x + v t + a t^2 / 2. Before the error can reach the bound, the policy evaluates
+the errors again; if less than one step of the physics remains, the window ends. The bound therefore holds for any
+motion, and no margin is lost to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6,
+49, 2006).
 
 The policy examines the pairs of all agents that send, receive, forward or interfere. A bound in metres adds the pairs
 of each agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound
@@ -62,7 +63,7 @@ class ErrorBounded:
         exponent: Exponent of the log-distance law for `bound_db`.
 
     Raises:
-        PolicyError: One of them is not above 0.
+        PolicyError: One of these values is not above 0.
     """
 
     name = "error_bounded"

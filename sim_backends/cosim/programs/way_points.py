@@ -61,7 +61,7 @@ _APPROACH_PER_S: Final = 1.0
 
 
 class DriveThrough(NeverSends):
-    """Drives a wheeled body from point to point, and stops at the last.
+    """Drives a wheeled body from point to point, and stops at the last point.
 
     It turns towards a point at a rate proportional to the heading error, and the larger the error is, the slower it
     drives.
@@ -119,7 +119,7 @@ class DriveThrough(NeverSends):
 
 
 class FlyThrough(NeverSends):
-    """Flies a body from point to point, and hovers at the last.
+    """Flies a body from point to point, and hovers at the last point.
 
     Args:
         points_m: The waypoints, metres east, north, up.

@@ -36,7 +36,7 @@ class BoundCost:
 
     @property
     def factor(self) -> float:
-        """Ratio of the exchanges with that window to those with `error_bounded`; nan if no window keeps the bound."""
+        """Exchanges with that window per exchange with `error_bounded`; nan if no window keeps the bound."""
         return self.fixed_exchanges / self.exchanges if self.fixed_exchanges else math.nan
 
 
@@ -81,7 +81,7 @@ def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
 def longest_for_all(
     longest_s: Sequence[float], costs: Callable[[float], Sequence[FixedCost]], bound_m: float
 ) -> tuple[float, Sequence[FixedCost]]:
-    """Return the longest fixed window, to 2 %, that keeps a bound in all runs, and its cost in each.
+    """Return the longest fixed window that keeps a bound in all runs (to 2 %), and its cost in each run.
 
     It is the window that a user would choose for further runs. If there is none, the result is nan and an empty
     sequence.

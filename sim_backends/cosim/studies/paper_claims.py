@@ -36,14 +36,14 @@ LINES: Final[Mapping[str, tuple[Sight, ...]]] = {"all": tuple(Sight), **{str(lin
 
 
 class Claim(NamedTuple):
-    """A change from another system to the paper's, in some rows.
+    """The change from another system to the paper's system, in some rows.
 
     Attributes:
         than: The system with which the paper's own is compared.
         lines: One of `LINES`.
         quantity: `delay`, with a relative change, or `loss`, with a difference.
         claimed: The change that the paper states; None if it states none.
-        tabled: The change according to the paper's own tables; nan if they do not have it.
+        tabled: The change according to the paper's own tables; nan if the tables do not contain it.
         ours: The measured change, with its 95 % interval.
         rows: Number of rows that it is based on: for a delay, packets must have arrived in both systems.
     """

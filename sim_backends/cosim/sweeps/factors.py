@@ -54,7 +54,7 @@ _QUANTITIES: Final = (
 
 
 def _in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
-    """Return a quantity in a unit; only levels may be negative. Errors are those of `parse_quantity`."""
+    """Return a quantity in a unit; only levels may be negative. Errors are as for `parse_quantity`."""
     magnitude = text.removeprefix("-") if unit in {"dB", "dBm"} else text
     value = parse_quantity(magnitude, factors, "value")
     return value if magnitude == text else -value

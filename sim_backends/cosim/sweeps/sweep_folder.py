@@ -69,7 +69,7 @@ class SweepFolder:
 
     @contextmanager
     def opened(self, plan: SweepPlan) -> Iterator[None]:
-        """Create the folder or open it again, and lock it during the body.
+        """Create the folder or open it again, and lock it during the body of the `with` statement.
 
         Raises:
             ConfigurationError: It contains something else, another process runs the sweep, or it cannot be written.
