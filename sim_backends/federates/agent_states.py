@@ -210,7 +210,7 @@ def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
     """Return states of agents, by name.
 
     Raises:
-        MalformedFrameError: A state is invalid, or an agent has two.
+        MalformedFrameError: A state is invalid, or an agent has two states.
     """
     count = reader.count(STATE.size)
     begin = reader.position
@@ -253,7 +253,7 @@ def _check_each(data: bytes, begin: int) -> None:
     """Check each state.
 
     Raises:
-        MalformedFrameError: One is invalid; the error has its position.
+        MalformedFrameError: A state is invalid; the error has the position of this state.
     """
     for row, (index, reserved, *numbers, heading_rad, limit_m_s2) in enumerate(STATE.iter_unpack(data)):
         if reserved or not math.isfinite(sum(numbers)) or math.isinf(heading_rad) or not limit_m_s2 >= 0:

@@ -91,7 +91,7 @@ class MalformedFrameError(ValueError):
 
 
 class UnknownKindError(MalformedFrameError):
-    """A frame has an unknown kind: what was received may be text."""
+    """A frame has an unknown kind: the received bytes may be text."""
 
 
 class Header(NamedTuple):
@@ -201,7 +201,7 @@ class FrameReader:
         """Return the next text.
 
         Raises:
-            MalformedFrameError: It is too long, the frame ends before, or it is not UTF-8.
+            MalformedFrameError: It is too long, the frame ends too early, or it is not UTF-8.
         """
         position = self.position
         (length,) = self.unpack(_LENGTH)

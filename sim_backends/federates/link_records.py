@@ -15,7 +15,7 @@ _MAX_COUNT = 1 << 62
 
 
 def encode_links(samples: Mapping[str, LinkSample], agents: AgentTable) -> bytes:
-    """Return the body of the message; a time or counter that is unknown is 0."""
+    """Return the body of the message; an unknown time or counter is 0."""
     radios, links = [], []
     for name, sample in samples.items():
         noise_dbm = _or_nan(sample.noise_dbm)

@@ -15,12 +15,12 @@ from sim_backends.world.shapes import Box
 
 @dataclass(frozen=True)
 class Wheels:
-    """Wheels of equal size, whose sides turn at different speeds.
+    """Wheels of equal size; the wheels of the two sides may turn at different speeds.
 
     Attributes:
         axles_m: Positions of the axles, forward of the middle; each has a wheel on both sides.
         track_m: Distance of the wheels on both sides.
-        turning_track_m: Difference of the speeds of both sides per yaw rate, as the robot's controller assumes it.
+        turning_track_m: Difference of the speeds of the two sides per yaw rate, as assumed by the robot's controller.
         radius_m: Radius of a wheel.
         width_m: Width of a wheel.
         mass_kg: Mass of a wheel.
@@ -143,6 +143,6 @@ _IRIS_INERTIA_KG_M2: Final = (0.029125, 0.029125, 0.055225)
 
 
 def quadrotor_inertia_kg_m2(limits: QuadrotorLimits) -> Vector:
-    """Return the moments of inertia of a quadrotor: PX4's Iris (`models/iris`), scaled by mass and size."""
+    """Return the moments of inertia of a quadrotor, scaled from PX4's Iris (`models/iris`) by mass and size."""
     factor = limits.mass_kg / IRIS.mass_kg * (limits.radius_m / IRIS.radius_m) ** 2
     return _scaled(_IRIS_INERTIA_KG_M2, factor)

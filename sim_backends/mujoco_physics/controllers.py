@@ -21,7 +21,7 @@ _UPRIGHT: Final = 0.1
 
 @dataclass(frozen=True)
 class Registers:
-    """Arrays of the simulation that controllers read and write, flat.
+    """Flat arrays of the simulation that controllers read and write.
 
     Memory views access single items faster than NumPy.
 

@@ -2,14 +2,14 @@
 
 Forward speed and yaw rate approach the commanded values as fast as their limits allow, independently of each other,
 as in ROS's `diff_drive_controller`. With a constant acceleration a and yaw rate w, the displacement in a time t is
-exact (the integral of the speed along the heading, with the middle of the interval as the origin of time): with the
-mean speed v, the mean heading h and x = w t / 2, it is
+exact. It is the integral of the speed along the heading, with the origin of time in the middle of the interval. With
+the mean speed v, the mean heading h and x = w t / 2, it is
 
     v t sin(x) / x                            along h, and
     a t^2 / 2 (sin(x) - x cos(x)) / x^2       to the left of h.
 
-If the yaw rate changes while the robot moves, this is a Fresnel integral; a single step with the mean yaw rate is
-then used, with an error below v (dw/dt) t^3 / 12.
+If the yaw rate changes while the robot moves, the displacement is a Fresnel integral; a single step with the mean yaw
+rate is then used, with an error below v (dw/dt) t^3 / 12.
 """
 
 import math

@@ -155,7 +155,7 @@ def _kinematics(name: str, body: Body[Any], pose: Pose) -> _Kinematics:
 
 
 def _closing_time_s(gap_m: float, mover: _Kinematics, other: _Kinematics | None = None) -> float:
-    """Return the minimum time in which one body, or two, can close a gap, including acceleration."""
+    """Return the minimum time in which one or two bodies can close a gap, including acceleration."""
     v, a, top = mover.speed_m_s, mover.limit_m_s2, mover.top_speed_m_s
     if other is not None:
         v, a, top = v + other.speed_m_s, a + other.limit_m_s2, top + other.top_speed_m_s

@@ -50,7 +50,7 @@ _QUANTITIES: Final = (
     ("_dbm", "dBm", {"dBm": 1.0}),
     ("_value", "1", FRACTION_PER_UNIT),
 )
-"""Suffix, unit and factors of units of the column of numbers of each kind of quantity."""
+"""For each kind of quantity: suffix and unit of its column of numbers, and the factors of all its units."""
 
 
 def _in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
@@ -182,7 +182,7 @@ def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
 
 
 def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 (any YAML value)
-    """Yield the keys of all values that are not mappings, and lists of mappings, with their values."""
+    """Yield the joined keys and the value of each entry that is neither a mapping nor a list of mappings."""
     items = value.items() if isinstance(value, dict) else enumerate(value)
     for key, item in items:
         name = f"{prefix}{key}"
