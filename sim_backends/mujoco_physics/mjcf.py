@@ -202,7 +202,7 @@ class _Document:
         )
 
     def _add_grip(self, name: str, friction: float) -> None:
-        """Add contacts with friction between a shape and the ground; contacts with obstacles have none."""
+        """Add contacts with friction between a shape and the ground; contacts with obstacles have no friction."""
         for ground in self._grounds:
             _add(
                 self._grips,

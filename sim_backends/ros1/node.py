@@ -296,7 +296,7 @@ class RosNode:
             threading.Thread(target=self._serve, args=(stream,), daemon=True).start()
 
     def _serve(self, stream: socket.socket) -> None:
-        """Send messages to a subscriber; one that violates TCPROS is disconnected."""
+        """Send messages to a subscriber; a subscriber that violates TCPROS is disconnected."""
         with stream, suppress(OSError, ValueError):
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             stream.settimeout(CALL_S)

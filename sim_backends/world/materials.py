@@ -21,9 +21,9 @@ class Solid:
 
     Attributes:
         a: Relative permittivity at 1 GHz.
-        b: Its exponent.
+        b: Exponent of the frequency in the permittivity.
         c: Conductivity at 1 GHz, in S/m.
-        d: Its exponent.
+        d: Exponent of the frequency in the conductivity.
     """
 
     a: float

@@ -63,7 +63,7 @@ class Motion(Protocol):
 
 
 class WayPoints:
-    """One robot moves straight from point to point at one speed, and stops at the last.
+    """One robot moves straight from point to point at one speed, and stops at the last point.
 
     It has no mutable state: a state depends only on the time. Corners are passed at times rounded from their distance
     along the path, so that rounding errors do not add up.
@@ -103,7 +103,7 @@ class WayPoints:
         """Return an acceleration a such that extrapolation at the current velocity is wrong by at most a t^2 / 2.
 
         Up to the next corner, c from now, there is no error; after it two velocities of speed v differ by at most 2
-        v. So the error is at most 2 v (t - c), which is at most (v / c) t^2 / 2.
+        v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
         corner = bisect_right(self._times_ns, time_ns)
         if corner == len(self._times_ns):

@@ -142,7 +142,7 @@ class _Stamped:
 
 
 class Clocked:
-    """A program that uses only the clock of its computer, also for the time stamps of its datagrams.
+    """A program that uses only the clock of its computer, including for the time stamps of its datagrams.
 
     If the clock of one agent is wrong, the programs of all agents are wrapped, so that all can read the time stamps.
 
