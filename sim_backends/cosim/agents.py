@@ -39,8 +39,8 @@ class AgentAbsence(NamedTuple):
     """The absence of an agent, before it appears or after it has disappeared.
 
     Attributes:
-        since_ns: Time from which on it is absent.
-        state: The last state of its body, at rest, or its start.
+        since_ns: Beginning of the absence.
+        state: The last position of its body, at rest; before it appears, its start state.
     """
 
     since_ns: int
@@ -48,7 +48,7 @@ class AgentAbsence(NamedTuple):
 
 
 class _PresentStates(Mapping[str, State]):
-    """States without those of absent agents."""
+    """The states of the agents that are present."""
 
     def __init__(self, states: Mapping[str, State], names: Mapping[str, None]) -> None:
         self._states = states
@@ -73,14 +73,14 @@ class _PresentStates(Mapping[str, State]):
 _MAX_WAKES_AT_ONE_TIME: Final = 1000
 _ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 _CHANGE: Final = ""
-"""Name in the queue of the next time at which a lifetime begins or ends; it is before all names of agents."""
+"""Name of the queue entry for the next beginning or end of a lifetime; it sorts before all names of agents."""
 
 
 class Agents:
-    """Advances bodies and programs together. A program reads the state of its body at the current time in any window.
+    """Advances bodies and programs together. In any window, programs read the current state of their bodies.
 
-    An agent is absent outside of its lifetime, and while the physics, if its attribute `agents_disappear` is True,
-    returns no state of it. Its program then does not wake.
+    An agent is absent outside of its lifetime. If the attribute `agents_disappear` of the physics is True, an agent
+    is also absent while the physics returns no state for it. The program of an absent agent does not wake.
 
     Args:
         physics: Moves the bodies.
@@ -133,7 +133,8 @@ class Agents:
         """Return the states of the present agents at the last physics step that is not after `now_ns`.
 
         Raises:
-            FederateError: The physics failed, did not answer in time, or has lost an agent and may not.
+            FederateError: The physics failed, did not answer in time, or returned no state for an agent that must be
+                present.
         """
         if self._changes_ns:
             self._read_changes(now_ns)
@@ -160,7 +161,7 @@ class Agents:
         return states
 
     def _read_changes(self, now_ns: int) -> None:
-        """Read the states before and at each change of a lifetime, so that last states do not depend on windows."""
+        """Read the states before and at each change of a lifetime; the last states then do not depend on windows."""
         while (change_ns := self.next_change_ns()) is not None and change_ns <= now_ns:
             if self._at_ns < change_ns - 1:
                 self.states(change_ns - 1)
@@ -169,7 +170,7 @@ class Agents:
             self.states(change_ns)
 
     def _without_hidden(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
-        """Return the states without those of agents outside of their lifetimes, which a physics may still move."""
+        """Return the states of the agents that are within their lifetimes; a physics may move the others, too."""
         if self._changes_ns and self._changes_ns[-1] <= now_ns:
             while self._changes_ns and self._changes_ns[-1] <= now_ns:
                 self._changes_ns.pop()
@@ -185,7 +186,7 @@ class Agents:
         """Update the names of the present agents.
 
         Raises:
-            FederateError: An agent has disappeared, neither by its lifetime nor by a physics that may remove it.
+            FederateError: An agent has disappeared within its lifetime, and the physics must not remove agents.
         """
         lost = self._names - states.keys()
         missing = lost - self._hidden
@@ -204,16 +205,17 @@ class Agents:
         new = states.keys() - self._names
         for name in new:
             self.absent.pop(name, None)
-        if self._states:  # the first states have the agents without a program, too
+        if self._states:  # the first states include the agents without a program
             self._new_agents |= new
             self.has_changed |= bool(lost or new)
         self._names = frozenset(states)
         self._schedule((name for name in sorted(new) if name in self.programs), now_ns)
 
     def with_changes(self, begin: Mapping[str, State], *, end: Mapping[str, State]) -> Mapping[str, State]:
-        """Return states that the network assumes in a window, with those of all agents that were present in it.
+        """Return the states that the network assumes in a window, for all agents that were present in it.
 
-        Agents that appeared in it have their state at its end, and agents that disappeared their last state.
+        An agent that appeared in the window has its state at the end of the window. An agent that disappeared has its
+        last state.
 
         Args:
             begin: States for the window, at its beginning or end.
@@ -250,11 +252,12 @@ class Agents:
         return earliest_ns
 
     def _schedule(self, names: Iterable[str], earliest_ns: int | None = None) -> None:
-        """Read the next wake times of programs, which change only when a program wakes, and update the queue.
+        """Read the next wake times of programs, and update the queue; they change only when a program wakes.
 
         Args:
-            names: Their agents.
-            earliest_ns: Time before which none of them wakes, for agents that have appeared; None if there is none.
+            names: The agents of the programs.
+            earliest_ns: Time at which the agents appeared, before which their programs do not wake; None if they have
+                not just appeared.
         """
         for name in names:
             try:
@@ -292,7 +295,7 @@ class Agents:
             self._received.setdefault(receiver, []).append(received)
 
     def is_absent(self, names: Iterable[str], at_ns: int) -> bool:
-        """Return True if one of some agents is absent now, and was absent at a time before."""
+        """Return True if any of these agents is absent now and has been absent since `at_ns` or earlier."""
         absent = self.absent
         return any(name in absent and absent[name].since_ns <= at_ns for name in names)
 

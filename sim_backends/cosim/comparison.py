@@ -31,19 +31,19 @@ class Spread:
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors and the cost of a run. Values that no packet determines are nan.
+    """The errors and the cost of a run. A value for which there are no packets is nan.
 
     Attributes:
         packets: Number of packets whose fate is decided in both runs.
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
         position_error_m: Largest error, at the time when a packet was sent, of the relative position that the network
-            assumed for two of the agents that transmit, forward or interfere in this run. The true positions are
-            those of the continuous trajectories. The mean error of a state that is held for a step of length h, at
-            speed v, is therefore v h / 2.
+            assumed for two of the agents that transmit, forward or interfere in this run. The true positions are the
+            positions on the continuous trajectories. The mean error of a state that is held for a step of length h,
+            at speed v, is therefore v h / 2.
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.
         fate_disagreement: Share of packets that arrived in one run only.
-        first_disagreement: The packet of these that was sent first, or None.
+        first_disagreement: The first of these packets by time of sending, or None.
         first_disagreement_s: Time when it was sent, or nan.
         causality_violations: Number of arrivals at a time that the receiver had already passed.
         late_s: Time by which the receiver had passed the time of arrival, over all arrivals.
@@ -106,7 +106,7 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
 
 
 def mean_errors(all_errors: Sequence[Errors]) -> Errors:
-    """Return the errors of several runs, for example of all seeds, as one.
+    """Return the combined errors of several runs, for example of all seeds.
 
     Numbers are means over the runs that have them. A maximum is the largest of all runs, and the first disagreement
     is the earliest of all runs.
@@ -157,7 +157,7 @@ def delay_added_s(run: Run) -> float:
 
 
 def lost_share(run: Run) -> float:
-    """Return the share of packets lost, of those whose fate is decided; nan without such packets."""
+    """Return the share of lost packets among the packets whose fate is decided; nan without such packets."""
     lost = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
     return sum(lost) / len(lost) if lost else math.nan
 

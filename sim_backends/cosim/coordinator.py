@@ -38,7 +38,7 @@ _MAX_EMPTY_WINDOWS: Final = 1000
 """Number of successive windows of length 0 after which the policy has failed."""
 _PROGRESS_EVERY_S: Final = 0.2
 _NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
-"""A window without packets, see `Coordinator._enter`, and the fates decided in it."""
+"""The results of `Coordinator._enter` for a window without packets, and the fates decided in the window."""
 
 Progress = Callable[[int, float], None]
 """Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
@@ -66,8 +66,8 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised after that.
 
     Raises:
-        ConfigurationError: The physics does not move an agent that may send or receive, or it lacks something that a
-            physics federate needs.
+        ConfigurationError: The physics does not move an agent that may send or receive, or the physics lacks a member
+            of a physics federate.
         FederateError: The physics failed, or does not move an agent that runs a program.
     """
 
@@ -233,7 +233,7 @@ class Coordinator:
             return to_ns
         try:
             end_ns = index(end_ns)
-        except TypeError as error:  # the policy may be of another package
+        except TypeError as error:  # the policy may come from another package
             raise FederateError(
                 f"policy {self.policy.name} returned {end_ns!r} as the end of {window}",
                 remedy="return a whole number of nanoseconds, or None",
@@ -260,7 +260,7 @@ class Coordinator:
         # A network without dead reckoning assumes that agents do not move.
         moving = begin if self._extrapolates else {name: State(state.position_m) for name, state in begin.items()}
         step_ns = situation.physics_step_ns
-        # The states are those of the last physics step, which may be before the beginning of the window.
+        # The states are from the last physics step, which may be before the beginning of the window.
         since_ns = begin_ns // step_ns * step_ns
         self._update_situation(begin_ns, begin, moving, sent=())
         reckoning_step_ns = policy.reckoning_step_ns(situation)
@@ -319,7 +319,7 @@ class Coordinator:
     def _enter(
         self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
     ) -> tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]:
-        """Record packets that enter in a window: those sent in it or, if sends are deferred, in the one before.
+        """Record the packets that enter in a window: sent in it or, if sends are deferred, in the previous one.
 
         Returns:
             Their fates; the packets that the network must carry; the fates of the others, which are dropped.
@@ -344,7 +344,7 @@ class Coordinator:
         self._select_present()
 
     def _select_present(self) -> None:
-        """Set the pairs and the other agents of the situation to those that are present, if some have been absent."""
+        """Limit the pairs and the other agents of the situation to present agents, if some have been absent."""
         if not self._agents.has_changed:
             return
         situation = self.situation

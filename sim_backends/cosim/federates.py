@@ -17,7 +17,7 @@ from sim_backends.federates.protocols import (
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.world.motion import State
 
-# The other modules of the co-simulation import them from here.
+# The other modules of the co-simulation import these names from here.
 __all__ = [
     "Action",
     "AnswerTimeoutError",
@@ -101,7 +101,7 @@ class Program(Protocol):
 
 
 def next_send_ns(program: Program) -> int | None:
-    """Return a time before which a program sends nothing unless it receives a datagram, or None if it never will.
+    """Return a time before which a program sends nothing unless it receives a datagram, or None if it never sends.
 
     A program may have a method `next_send_ns`; otherwise it is assumed to send whenever it wakes.
     """

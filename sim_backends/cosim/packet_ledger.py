@@ -18,7 +18,7 @@ ABSENT: Final = "agent absent"
 
 
 def transmitters(network: object) -> tuple[str, ...]:
-    """Return the agents that forward or interfere in a network, in addition to those that send and receive.
+    """Return the agents that forward or interfere in a network, in addition to the senders and receivers.
 
     They are the value of the network's optional attribute `transmitters`.
     """
@@ -27,14 +27,14 @@ def transmitters(network: object) -> tuple[str, ...]:
 
 
 def fixed_emitters_m(network: object) -> tuple[Vector, ...]:
-    """Return the positions of sources of interference that are not agents: the network's optional attribute."""
+    """Return the positions of sources of interference that are not agents, an optional attribute of the network."""
     return tuple(getattr(network, "fixed_emitters_m", ()))
 
 
 def position_error_m(fate: Fate) -> float:
     """Return the largest error, in metres, of the relative positions that the network assumed for a packet.
 
-    The positions are those of at least sender and receiver, at the time of sending.
+    The error includes at least the positions of sender and receiver, at the time of sending.
     """
     if fate.position_error_m is not None:
         return fate.position_error_m
@@ -50,7 +50,7 @@ def max_position_error_m(
         assumed: States of the agents that the network assumes.
         true: True states of the agents in `names`, in the same order.
         names: The agents to include.
-        has_fixed_emitters: True to include a point that never moves, too.
+        has_fixed_emitters: True to also include a point that never moves.
     """
     offsets_m = _offsets_m([assumed[name] for name in names], true)
     return _max_distance_m([*offsets_m, STILL] if has_fixed_emitters else offsets_m)
@@ -169,7 +169,7 @@ class PacketLedger:
         return fates
 
     def is_withdrawn(self, packet_id: int) -> bool:
-        """Return True once for a packet that was withdrawn, whose fate the network now reports."""
+        """Return True if a reported packet was withdrawn before; a second call for it returns False."""
         if packet_id not in self._withdrawn:
             return False
         self._withdrawn.remove(packet_id)

@@ -24,8 +24,8 @@ class Curve:
 
     Attributes:
         name: Its name; the name of a sync policy determines its colour and marker.
-        x: Above 0, at least one.
-        y: At least 0, one for each x.
+        x: Values above 0, at least one.
+        y: Values of at least 0, one for each x.
         label: Text next to it; if empty, its name.
     """
 
@@ -88,7 +88,7 @@ class ObstacleOutline:
 
 
 def outlines(world: World) -> Iterator[ObstacleOutline]:
-    """Yield the outline of each part of a world's obstacles, those of higher ground first."""
+    """Yield the outline of each part of a world's obstacles, beginning with higher ground."""
     for obstacle in sorted(world.obstacles, key=lambda obstacle: not isinstance(obstacle, Raised | Ramp)):
         for part in obstacle.parts():
             shape = part.shape
@@ -133,7 +133,7 @@ class LabelBox:
     height: float
 
     def overlap(self, other: "LabelBox") -> float:
-        """Return the area that both cover."""
+        """Return the area of the overlap with another rectangle."""
         width = min(self.left + self.width, other.left + other.width) - max(self.left, other.left)
         height = min(self.bottom + self.height, other.bottom + other.height) - max(self.bottom, other.bottom)
         return max(width, 0.0) * max(height, 0.0)
@@ -224,7 +224,7 @@ def _cost(box: LabelBox, point: Point, bounds: LabelBox, obstacles: Sequence[Lab
 
 
 def curve_boxes(curves: Sequence[Sequence[Point]], half_width: float) -> Iterator[LabelBox]:
-    """Yield boxes that cover curves: squares of `2 half_width` around their markers, and along the lines between."""
+    """Yield squares with sides of `2 half_width` that cover curves, around markers and along the lines between."""
     for points in curves:
         for x, y in _interpolated(points, half_width):
             yield LabelBox(x - half_width, y - half_width, 2 * half_width, 2 * half_width)

@@ -1,6 +1,7 @@
 """Figures of co-simulations for publications; the only module of `sim_backends` that imports matplotlib.
 
-The figures have the style of those of trials (`fieldkit.report.theme`), and the same bytes on every machine.
+The figures have the same style as the figures of trials (`fieldkit.report.theme`). Their bytes are the same on every
+machine.
 """
 
 import io
@@ -40,7 +41,7 @@ _LABEL_POINTS: Final = 7.0
 """Font size of the labels of curves."""
 _RUN_INCHES: Final = 3.2
 _TIME_AXIS_FACTOR: Final = 1.45
-"""Length of the time axis over the duration of the run, to leave space for labels."""
+"""Ratio of the length of the time axis to the duration of the run, which leaves space for labels."""
 _MARKER_POINTS: Final = 5.0
 _POINTS_PER_INCH: Final = 72.0
 _ZERO_SHARE: Final = 0.16
@@ -62,7 +63,7 @@ _STYLES: Final[Mapping[str, tuple[Colour, Marker]]] = {
     "velocity_aware": ("red", "v"),
     "error_bounded": ("orange", "P"),
 }
-"""Colour and marker of each sync policy, the same in all figures; other curves have those of `CYCLE`."""
+"""Colour and marker of each sync policy, the same in all figures; other curves have the styles in `CYCLE`."""
 
 
 def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
@@ -80,7 +81,7 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
         for number, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(rows, columns, number)
             drawn.append((axes, panel, _draw_log(axes, panel)))
-        figure.draw_without_rendering()  # the positions of the axes are known only after that
+        figure.draw_without_rendering()  # the axes have their final positions only after this call
         figure.set_layout_engine("none")
         for axes, panel, curves in drawn:
             _label(

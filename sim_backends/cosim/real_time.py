@@ -15,11 +15,11 @@ from sim_backends.cosim.federates import seconds_text
 from sim_backends.cosim.scenario.build import Simulation
 
 LATE_BOUND_S: Final = 0.1
-"""Default of the largest lateness, as `late_bound` of emulated robots."""
+"""Default of the largest lateness; equal to the default of `late_bound` of emulated robots."""
 
 
 class RealTimeError(EvidenceError):
-    """A run could not keep up with real time, so that its results are not those of a real-time run."""
+    """A run could not keep up with real time; its results are therefore not valid for real time."""
 
 
 @dataclass
@@ -76,7 +76,7 @@ class Pace:
 
         Raises:
             RealTimeError: A window was later than the bound.
-            FieldkitError: As `Simulation.run`.
+            FieldkitError: As for `Simulation.run`.
         """
         coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
         bound_ns = round(self.late_bound_s * 1e9)
@@ -86,7 +86,7 @@ class Pace:
             coordinator.advance(end_ns, max_windows=1)
             ended_ns, wall_ns = coordinator.situation.now_ns, time.monotonic_ns()
             if ended_ns == now_ns:
-                continue  # an empty window has the deadline of the one before
+                continue  # an empty window has the deadline of the previous window
             late_ns = wall_ns - started_ns - round(ended_ns / self.factor)
             lateness.add(late_ns)
             if report is not None:

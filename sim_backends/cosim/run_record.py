@@ -20,15 +20,16 @@ class Fate:
     Attributes:
         packet: The packet, with the times when it was sent and when it entered the network.
         assumed: States of source and destination that the network assumed when the packet entered.
-        true: True states of source and destination at the time of sending: those at the last physics step,
+        true: True states of source and destination at the time of sending: the states at the last physics step,
             extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
         arrived_ns: Time when the network delivered it, or None.
-        counted_ns: Time from which the arrival counts for its receiver: by the policy, `arrived_ns` or the end of the
-            window.
-        late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; else 0.
+        counted_ns: Time from which the arrival counts for its receiver: `arrived_ns` or the end of the window,
+            depending on the policy.
+        late_ns: Time from `counted_ns` to the simulated time of the receiver at delivery, if that is later; otherwise
+            0.
         reason: The reason why it never arrived; empty if it arrived or is under way.
         position_error_m: Largest error of the relative position that the network assumed for two of the agents that
-            affect the packet; None if these are source and destination only (`packet_ledger.position_error_m`).
+            affect the packet; None if only its source and destination affect it (`packet_ledger.position_error_m`).
     """
 
     packet: Packet
@@ -42,7 +43,7 @@ class Fate:
 
     @property
     def is_decided(self) -> bool:
-        """True if it arrived, or never will."""
+        """True if the packet has arrived, or never will."""
         return self.arrived_ns is not None or bool(self.reason)
 
 
@@ -58,7 +59,7 @@ class Run:
     Attributes:
         fates: The fate of every packet, by flow and number.
         windows_ns: The ends of all windows.
-        wall_s: Wall time by part: agents, network, exchange, and wait, which is the time that federates only waited.
+        wall_s: Wall time by part: agents, network, exchange, and wait, the time in which federates only waited.
         digest: Hash over every packet, arrival, drop and window, in order (`EventDigest`).
     """
 
@@ -78,12 +79,13 @@ _HASHED_BYTES: Final = 1 << 15
 class EventDigest:
     """Hashes windows in order: packets that entered the network, arrivals, drops, and the end of each window.
 
-    A window is hashed after its end, so a run that stops within a window has the digest of the windows before.
-    States are not hashed: the last bit of a position may differ between two mathematical libraries; times are equal.
+    A window is hashed after its end, so the digest of a run that stops within a window covers the windows before it.
+    States are not hashed, because the last bit of a position may differ between two mathematical libraries. Times are
+    the same with every library.
 
     Attributes:
-        quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together; for a window
-            without packets, a caller may append its end here.
+        quiet_ends_ns: Ends of the windows since the last window with packets. They are hashed together. For a window
+            without packets, a caller may append the end of the window here.
     """
 
     def __init__(self) -> None:
@@ -185,5 +187,5 @@ class IpObserver(Protocol):
     """An observer that also receives IP packets."""
 
     def log_ip(self, at_ns: int, name: str, fragment: Fragment) -> None:
-        """Receive an IP packet, or a fragment of one, that an agent sent or that arrived at it."""
+        """Receive an IP packet or fragment that an agent sent or that arrived at it."""
         ...

@@ -27,7 +27,7 @@ class _Layouts(NamedTuple):
     """Layouts of `struct` that each read one part of many states and skip the others.
 
     Attributes:
-        indices: The index and the reserved field, as one number, which is the index if the reserved field is 0.
+        indices: The index and the reserved field as one number, which equals the index if the reserved field is 0.
         positions: Positions and velocities.
         headings: The headings.
         limits: The limits.
@@ -53,7 +53,8 @@ class AgentTable:
 
     Attributes:
         names: Their names, in order.
-        indices: Their indices by name. After an addition it is another mapping, so that received states can keep it.
+        indices: Their indices by name. An addition replaces the mapping, so that received states can keep the
+            previous one.
         order: All indices.
         valid_limits: The limits of the last states that were received, which seldom change and need no second check.
     """
@@ -91,7 +92,7 @@ class AgentTable:
 
 
 def announcements_bytes(states: Mapping[str, State], agents: AgentTable) -> bytes:
-    """Return the announcement of the agents that are not in the table yet, which adds them to it.
+    """Return the announcement of the agents that are not in the table yet, and add them to the table.
 
     Raises:
         ValueError: There are too many agents.
@@ -170,7 +171,7 @@ class ReceivedStates(Mapping[str, State]):
         return len(self._rows)
 
     def has_indices(self, agents: AgentTable) -> bool:
-        """Return True if the indices in its bytes are those of a table, for all of the table's agents."""
+        """Return True if the states have the same agents with the same indices as a table."""
         return self._rows is agents.indices or self._rows == agents.indices
 
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
@@ -209,7 +210,7 @@ def read_states(reader: FrameReader, agents: AgentTable) -> ReceivedStates:
     """Return states of agents, by name.
 
     Raises:
-        MalformedFrameError: A state is invalid, or an agent has two.
+        MalformedFrameError: A state is invalid, or an agent has two states.
     """
     count = reader.count(STATE.size)
     begin = reader.position
@@ -252,7 +253,7 @@ def _check_each(data: bytes, begin: int) -> None:
     """Check each state.
 
     Raises:
-        MalformedFrameError: One is invalid; the error has its position.
+        MalformedFrameError: A state is invalid; the error has the position of this state.
     """
     for row, (index, reserved, *numbers, heading_rad, limit_m_s2) in enumerate(STATE.iter_unpack(data)):
         if reserved or not math.isfinite(sum(numbers)) or math.isinf(heading_rad) or not limit_m_s2 >= 0:

@@ -252,7 +252,8 @@ class _Run:
                 raise ValueError(f"the command {type(command).__name__} to {name} is not supported")
         federate = current.federate
         if from_ns > current.last_ns:
-            # The coordinator does not send requests that change nothing; the federate must get the time of the last.
+            # The coordinator does not send requests that change nothing; the federate must get the time of the last
+            # one.
             federate.advance(from_ns, {})
         states = federate.advance(to_ns, commands)
         current.last_ns = to_ns

@@ -31,7 +31,7 @@ class FrameChannel(Protocol):
 
         Raises:
             ClosedError: The other side closed the channel.
-            DeadlineError: It did not read in time.
+            DeadlineError: The other side did not read in time.
         """
         ...
 
@@ -103,7 +103,7 @@ class StreamChannel:
         return ProtocolFrame(header, data[HEADER_BYTES:end])
 
     def _read_rest(self, begin: bytes, end: int, deadline_s: float | None) -> bytes:
-        """Return data that begins with some bytes and has at least a number of bytes."""
+        """Return `begin` and the bytes received after it, at least `end` bytes in total."""
         data = bytearray(begin)
         try:
             while len(data) < end:

@@ -18,7 +18,7 @@ _EXIT_S: Final = 1.0
 _POLL_S: Final = 0.005
 _TAIL_BYTES: Final = 4096
 _TAIL_LINES: Final = 10
-"""Lines of a stack trace that contain its cause, whether it is first or last."""
+"""Number of last lines that are shown: enough for the cause of an error in a stack trace."""
 
 
 class Child:
@@ -122,7 +122,7 @@ def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[
             time.sleep(_POLL_S)
         if _has_exited(process.pid):
             break
-    # SIGKILL to the group also ends processes that the command started, and suspended ones.
+    # SIGKILL to the group also ends processes that the command started, and suspended processes.
     _signal_group(process.pid, signal.SIGKILL)
     process.wait()
     stderr.close()

@@ -32,11 +32,12 @@ class CompiledProgram:
 
     Attributes:
         name: Its name in messages and file names.
-        source: The file. Its own headers are beside it; those for all federates are in `sim_backends/federates/cpp`.
+        source: The file. Its own headers are beside it; headers for all federates are in
+            `sim_backends/federates/cpp`.
         packages: Names of its libraries for pkg-config.
         install: Command that installs the compiler and the libraries.
         flags: Other options of the compiler.
-        libraries: Options that link the libraries; None for those of pkg-config.
+        libraries: Options that link the libraries; None for the options from pkg-config.
         duration: Usual time of a compilation, for the message: `about 30 s`.
     """
 
@@ -112,7 +113,7 @@ class CompiledProgram:
 
 
 def included_files(source: Path) -> list[Path]:
-    """Return a C++ file and the headers of fieldkit that it includes, directly or through another one."""
+    """Return a C++ file and the headers of fieldkit that it includes, directly or through another header."""
     files = [source.resolve()]
     for file in files:  # grows in the loop
         for name in _INCLUDE.findall(file.read_text(encoding="utf-8")):

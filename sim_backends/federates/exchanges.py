@@ -45,7 +45,7 @@ _STATES_HEAD: Final = struct.Struct("<qII")
 
 
 def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any], agents: AgentTable) -> bytes:
-    """Return the body of a request to a physics; raises as `commands_bytes`.
+    """Return the body of a request to a physics; errors as for `commands_bytes`.
 
     Args:
         to_ns: Time to advance to.
@@ -83,7 +83,7 @@ def encode_states(
 
 
 def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]:
-    """Return time and states of a physics' answer; the states have the limits.
+    """Return time and states of a physics' answer; the states include the limits.
 
     Raises:
         MalformedFrameError: It is malformed.

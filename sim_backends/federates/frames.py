@@ -78,7 +78,7 @@ _KINDS: Final = {int(kind): kind for kind in MessageKind}
 
 
 class MalformedFrameError(ValueError):
-    """A frame is not as the protocol describes it.
+    """A frame does not follow the protocol.
 
     Args:
         position: Number of the wrong byte, from the beginning of the frame.
@@ -91,7 +91,7 @@ class MalformedFrameError(ValueError):
 
 
 class UnknownKindError(MalformedFrameError):
-    """A frame has an unknown kind: what was received may be text."""
+    """A frame has an unknown kind: the received bytes may be text."""
 
 
 class Header(NamedTuple):
@@ -179,7 +179,7 @@ class FrameReader:
         """Return the next values.
 
         Raises:
-            MalformedFrameError: The frame ends before.
+            MalformedFrameError: The frame ends too early.
         """
         at, self._at = self._at, self._at + layout.size
         if self._at > len(self._body):
@@ -190,7 +190,7 @@ class FrameReader:
         """Return the next bytes.
 
         Raises:
-            MalformedFrameError: The frame ends before.
+            MalformedFrameError: The frame ends too early.
         """
         at, self._at = self._at, self._at + size
         if self._at > len(self._body):
@@ -201,7 +201,7 @@ class FrameReader:
         """Return the next text.
 
         Raises:
-            MalformedFrameError: It is too long, the frame ends before, or it is not UTF-8.
+            MalformedFrameError: It is too long, the frame ends too early, or it is not UTF-8.
         """
         position = self.position
         (length,) = self.unpack(_LENGTH)
@@ -231,7 +231,7 @@ class FrameReader:
         return int(count)
 
     def short_count(self, item_bytes: int) -> int:
-        """Return the next count of two bytes; otherwise as `count`."""
+        """Return the next count of two bytes; arguments and errors as for `count`."""
         return self.count(item_bytes, _LENGTH)
 
     def end(self) -> None:

@@ -28,7 +28,7 @@ from sim_backends.federates.frames import (
 from sim_backends.world.motion import Lifetime, State
 
 NO_EVENT: Final = -1
-"""Time that means that there is no next event."""
+"""Value of the time of the next event if there is no next event."""
 _PREFIX: Final = struct.Struct("<8sH")
 _HELLO: Final = struct.Struct("<BBIQqq32s")
 _WELCOME: Final = struct.Struct("<HBBIqq32s")

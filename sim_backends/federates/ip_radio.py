@@ -123,7 +123,7 @@ class IpRadio:
         """Implement `RadioModel.use_meter`; the federate has its own counters."""
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:  # noqa: ARG002 (see RadioModel)
-        """Implement `RadioModel.sample`; a federate is asked for its samples itself."""
+        """Implement `RadioModel.sample`; samples are requested directly from the federate."""
         return {}
 
     def log_losses(self, log: LossLog | None) -> None:

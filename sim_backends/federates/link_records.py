@@ -15,7 +15,7 @@ _MAX_COUNT = 1 << 62
 
 
 def encode_links(samples: Mapping[str, LinkSample], agents: AgentTable) -> bytes:
-    """Return the body of the message; a time or counter that is unknown is 0."""
+    """Return the body of the message; an unknown time or counter is 0."""
     radios, links = [], []
     for name, sample in samples.items():
         noise_dbm = _or_nan(sample.noise_dbm)
@@ -69,5 +69,5 @@ def _or_nan(value: float | None) -> float:
 
 
 def _or_none(value: float) -> float | None:
-    """Return a number, or None if it is not finite: an unknown one is NaN."""
+    """Return a number, or None if it is not finite: NaN means unknown."""
     return value if math.isfinite(value) else None

@@ -24,7 +24,7 @@ class ProgramFederate:
 
     Attributes:
         role: `PHYSICS` or `NETWORK`.
-        command: Returns its command line, and builds it before if necessary. It raises `ConfigurationError` if
+        command: Returns its command line; it builds the program first if necessary. It raises `ConfigurationError` if
             something is not installed; the remedy is the command that installs it.
         summary: What it is, in one line.
         options: Model of its options in a scenario; None if it has any options, which are not validated.

@@ -18,11 +18,11 @@ _PERIOD_S: Final = 0.1
 
 
 class ProcessorSharing:
-    """Context of an exchange: while this thread waits, it stays on the processor that the child has too.
+    """Context of an exchange: while this thread waits, it stays on the processor of the child.
 
-    Ten times per second, one exchange is free, in which the kernel may choose another processor because of other
-    load; the processor of this thread after it is used next. Between exchanges this thread is free, so that threads
-    and processes that it starts are free as well.
+    Ten times per second, one exchange is unrestricted: the kernel may then choose another processor because of other
+    load. The processor that this thread has after that exchange is used for the next ones. Between exchanges this
+    thread is unrestricted, so that threads and processes that it starts are unrestricted, too.
 
     Args:
         pid: The child. It has one thread.
@@ -46,7 +46,7 @@ class ProcessorSharing:
         now_s = time.monotonic()
         if now_s < self._change_at_s or len(self._allowed) < 2:
             return
-        with suppress(ProcessLookupError):  # it has exited, which the exchange reports
+        with suppress(ProcessLookupError):  # the child has exited; the exchange reports this
             if self._processor is not None:
                 self._processor = None
                 os.sched_setaffinity(self._pid, self._allowed)

@@ -1,4 +1,4 @@
-"""Protocols of federates, and the errors that name the one that failed or did not answer."""
+"""Protocols of federates, and the errors that name the federate that failed or did not answer."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
@@ -61,7 +61,7 @@ class PhysicsFederate(Protocol):
     """Moves the agents.
 
     If an attribute `agents_disappear` is True, an agent may be missing in the states: it has disappeared, and may
-    appear again. Otherwise that ends the run.
+    appear again. If it is False, a missing agent ends the run.
 
     If it has an attribute `path_losses_db`, with mean losses in dB by transmitter and receiver, the radio of the
     built-in network uses these instead of the losses of the world.
@@ -81,7 +81,7 @@ class PhysicsFederate(Protocol):
         Args:
             to_ns: Time to advance to.
             commands: Command of each agent's program to its body. It applies from the time of the previous call on;
-                an agent without a command keeps its last one.
+                an agent without a command keeps its last command.
         """
         ...
 

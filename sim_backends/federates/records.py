@@ -45,14 +45,14 @@ LAYOUTS: Final = {
 """Layout of each part of a message, for the reference."""
 
 _text_bytes: Final = lru_cache(maxsize=4096)(text_bytes)
-"""As `text_bytes`; most texts of packets are names of flows and transports, which recur."""
+"""`text_bytes` with a cache, because most texts of packets are recurring names of flows and transports."""
 
 
 def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:
     """Return commands to agents.
 
     Raises:
-        ValueError: A command has no layout, or is to an agent that was not announced.
+        ValueError: A command has no layout, or is for an agent that was not announced.
     """
     parts = [count_bytes(len(commands))]
     for name, command in commands.items():
@@ -175,7 +175,7 @@ class ArrivalDelay(NamedTuple):
 
     Attributes:
         queuing_ns: Time in queues.
-        transmission_ns: Time from the first attempt of a frame to the end of the received one.
+        transmission_ns: Time from the first attempt of a frame to the end of the received frame.
         propagation_ns: Time in the air.
     """
 

@@ -77,7 +77,7 @@ class _RemoteFederate:
 class RemotePhysics(_RemoteFederate):
     """A physics in another process.
 
-    A request that changes nothing is not sent: the states between two steps are those at the first.
+    A request that changes nothing is not sent: the states between two steps are the states at the first of them.
 
     Args:
         session: The session.
@@ -162,7 +162,7 @@ class RemoteNetwork(_RemoteFederate):
         self._log_delay: ArrivalDelayLog | None = None
 
     def log_arrival_delays(self, log: ArrivalDelayLog | None) -> None:
-        """Pass the parts of the delays of later arrivals to `log`, if the network reports them; None ends this."""
+        """Pass the parts of the delays of later arrivals to `log`, if the network reports them; None stops it."""
         self._log_delay = log
 
     def sample_links(self) -> dict[str, LinkSample]:

@@ -23,7 +23,8 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
         make: Called with the `Hello` of each run; returns the federate, for example its class.
         address: None for standard input and output, which then belong to the protocol: what the federate prints goes
             to standard error. Otherwise an address of a transport (`transports.transport_table`).
-        runs: Number of runs after which to return; None for one run if this side does not listen, else no limit.
+        runs: Number of runs after which to return; None means one run if this side does not listen, otherwise no
+            limit.
         **properties: Other attributes of `FederateService`.
 
     Raises:
@@ -34,7 +35,7 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
 
 
 def serve_service(service: FederateService, *, address: str | None = None, runs: int | None = None) -> None:
-    """Serve a federate and its properties; otherwise as `serve`."""
+    """Serve a federate and its properties; arguments and errors as for `serve`."""
     parsed = None if address is None else parse_address(address)
     if address is not None and parsed is None:
         raise ValueError(f"{address!r} is not one of {', '.join(FORMS)}")

@@ -89,7 +89,7 @@ class FederateSession:
         return self._copies
 
     def release(self, copy: int) -> None:
-        """Release a copy of the federate, by a message before the next request."""
+        """Release a copy of the federate; the message is sent before the next request."""
         self._released.append(copy)
 
     def welcome(self, hello: Hello) -> Welcome:
@@ -173,7 +173,7 @@ class FederateSession:
             frame = self._channel.receive(limit_s)
             _, kind, number, copy = frame.header
             if kind is MessageKind.BUSY:
-                if number == expected.request:  # otherwise it is late
+                if number == expected.request:  # otherwise it belongs to an earlier request
                     self._busy_ns = decode_number(frame.body)
                     limit_s = min(time.monotonic() + self._deadline_s, last_s)
                 continue

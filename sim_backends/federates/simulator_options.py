@@ -29,7 +29,7 @@ class SimulatorOptions(Strict):
         yield from ()
 
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        """Yield everything in a scenario that the simulator does not support, with its keys.
+        """Yield every part of a scenario that the simulator does not support, with its keys.
 
         Args:
             scenario: The scenario as in the configuration of hello, in JSON values.
@@ -47,7 +47,7 @@ class SimulatorOptions(Strict):
         return {}
 
     def to_json(self) -> dict[str, Any]:
-        """Return all options as JSON values, defaults included, without those that are None."""
+        """Return all options as JSON values, including defaults, without options that are None."""
         return self.model_dump(mode="json", by_alias=True, exclude_none=True)
 
 

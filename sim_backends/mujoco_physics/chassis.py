@@ -15,12 +15,12 @@ from sim_backends.world.shapes import Box
 
 @dataclass(frozen=True)
 class Wheels:
-    """Wheels of equal size, whose sides turn at different speeds.
+    """Wheels of equal size; the wheels of the two sides may turn at different speeds.
 
     Attributes:
         axles_m: Positions of the axles, forward of the middle; each has a wheel on both sides.
         track_m: Distance of the wheels on both sides.
-        turning_track_m: Difference of the speeds of both sides per yaw rate, as the robot's controller assumes it.
+        turning_track_m: Difference of the speeds of the two sides per yaw rate, as assumed by the robot's controller.
         radius_m: Radius of a wheel.
         width_m: Width of a wheel.
         mass_kg: Mass of a wheel.
@@ -102,8 +102,8 @@ HUSKY: Final = Chassis(
 """Clearpath Husky A200: `husky_description/urdf/husky.urdf.xacro` (github.com/husky/husky), with its centre of mass
 in the plane of symmetry. Its controller multiplies the track by 1.875 (`husky_control/config/control.yaml`), because
 the wheels slide sideways when it turns: with equal friction in all directions, on a base a and a track b, the yaw
-rate is b^2 / (a^2 + b^2) = 0.554 of that of rolling wheels. The torque of its motors is not published; ours is twice
-the friction of a wheel, so that friction is the limit.
+rate is b^2 / (a^2 + b^2) = 0.554 of the yaw rate of rolling wheels. The torque of its motors is not published; ours
+is twice the friction of a wheel, so that friction is the limit.
 """
 
 BURGER: Final = Chassis(
@@ -124,15 +124,15 @@ BURGER: Final = Chassis(
 )
 """ROBOTIS TurtleBot3 Burger: `turtlebot3_description/urdf/turtlebot3_burger.urdf.xacro`
 (github.com/ROBOTIS-GIT/turtlebot3) with the mass of the laser scanner; the stall torque of its motors (XL430-W250,
-e-Manual). Its centre of mass is not published; ours is in the middle of its body, because that of the URDF, above the
-axle, would let it fall over.
+e-Manual). Its centre of mass is not published; ours is in the middle of its body, because the robot would fall over
+with the centre of mass of the URDF, which is above the axle.
 """
 
 CASTER_RADIUS_M: Final = 0.01
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:
-    """Return the robot on wheels of a kind; an unknown one is a TurtleBot3 Burger of its size."""
+    """Return the robot on wheels of a kind; an unknown kind is a TurtleBot3 Burger scaled to its size."""
     if profile == "husky":
         return HUSKY
     factor = limits.radius_m / TURTLEBOT3_BURGER.radius_m
@@ -143,6 +143,6 @@ _IRIS_INERTIA_KG_M2: Final = (0.029125, 0.029125, 0.055225)
 
 
 def quadrotor_inertia_kg_m2(limits: QuadrotorLimits) -> Vector:
-    """Return the moments of inertia of a quadrotor: those of PX4's Iris (`models/iris`), scaled by mass and size."""
+    """Return the moments of inertia of a quadrotor, scaled from PX4's Iris (`models/iris`) by mass and size."""
     factor = limits.mass_kg / IRIS.mass_kg * (limits.radius_m / IRIS.radius_m) ** 2
     return _scaled(_IRIS_INERTIA_KG_M2, factor)

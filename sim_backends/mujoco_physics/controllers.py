@@ -21,7 +21,7 @@ _UPRIGHT: Final = 0.1
 
 @dataclass(frozen=True)
 class Registers:
-    """Arrays of the simulation that controllers read and write, flat.
+    """Flat arrays of the simulation that controllers read and write.
 
     Memory views access single items faster than NumPy.
 
@@ -146,7 +146,7 @@ class FlightController:
         )
         targets, first = registers.mocap_quat, 4 * mocap
         if not self._is_powered:
-            # Towards its present attitude, the control of attitude has no torque except damping.
+            # With its present attitude as the target, the attitude control applies no torque except damping.
             registers.ctrl[motor] = 0.0
             for index in range(4):
                 targets[first + index] = registers.xquat[4 * body + index]

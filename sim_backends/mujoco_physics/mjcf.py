@@ -28,7 +28,7 @@ _CONTACT: Final = {"solref": "0.01 1", "solimp": "0.9 0.95 0.001"}
 _GRIP: Final = {"solref": "0.003 1.6", "solimp": "0.1 0.1 0.001"}
 """Softness of contacts with the ground; a Husky compresses its tires by 0.3 mm."""
 _GRIP_SLIP: Final = "0.3 1"
-"""Softness of their friction. MuJoCo's contacts repel what slides on them, in proportion to its speed; with a stiffer
+"""Softness of their friction. MuJoCo's contacts repel a sliding body in proportion to its speed; with a stiffer
 friction, the wheels of a robot that turns would hop (documentation of MuJoCo, "Computation", convex relaxation)."""
 _BODY_FRICTION: Final = 0.3
 """Friction of a robot that has fallen over; our estimate."""
@@ -202,7 +202,7 @@ class _Document:
         )
 
     def _add_grip(self, name: str, friction: float) -> None:
-        """Add contacts with friction between a shape and the ground; contacts with obstacles have none."""
+        """Add contacts with friction between a shape and the ground; contacts with obstacles have no friction."""
         for ground in self._grounds:
             _add(
                 self._grips,

@@ -1,4 +1,4 @@
-"""The physics federate in MuJoCo: the one module that imports it."""
+"""The physics federate in MuJoCo; the only module that imports MuJoCo."""
 
 import copy
 import json
@@ -40,7 +40,7 @@ _LONGEST_STEP_NS: Final = 1_000_000
 _CARRIES: Final = 0.5
 """Minimum vertical component of the normal of a contact that carries a robot."""
 _PARKED_M: Final = 10_000.0
-"""Distance east and north at which absent agents are, at most 1 um of rounding error."""
+"""Distance east and north at which absent agents are parked; the rounding error there is at most 1 um."""
 _PARKED_APART_M: Final = 10.0
 _PARKED_UP_M: Final = 0.0
 
@@ -83,8 +83,9 @@ class SensedStates(Mapping[str, State]):
 class MujocoPhysics:
     """Moves the agents of a run in MuJoCo.
 
-    Its time is a number of steps. A command applies at the first step that is not before it. The result does not
-    depend on how the time is divided into calls. Agents that are absent are parked far away from the others.
+    Its time is a number of steps. A command applies at the first step that is not before the time at which it was
+    given. The result does not depend on how the time is divided into calls. Agents that are absent are parked far
+    away from the others.
 
     Args:
         hello: The run: agents, step, and configuration with `world` and `robots`, both optional.
@@ -170,7 +171,7 @@ class MujocoPhysics:
         self._set_pose(row, pose)
 
     def _set_pose(self, row: int, pose: Sequence[float]) -> None:
-        """Set position and quaternion of an agent, which is at rest then."""
+        """Set position and quaternion of an agent at rest."""
         model, data = self.model, self.data
         body = model.body(f"a{row}")
         first = int(model.jnt_qposadr[body.jntadr[0]])
@@ -314,7 +315,7 @@ class MujocoPhysics:
         self._states = SensedStates(self._present_rows(), numbers)
 
     def _integrate(self, count: int) -> None:
-        """Take steps of MuJoCo, from derived quantities of the state to those of the new state."""
+        """Take steps of MuJoCo, and compute the derived quantities of the new state."""
         model, data = self.model, self.data
         mujoco.mj_step2(model, data)
         if count > 1:
@@ -352,7 +353,7 @@ class _PresenceChange(NamedTuple):
 
 
 def _changes(lifetimes: Mapping[int, Lifetime], step_ns: int) -> Iterator[_PresenceChange]:
-    """Yield the changes after step 0; an agent is at least as long there as its lifetime."""
+    """Yield the changes after step 0; an agent is present at least during its lifetime."""
     for row, lifetime in lifetimes.items():
         if lifetime.appears_ns >= step_ns:
             yield _PresenceChange(lifetime.appears_ns // step_ns, row, appears=True)
@@ -364,7 +365,7 @@ _OF_MUJOCO: Final = {"model", "data", "_sensors", "_registers"}
 
 
 def _limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:
-    """Return the limits of an agent: those of the configuration, or else those of its profile.
+    """Return the limits of an agent: the limits in the configuration, otherwise the limits of its profile.
 
     Raises:
         ConfigurationError: The configuration has other limits than its kind of robot.
@@ -386,7 +387,7 @@ def _limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | 
 
 
 def _model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:
-    """Return an agent at its start, a robot on wheels upright on the ground below it."""
+    """Return an agent at its start; a robot on wheels is upright on the ground below it."""
     e, n, u = agent.start.position_m
     place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
     if isinstance(limits, QuadrotorLimits):

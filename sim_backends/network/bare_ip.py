@@ -51,8 +51,8 @@ class _Group:
     """The packets of one broadcast.
 
     Attributes:
-        packet_ids: Number of the packet of each receiver that has not received or missed it.
-        missed: By receiver that missed the frame before its packet entered the network: the reason.
+        packet_ids: Packet number for each receiver that has neither received nor missed the frame.
+        missed: The reason for each receiver that missed the frame before its packet entered the network.
     """
 
     packet_ids: dict[str, int] = field(default_factory=dict)
@@ -60,7 +60,7 @@ class _Group:
 
 
 class BareBroadcast:
-    """Carries broadcasts. The first packet of a group sends the frame, the others only wait for it.
+    """Carries broadcasts. The first packet of a group sends the frame; the other packets only wait for it.
 
     Args:
         wire: The network below.

@@ -32,8 +32,8 @@ class Fragment:
 
     Attributes:
         packet: The packet.
-        ip_id: Number of the packet among those of its source: the header's identification without its limit of 16
-            bits.
+        ip_id: Number of the packet among all packets of its source: the identification field of the header without
+            its limit of 16 bits.
         index: Index of the fragment in the packet, from 0.
         count: Number of fragments of the packet.
         offset_bytes: Offset of its payload in the payload of the packet.
@@ -49,7 +49,7 @@ class Fragment:
 
     @property
     def identity(self) -> PacketIdentity:
-        """Identity from which its random numbers are derived; the first fragment has that of the whole packet."""
+        """Identity from which its random numbers are derived; the first fragment has the identity of the packet."""
         flow, number = self.packet.identity
         return (f"{flow} fragment {self.index}", number) if self.index else (flow, number)
 

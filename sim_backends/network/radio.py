@@ -1,4 +1,4 @@
-"""The network of the co-simulation: transports over the internet protocol over a radio, in exact order of time."""
+"""The network of the co-simulation: transports, the internet protocol and a radio, in exact order of time."""
 
 import heapq
 from collections.abc import Callable, Mapping, Sequence
@@ -39,8 +39,8 @@ class RadioNetwork:
 
     The radio receives the positions of stations when an event is processed, not at every window, so the result does
     not depend on earlier updates. It receives no velocities: for the radio, stations stay at the coordinator's
-    positions, or move in steps if the coordinator passes dead-reckoned states. The position error is therefore
-    decided by the policy alone. A station without a state is absent: its radio is off.
+    positions, or move in steps if the coordinator passes dead-reckoned states. The position error therefore depends
+    only on the policy. A station without a state is absent: its radio is off.
 
     `Transport.lost` is called for packets with a single destination only, because each host may miss a broadcast
     (`CountsMisses`).
@@ -202,7 +202,7 @@ class RadioNetwork:
             self._collect()
 
     def _schedule(self, at_ns: int, host: str | None, call: Callable[[], None]) -> None:
-        """Schedule `call` for `at_ns`, on a host that must be on, or on no host."""
+        """Schedule `call` for `at_ns`; if a host is given, the call waits while the host is off."""
         self._timers_set += 1
         heapq.heappush(self._timers, (at_ns, self._timers_set, host, call))
 
@@ -218,7 +218,7 @@ class RadioNetwork:
         """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed.
 
         Returns:
-            True if they changed. The radio may then have another next event.
+            True if they changed. The next event of the radio may then be a different one.
         """
         states = self._states.at(at_ns) if isinstance(self._states, DeadReckoned) else self._states
         if states is self._placed_states:

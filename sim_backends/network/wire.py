@@ -23,7 +23,7 @@ class IpPacket:
         destination: Name of the receiver; None for all stations (multicast).
         transport: Name of the transport to which it belongs.
         size_bytes: Its size with the IP header.
-        identity: Identity from which its random numbers are derived; a retransmission has another one.
+        identity: Identity from which its random numbers are derived; a retransmission has another identity.
         body: Content for the transport; the network below does not inspect it.
     """
 
@@ -88,7 +88,7 @@ class CountsMisses(Transport, Protocol):
     """A transport that also records which hosts miss a broadcast."""
 
     def missed(self, packet: IpPacket, host: str, reason: str) -> None:
-        """Record, as by `lost`, that a packet without a single destination will not arrive at a host."""
+        """Record, like `lost`, that a packet without a single destination will not arrive at a host."""
         ...
 
 

@@ -2,9 +2,9 @@
 
 Bodies move in time steps. A command takes effect at the first step that is not before the time at which it was given,
 and the motion does not depend on how the time is divided into calls. Two things make it fast. A course is evaluated
-only when a state is requested. And contacts are checked only between bodies in a neighbour list (Verlet, Phys. Rev.
-159, 98, 1967): a body that is farther from all obstacles and bodies than its top speed allows cannot touch
-anything until the list expires.
+only when a state is requested. Contacts are checked only between bodies in a neighbour list (Verlet, Phys. Rev. 159,
+98, 1967): a body that is farther from all obstacles and bodies than its top speed allows cannot touch anything until
+the list expires.
 """
 
 import math
@@ -25,7 +25,7 @@ from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
 
 _SUPPORT_M: Final = 1e-3
-"""Distance to the ground or an obstacle below which it carries a quadrotor."""
+"""Maximum distance between a quadrotor and the ground or obstacle that supports it."""
 _ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 
 
@@ -50,9 +50,9 @@ class Bodies:
     Args:
         bodies: The bodies, by the name of their agent.
         world: Ground and obstacles; None for open flat ground.
-        step_ns: Time step; states are those at whole steps.
-        lifetimes: Bodies that do not exist during the whole run. A body is there from the last step before its
-            lifetime begins to the first one after it ends.
+        step_ns: Time step; there are states only at whole steps.
+        lifetimes: Bodies that do not exist during the whole run. A body exists from the last step before its lifetime
+            begins to the first step after its lifetime ends.
 
     Attributes:
         step_ns: Time step.
@@ -104,11 +104,11 @@ class Bodies:
         self._states = Snapshot(self._tracks, 0)
 
     def start_states(self) -> dict[str, State]:
-        """Return the states of all bodies at their starts, also of those that are not there yet."""
+        """Return the states of all bodies at their starts, including bodies that have not appeared yet."""
         return {name: self._track(name, self._initial_pose(name), 0).state(0) for name in self.names}
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of one body, see `limits_m_s2`; if it is not there, the limit at its start."""
+        """Return the limit of one body, see `limits_m_s2`; if it is absent, the limit at its start."""
         if name not in self._present:
             start_limit_m_s2: float = self._bodies[name].limit_m_s2(self._initial_pose(name))
             return start_limit_m_s2
@@ -219,7 +219,7 @@ class Bodies:
         self._states = Snapshot(self._tracks, step)
 
     def _move(self, step: int) -> None:
-        """Move the bodies that are there up to a step."""
+        """Move the bodies that are present up to a step."""
         while self._step < step:
             until = step
             candidates: Mapping[str, ContactCandidates] = {}
@@ -234,7 +234,7 @@ class Bodies:
             self._step = until
 
     def _change_steps_of(self, lifetime: Lifetime) -> Iterator[int]:
-        """Yield the step in which a body appears, and the first one in which it is not there any more."""
+        """Yield the step in which a body appears, and the first step in which it has disappeared."""
         if lifetime.appears_ns >= self.step_ns:
             yield lifetime.appears_ns // self.step_ns
         if lifetime.disappears_ns is not None:

@@ -193,7 +193,7 @@ class Snapshot(Mapping[str, State]):
         return state
 
     def keys(self) -> KeysView[str]:
-        """Return the names of the bodies; as fast as a dict's, because it is called in every window."""
+        """Return the names of the bodies; as fast as `dict.keys`, because it is called in every window."""
         return self._tracks.keys()
 
     def __iter__(self) -> Iterator[str]:

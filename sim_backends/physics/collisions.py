@@ -29,7 +29,7 @@ class Footprint:
         reach_m: Radius around that point: the radius of a round obstacle, 0 for one with edges.
         low_m: Height of its lower face.
         high_m: Height of its upper face.
-        wall_m: Returns the height up to which it is an obstacle at a point of it; None if that is `high_m`
+        wall_m: Returns the height up to which it is an obstacle at one of its points; None if this is `high_m`
             everywhere.
     """
 
@@ -242,7 +242,7 @@ def _push_out(
 def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_m: Vector) -> tuple[Vector, float]:
     """Return the direction and distance out of an obstacle that a cylinder overlaps.
 
-    The direction is vertical if the cylinder came from above or below, else horizontal. A driving body is moved
+    The direction is vertical if the cylinder came from above or below, otherwise horizontal. A driving body is moved
     neither up nor down but back: on a ramp it may touch something above itself.
     """
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])

@@ -1,15 +1,15 @@
 """Robots with differential drive: unicycles with limits.
 
 Forward speed and yaw rate approach the commanded values as fast as their limits allow, independently of each other,
-like in ROS's `diff_drive_controller`. With a constant acceleration a and yaw rate w, the displacement in a time t is
-exact (the integral of the speed along the heading, about its middle): with the mean speed v, the mean heading h and
-x = w t / 2, it is
+as in ROS's `diff_drive_controller`. With a constant acceleration a and yaw rate w, the displacement in a time t is
+exact. It is the integral of the speed along the heading, with the origin of time in the middle of the interval. With
+the mean speed v, the mean heading h and x = w t / 2, it is
 
     v t sin(x) / x                            along h, and
     a t^2 / 2 (sin(x) - x cos(x)) / x^2       to the left of h.
 
-If the yaw rate changes while the robot moves, this is a Fresnel integral; a single step with the mean yaw rate is
-then used, with an error below v (dw/dt) t^3 / 12.
+If the yaw rate changes while the robot moves, the displacement is a Fresnel integral; a single step with the mean yaw
+rate is then used, with an error below v (dw/dt) t^3 / 12.
 """
 
 import math
@@ -54,11 +54,11 @@ class DriveLimits:
 
 HUSKY_A200: Final = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.6, height_m=0.39, friction=1.0)
 """Clearpath Husky A200: 1.0 m/s, 990 mm x 670 mm x 390 mm, climbs 45 degrees (data sheet); accelerations and rate of
-turn of `husky_control/config/control.yaml` (github.com/husky/husky)."""
+turn from `husky_control/config/control.yaml` (github.com/husky/husky)."""
 
 TURTLEBOT3_BURGER: Final = DriveLimits(0.22, 2.5, 2.84, 3.2, radius_m=0.113, height_m=0.192)
 """ROBOTIS TurtleBot3 Burger: 0.22 m/s, 2.84 rad/s, 138 mm x 178 mm x 192 mm (e-Manual, specifications); accelerations
-of `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground,
+from `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground,
 our estimate.
 """
 
@@ -101,8 +101,8 @@ class Arc:
 
     Attributes:
         start: Its initial pose.
-        speed_m_s: Initial speed, equal to that of the initial pose except for rounding.
-        turn_rad_s: Initial yaw rate, equal to that of the initial pose except for rounding.
+        speed_m_s: Initial speed, equal to the speed of the initial pose except for rounding.
+        turn_rad_s: Initial yaw rate, equal to the yaw rate of the initial pose except for rounding.
         acceleration_m_s2: Change of the speed per second.
         turn_acceleration_rad_s2: Change of the yaw rate per second.
         steps: See `Course.steps`.
@@ -253,7 +253,7 @@ class DifferentialDrive:
     def stopped(self, pose: DrivePose, stop: ContactStop, command: object) -> DrivePose:
         """Implement `Body.stopped`.
 
-        At a wall it slides on with the component of its velocity along the wall, limited to that component of the
+        At a wall it slides on with the component of its velocity along the wall, limited to the same component of the
         commanded velocity; a robot that heads straight into a wall stops.
         """
         heading: Vector = (math.cos(pose.heading_rad), math.sin(pose.heading_rad), 0.0)

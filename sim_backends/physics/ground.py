@@ -1,7 +1,8 @@
 """The ground for bodies on wheels: flat, with raised areas and ramps.
 
-Vertical faces are walls from below and edges from above, over which no body drives; where a ramp leads to raised
-ground there is neither. For a robot, ground on which its tires have no grip, because it is too steep, is also a wall.
+A vertical face is a wall for bodies below it, and an edge for bodies above it. No body drives over an edge. Where a
+ramp leads to raised ground, there is neither a wall nor an edge. Ground that is too steep for the grip of the tires
+of a robot is also a wall for it.
 """
 
 import math
@@ -84,7 +85,7 @@ class Ground:
         return Surface(highest.height_m((east_m, north_m)), highest.grade)
 
     def edge_m(self, place_m: Vector) -> float:
-        """Return the minimum distance to different ground."""
+        """Return the minimum distance to the edge of an area of ground."""
         return min((piece.edge_m(place_m[0], place_m[1]) for piece in self._pieces), default=math.inf)
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
@@ -109,7 +110,7 @@ class Ground:
         return Footprint(piece.obstacle.name, piece.nearest_m, 0.0, 0.0, top_m, partial(self._wall_m, piece))
 
     def _wall_m(self, piece: _Piece, east_m: float, north_m: float) -> float:
-        """Return the height of a piece's side at a point of it; 0 if other ground leads up to it."""
+        """Return the height of the side of an area at one of its points; 0 if other ground leads up to it."""
         height_m = piece.obstacle.height_m((east_m, north_m))
         others = (
             other for other in self._pieces if other is not piece and other.distance_m(east_m, north_m) <= _LEVEL_M

@@ -18,14 +18,14 @@ _ROUNDING: Final = 1 + 1e-9
 
 
 class CellGrid:
-    """Numbers by the square cell of their position; those within a given distance are in nine cells.
+    """Numbers by the square cell of their position; nine cells contain all numbers within a given distance.
 
     Args:
-        within_m: That distance, horizontally, in metres.
+        within_m: This distance, horizontally, in metres.
     """
 
     def __init__(self, within_m: float) -> None:
-        # Larger cells contain these as well; the minimum of 1 m keeps cell numbers finite for any finite position.
+        # Cells may be larger than the distance. The minimum of 1 m keeps cell numbers finite for any finite position.
         self._cell_m = max(within_m * _ROUNDING, 1.0)
         self._cells: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
 
@@ -34,7 +34,7 @@ class CellGrid:
         self._cells[self._cell(place_m)].append(number)
 
     def nearby_indices(self, place_m: Vector) -> list[int]:
-        """Return, in order, all numbers within the distance of a position, and some that are farther away."""
+        """Return all numbers within the distance of a position, and some that are farther away, in order."""
         east, north = self._cell(place_m)
         cells = [(east + e, north + n) for e in (-1, 0, 1) for n in (-1, 0, 1)]
         return sorted(number for cell in cells if cell in self._cells for number in self._cells[cell])
@@ -155,7 +155,7 @@ def _kinematics(name: str, body: Body[Any], pose: Pose) -> _Kinematics:
 
 
 def _closing_time_s(gap_m: float, mover: _Kinematics, other: _Kinematics | None = None) -> float:
-    """Return the minimum time in which one body, or two, can close a gap, including acceleration."""
+    """Return the minimum time in which one or two bodies can close a gap, including acceleration."""
     v, a, top = mover.speed_m_s, mover.limit_m_s2, mover.top_speed_m_s
     if other is not None:
         v, a, top = v + other.speed_m_s, a + other.limit_m_s2, top + other.top_speed_m_s

@@ -15,7 +15,7 @@ class Paths:
 
     Args:
         motions: The motions; no two of them move the same agent.
-        step_ns: Time step; states are those at whole steps.
+        step_ns: Time step; there are states only at whole steps.
         limits_m_s2: Maximum acceleration of each agent. For agents that are not listed it follows from the corners of
             `WayPoints`; for any other motion it is infinite.
     """
@@ -38,7 +38,7 @@ class Paths:
         return self._states
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of an agent that was not given one, valid from the last returned states on."""
+        """Return the limit of an agent without a given limit; it is valid from the last returned states on."""
         waypoints = self._waypoints.get(name)
         return math.inf if waypoints is None else waypoints.limit_m_s2(self._at_ns)
 

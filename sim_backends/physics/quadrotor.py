@@ -1,10 +1,10 @@
 """Quadrotors: point masses with an attitude, moved by thrust, gravity and drag, and controlled by an autopilot.
 
-The autopilot is a cascade, like PX4's (PX4 user guide, controller diagrams): the target velocity gives an
-acceleration within limits; with gravity and drag, which the controller compensates, it gives a thrust vector within
-bounds of tilt and size; that gives roll and pitch. These follow with a first-order lag and a limited rate; the thrust
-is chosen so that its vertical component at the actual attitude has the desired value. With f the thrust per mass, in
-axes of its yaw (forward, left, up),
+The autopilot is a cascade, as in PX4 (PX4 user guide, controller diagrams). The target velocity gives an acceleration
+within limits. This acceleration, with compensation of gravity and drag, gives a thrust vector within bounds of tilt
+and magnitude. The thrust vector gives the target roll and pitch. Roll and pitch follow with a first-order lag and a
+limited rate. The thrust is chosen so that its vertical component at the actual attitude has the desired value. With f
+the thrust per mass, in axes of its yaw (forward, left, up),
 
     f = |f| (cos(roll) sin(pitch), -sin(roll), cos(roll) cos(pitch)), acceleration = f - g - (linear + quadratic |v|)
     v / mass.
@@ -22,7 +22,7 @@ from sim_backends.physics.collisions import ContactStop, Surface
 _REACHED: Final = 1e-9
 """Tolerance for reaching a target, in m/s or rad: a first-order lag alone never reaches it."""
 _MAX_STEPS: Final = 64
-"""Maximum number of steps, and so of stored poses, of a course."""
+"""Maximum number of steps of a course, and therefore of its stored poses."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,8 @@ IRIS: Final = QuadrotorLimits(
 0.47 m x 0.47 m x 0.11 m, rotors of 0.128 m around (0.13, 0.22) m. Limits and gains are PX4's defaults (parameter
 reference: MPC_TILTMAX_AIR, MC_ROLLRATE_MAX, MC_YAWRATE_MAX, 1 / MC_ROLL_P, MPC_XY_VEL_MAX, MPC_Z_VEL_MAX_DN and UP,
 MPC_ACC_HOR_MAX, MPC_ACC_DOWN_MAX and UP, MPC_XY_VEL_P_ACC, MPC_Z_VEL_P_ACC). The minimum thrust of a tenth is our
-choice, and the drag of the body is that of a cube's face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052 m^2 / 2.
+choice, and the drag of the body is the drag of a cube with a face of 0.47 m x 0.11 m: 1.225 kg/m^3 x 1.05 x 0.052 m^2
+/ 2.
 """
 
 DUCKIEDRONE: Final = QuadrotorLimits(
@@ -127,8 +128,8 @@ DUCKIEDRONE: Final = QuadrotorLimits(
     height_m=0.12,
 )
 """Duckietown Duckiedrone: a frame of the 250 mm class. No data sheet describes its flight; all values are our
-estimates, from the mass of its parts and twice its weight in thrust, with low speeds, as it is flown indoors by a
-camera.
+estimates, from the mass of its parts and a thrust of twice its weight. Its speeds are low, because it flies indoors
+and uses a camera for control.
 """
 
 
@@ -169,7 +170,7 @@ class FlightStatus(NamedTuple):
         place_m: Position of its lowest point, metres east, north, up.
         roll_rad: See `FlightPose`.
         pitch_rad: See `FlightPose`.
-        is_supported: True if something below it carries it.
+        is_supported: True if it rests on something.
     """
 
     place_m: Vector
@@ -202,7 +203,7 @@ class Glide:
 
     Attributes:
         start: Its initial pose.
-        velocity_m_s: Its velocity, equal to that of the initial pose except for rounding.
+        velocity_m_s: Its velocity, equal to the velocity of the initial pose except for rounding.
         step_s: Length of a step.
     """
 
@@ -377,7 +378,7 @@ class Quadrotor:
     def stopped(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:
         """Implement `Body.stopped`: it keeps the component of its velocity along the obstacle.
 
-        Without power it comes to rest, level, on what carries it.
+        Without power it comes to rest in a level attitude on whatever supports it.
         """
         is_off = isinstance(command, FlightTarget) and not command.powered
         if is_off and any(contact.normal[2] > 0 for contact in stop.contacts):

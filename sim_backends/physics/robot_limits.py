@@ -12,9 +12,9 @@ BODIES: Final[dict[str, DriveLimits | QuadrotorLimits]] = {
     "turtlebot3_burger": TURTLEBOT3_BURGER,
     **QUADROTORS,
 }
-"""All robots; those with a robot profile also have a radio."""
+"""All robots; robots with a robot profile also have a radio."""
 
 
 def quadrotor(profile: str) -> QuadrotorLimits:
-    """Return the limits of a drone of this profile; those of the paper's drone if the profile is unknown."""
+    """Return the limits of a drone of this profile; the limits of the paper's drone if the profile is unknown."""
     return QUADROTORS.get(profile, DUCKIEDRONE)

@@ -1,8 +1,9 @@
 """Framing of TCPROS, the protocol between ROS 1 nodes.
 
-Source: wiki.ros.org/ROS/TCPROS. Every packet is its length in 4 bytes, little-endian, and its payload. The first
-packet in each direction is the connection header, a sequence of fields `name=value`, each with its length; each later
-one is a serialized message. Only the standard library is imported, because Debian's Python imports this module too.
+Source: wiki.ros.org/ROS/TCPROS. Every packet consists of its length in 4 bytes, little-endian, and its payload. The
+first packet in each direction is the connection header, a sequence of fields `name=value`, each with its length. Each
+later packet is a serialized message. Only the standard library is imported, because Debian's Python imports this
+module too.
 """
 
 import struct
@@ -16,7 +17,7 @@ LENGTH_BYTES: Final = _LENGTH.size
 
 
 def pack(payload: bytes) -> bytes:
-    """Return `payload` with its length."""
+    """Return `payload` with its length in front."""
     return _LENGTH.pack(len(payload)) + payload
 
 
@@ -70,7 +71,7 @@ class PacketSplitter:
         """Yield and remove the payload of each complete packet.
 
         Raises:
-            ValueError: As `unpack_length`.
+            ValueError: The length of a packet exceeds `MAX_BYTES`.
         """
         while len(self._buffer) >= LENGTH_BYTES:
             end = LENGTH_BYTES + unpack_length(bytes(self._buffer[:LENGTH_BYTES]))

@@ -29,7 +29,7 @@ class RosMessageType:
     Attributes:
         name: Its name, `package/Name`.
         md5: MD5 sum of its definition.
-        definition: Its definition with those of all nested types.
+        definition: Its definition, with the definitions of all nested types.
     """
 
     name: str
@@ -75,7 +75,7 @@ class RosPublisher:
         stream.sendall(pack(pack_header(self._header)))
         with self._lock:
             self._streams.append(stream)
-        # Subscribers send nothing more, so that the end of the stream is all that can be read.
+        # Subscribers send nothing more, so only the end of the stream can be read.
         ended = select.poll()
         ended.register(stream, select.POLLIN)
         ended.poll()
@@ -139,7 +139,7 @@ class RosSubscriber:
         return len(self._streams)
 
     def update(self, publishers: Sequence[str]) -> None:
-        """Connect to the publishers, given by their URIs, that are new."""
+        """Connect to the new publishers in a list of URIs."""
         with self._lock:
             new, self._publishers = set(publishers) - self._publishers, set(publishers)
         for uri in new:
@@ -157,7 +157,7 @@ class RosSubscriber:
             raise TimeoutError(f"no message on {self._topic}") from None
 
     def _receive(self, uri: str) -> None:
-        """Receive the messages of a publisher until it ends; nothing happens if it does not exist any more."""
+        """Receive the messages of a publisher until it ends; nothing happens if it no longer exists."""
         with suppress(OSError, ValueError):
             protocol = call(uri, "requestTopic", self._caller, self._topic, [["TCPROS"]])
             _, host, port = protocol
@@ -296,7 +296,7 @@ class RosNode:
             threading.Thread(target=self._serve, args=(stream,), daemon=True).start()
 
     def _serve(self, stream: socket.socket) -> None:
-        """Send messages to a subscriber; one that violates TCPROS is disconnected."""
+        """Send messages to a subscriber; a subscriber that violates TCPROS is disconnected."""
         with stream, suppress(OSError, ValueError):
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             stream.settimeout(CALL_S)

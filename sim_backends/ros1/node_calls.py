@@ -40,7 +40,7 @@ class RosNodeRequests(SimpleXMLRPCRequestHandler):
 
 
 class RosNodeServer(SimpleXMLRPCServer):
-    """The XML-RPC server of a node; each call has a thread, so that one that is slow delays no other."""
+    """The XML-RPC server of a node; each call has its own thread, so that a slow call does not delay others."""
 
     @override
     def process_request(self, request: Any, client_address: Any) -> None:
@@ -57,7 +57,7 @@ def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a v
 
     Raises:
         OSError: It cannot be reached.
-        MasterError: It refused the call, or its answer is not one of ROS.
+        MasterError: It refused the call, or its answer is not a valid answer in ROS.
     """
     try:
         answer = getattr(ServerProxy(uri, transport=_TimedTransport()), method)(*arguments)

@@ -21,9 +21,9 @@ class Solid:
 
     Attributes:
         a: Relative permittivity at 1 GHz.
-        b: Its exponent.
+        b: Exponent of the frequency in the permittivity.
         c: Conductivity at 1 GHz, in S/m.
-        d: Its exponent.
+        d: Exponent of the frequency in the conductivity.
     """
 
     a: float
@@ -32,7 +32,7 @@ class Solid:
     d: float
 
     def permittivity(self, frequency_hz: float) -> complex:
-        """Return the relative permittivity, its imaginary part not above 0: ITU-R P.2040-1, eq. 9."""
+        """Return the relative permittivity; its imaginary part is not above 0: ITU-R P.2040-1, eq. 9."""
         ghz = frequency_hz / 1e9
         return complex(self.a * ghz**self.b, -_LOSS_FACTOR * self.c * ghz**self.d / ghz)
 

@@ -33,7 +33,7 @@ class Lifetime(NamedTuple):
 
     Attributes:
         appears_ns: Its beginning.
-        disappears_ns: Its end, at which the robot does not exist any more; None for never.
+        disappears_ns: Its end: the robot does not exist from this time on; None for never.
     """
 
     appears_ns: int = 0
@@ -54,7 +54,7 @@ class Motion(Protocol):
 
     @property
     def end_ns(self) -> int | None:
-        """Time after which all of them stay at rest, nanoseconds; None if it is unknown."""
+        """Time in nanoseconds after which all robots stay at rest; None if it is unknown."""
         ...
 
     def at(self, time_ns: int) -> Mapping[str, State]:
@@ -63,7 +63,7 @@ class Motion(Protocol):
 
 
 class WayPoints:
-    """One robot moves straight from point to point at one speed, and stops at the last.
+    """One robot moves straight from point to point at one speed, and stops at the last point.
 
     It has no mutable state: a state depends only on the time. Corners are passed at times rounded from their distance
     along the path, so that rounding errors do not add up.
@@ -103,7 +103,7 @@ class WayPoints:
         """Return an acceleration a such that extrapolation at the current velocity is wrong by at most a t^2 / 2.
 
         Up to the next corner, c from now, there is no error; after it two velocities of speed v differ by at most 2
-        v. So the error is at most 2 v (t - c), which is at most (v / c) t^2 / 2.
+        v. The error is therefore at most 2 v (t - c), which is at most (v / c) t^2 / 2.
         """
         corner = bisect_right(self._times_ns, time_ns)
         if corner == len(self._times_ns):
@@ -200,7 +200,7 @@ class DeadReckoned(Mapping[str, State]):
         self._current = states
 
     def at(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states at `now_ns`, not before the reference time; the same object during a whole step."""
+        """Return the states at `now_ns`, at or after the reference time; the same object during a whole step."""
         steps = (now_ns - self.since_ns) // self.step_ns
         if steps != self._steps:
             self._steps = steps

@@ -180,7 +180,7 @@ def _slab(start: Floats, end: Floats, half: Floats) -> tuple[Floats, Floats]:
 
 
 def _disc(start: Floats, end: Floats, radius: Floats) -> tuple[Floats, Floats]:
-    """Return the same as `_slab` for discs around the origin, paths of shape (m, n, 2)."""
+    """Return the same as `_slab` for discs around the origin and paths of shape (m, n, 2)."""
     step = end - start
     a = (step * step).sum(axis=-1)
     half_b = (start * step).sum(axis=-1)

@@ -63,7 +63,7 @@ class World(Named):
     twice the distance (`master`), or the receiver at the distance (`masterless`).
 
     Attributes:
-        name: Its name, that of its file without `.yaml`.
+        name: The name of its file without `.yaml`.
         summary: Description in one line.
         area_m: Extent of the drawn area, metres east and north from the origin.
         obstacles: Its obstacles.
@@ -97,8 +97,8 @@ class World(Named):
         """Return the loss by obstacles along straight paths, in dB, shape (n,).
 
         A solid causes its loss per metre and the reflection loss of two faces, at normal incidence and without
-        multiple reflections inside; for foliage the total depth counts. Diffraction is not modelled, so that a thick
-        obstacle casts a deeper shadow than a real one.
+        multiple reflections inside; the loss of foliage depends on the total depth. Diffraction is not modelled, so
+        that a thick obstacle casts a deeper shadow than a real one.
 
         Args:
             start_m: Starts of the paths, shape (n, 3).
@@ -129,7 +129,7 @@ class World(Named):
 
 @cache
 def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Floats, Floats, Floats]:
-    """Return, per material, the loss per metre and by two faces in dB, 0 for foliage, and 1 for foliage, else 0."""
+    """Return an item per material: loss per metre and by two faces in dB (0 for foliage); 1 for foliage, else 0."""
     materials = [MATERIALS[name] for name in names]
     solids = [material if isinstance(material, Solid) else None for material in materials]
     return (
@@ -140,7 +140,7 @@ def _material_losses(names: tuple[str, ...], frequency_hz: float) -> tuple[Float
 
 
 def world_files() -> dict[str, Path]:
-    """Return the files of all worlds by name: those of the lab's folder `worlds/`, and shipped ones."""
+    """Return the files of all worlds by name: worlds in the lab's folder `worlds/`, and shipped ones."""
     return {path.stem: path for folder in (SHIPPED, Path("worlds")) for path in sorted(folder.glob("*.yaml"))}
 
 

@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bound`: exchanges that keep a bound, with `error_bounded` and fixed windows."""
+"""`fieldkit cosim shootout SCENARIO --bound`: the exchanges that `error_bounded` and fixed windows need."""
 
 import argparse
 import math
@@ -37,7 +37,7 @@ _COLUMNS: Final = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search for the fixed window that keeps the bound, with each seed, and print the cost of both.
+    """Search for the fixed window that keeps the bound, for each seed; print its cost and the `error_bounded` cost.
 
     Raises:
         ConfigurationError: An option is given that applies to other modes only.

@@ -78,12 +78,12 @@ def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s
 
 
 def _named_federate(where: str) -> dict[str, str]:
-    """Return the change of a scenario that uses a federate with a name, whose options are then validated."""
+    """Return the change that makes a scenario use a named federate, so that its options are validated."""
     return {f"{ROLES[role]}.federate": where for role in (PHYSICS, NETWORK) if _has_role(where, role)}
 
 
 def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
-    """Return the traffic without topics, which a network may not support; its checks send packets of their own."""
+    """Return the traffic with UDP instead of topics and ROS 1, which a network may not support."""
     entries = [traffic.model_dump(mode="json", by_alias=True, exclude_none=True) for traffic in scenario.traffic]
     for entry in entries:
         if entry["protocol"] in {"topic", "ros1", "ros1-udp"}:
@@ -93,7 +93,7 @@ def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
 
 
 def _has_role(where: str, role: int) -> bool:
-    """Return True if a federate is known by a name, and has a role."""
+    """Return True if there is a federate with this name and this role."""
     try:
         return named(where, role) is not None
     except ConfigurationError:  # the other role, or its package cannot be loaded

@@ -136,8 +136,8 @@ def simulate_all(
 ) -> tuple[list[SeedResult], bool]:
     """Return the result of a scenario for each seed, and True if Ctrl-C interrupted them.
 
-    Seeds that had not finished when they were interrupted are missing. The runs are parallel unless a federate serves
-    one run at a time.
+    If the runs are interrupted, the seeds whose runs have not finished are missing. The runs are parallel unless a
+    federate serves one run at a time.
 
     Args:
         scenario: The scenario.

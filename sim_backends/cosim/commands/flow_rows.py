@@ -144,7 +144,7 @@ def _is_missing(value: Value) -> bool:
 
 
 def _distance_m(flow: FlowResult, scenario: CosimScenario, starts_m: Mapping[str, Vector]) -> float:
-    """Return the distance of a flow at time 0, to the millimetre; with a relay, the distance to it, as in trials."""
+    """Return the distance from sender to relay, or to receiver without a relay, at time 0 in whole millimetres."""
     is_relayed = scenario.topology is Topology.MASTER and scenario.relay is not None
     peer = scenario.relay if is_relayed and scenario.relay else flow.destination
     return round(math.dist(starts_m[flow.source], starts_m[peer]), 3)

@@ -34,7 +34,7 @@ from sim_backends.cosim.studies.seeds import Task, run_many
 
 WINDOWS_S: Final = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 START_TIMES: Final = 20
-"""Number of times in the exact reference of each seed at which a window of each policy starts."""
+"""Number of start times for the windows of each policy, in the exact reference of each seed."""
 _COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "actual window, mean", 1e3),
@@ -112,7 +112,8 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
         return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 
     def policy_for(window_s: float) -> SyncPolicy:
-        # The windows of error_bounded are as long as those of other policies unless its bound requires shorter ones.
+        # The windows of error_bounded are as long as the windows of other policies unless its bound requires shorter
+        # ones.
         longest_s = window_s if task.policy == ErrorBounded.name else max(window_s, scenario.policy.longest)
         return make_policy(task.policy, **scenario.policy.parameters | {"window_s": window_s, "longest_s": longest_s})
 

@@ -37,7 +37,7 @@ _LOCAL_ERRORS: Final = {
 
 @dataclass(frozen=True)
 class CostPoint:
-    """The errors and the cost of a policy with a window; nan for an error that no packet determines.
+    """The errors and the cost of a policy with a window; nan for an error for which there are no packets.
 
     Attributes:
         policy: Its name.
@@ -146,7 +146,7 @@ def _positive_points(errors: LocalErrors, measure: str, factor: float) -> tuple[
 
 
 def _curves(points: Sequence[CostPoint], name: str) -> list[Curve]:
-    """Return a curve per policy, of values times 1000; errors that no packet determines are omitted."""
+    """Return a curve per policy, of values times 1000; errors that are nan are omitted."""
     curves: dict[str, list[tuple[float, float]]] = {}
     for point in points:
         if not math.isnan(error := getattr(point, name)):

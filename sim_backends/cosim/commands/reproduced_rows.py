@@ -28,7 +28,7 @@ class ReproducedRows:
 
     Args:
         scenario: The scenario.
-        trial: Its section on that trial.
+        trial: The section of the scenario that describes the trial.
         policy: The sync policy, as text.
 
     Attributes:
@@ -64,7 +64,7 @@ class ReproducedRows:
         self.flows = frozenset(name for repeat in self._repeats for name in _flow_names(repeat))
 
     def _distance(self) -> Distance:
-        """Return the horizontal distance of the sender from the relay, or from the receiver without one."""
+        """Return the horizontal distance from the sender to the relay, or to the receiver if there is no relay."""
         starts = bodies(self._scenario, load_world(self._scenario.world))
         other = self._agents.get(Role.RELAY, self._agents[Role.RECEIVER])
         points_m = [starts[name].place_m[:2] for name in (self._agents[Role.SENDER], other)]
@@ -126,7 +126,7 @@ class ReproducedRows:
             yield self._trial.row(simulated, identity)
 
     def _captures(self, repeat: ReproducedRepeat, recording: Path) -> dict[Role, bytes]:
-        """Return the captures of both ends, if the network wrote those of its IP packets."""
+        """Return the captures of both ends, if the network wrote captures of its IP packets."""
         if not self._has_captures:
             return {}
         paths = {role: recording / CAPTURES / f"{self._agents[role]}.pcap" for role in (Role.SENDER, Role.RECEIVER)}
@@ -153,7 +153,7 @@ class ReproducedRows:
         return "\n".join((*lines, "", f"--- {address} ping statistics ---", summary, ""))
 
     def _values(self, repeat: ReproducedRepeat, transfer: FlowResult, ping: FlowResult | None) -> dict[str, Value]:
-        """Return the columns that the simulation knows without evidence."""
+        """Return the columns whose values come from the simulation itself, not from its captures."""
         sent_bytes = repeat.transfer.size_bytes
         values: dict[str, Value] = {
             "sent_bytes": sent_bytes,
@@ -175,7 +175,7 @@ class ReproducedRows:
 
 
 def _tcp_completion(capture: bytes, repeat: ReproducedRepeat, transfer: FlowResult) -> dict[str, Value]:
-    """Return the time from the first segment at the receiver until its program had the whole file."""
+    """Return the time from the arrival of the first segment until the receiving program has the whole file."""
     first_ns = None if repeat.transfer.port is None else first_tcp_ns(capture, repeat.transfer.port)
     if first_ns is None or transfer.last_arrived_ns is None or transfer.arrived_bytes < repeat.transfer.size_bytes:
         return {}

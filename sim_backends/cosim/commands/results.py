@@ -41,11 +41,11 @@ class FlowRecovery:
 def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
     """Return the recovery of each flow that a fault of the radio affected, by fault and flow.
 
-    A fault without an end, or whose end the run did not reach, is ignored.
+    A fault that has no end, or that ends after the run, is ignored.
 
     Args:
         scenario: The scenario with the faults.
-        run: A run of it.
+        run: A run of the scenario.
     """
     reached_ns = run.windows_ns[-1] if run.windows_ns else 0
     all_recoveries = []
@@ -113,8 +113,8 @@ class FlowRoundTrips:
         answered: Number of requests whose reply arrived.
         network_s: Time that request and reply together spent in the network.
         jitter_s: Mean absolute difference of successive round trips; nan if there are fewer than two.
-        times: Number of each answered request from 0, simulated time of the reply's arrival in nanoseconds, and time
-            in the network in seconds, in order of the requests.
+        times: For each answered request, in order: its number from 0, the simulated time of the reply's arrival in
+            nanoseconds, and the time in the network in seconds.
     """
 
     sent: int
@@ -134,11 +134,11 @@ class FlowResult:
         destination: The receiving agent.
         protocol: Its transport.
         sent: Number of packets whose fate is decided.
-        arrived: Number of them that arrived.
+        arrived: Number of these packets that arrived.
         under_way: Number of packets whose fate is not decided.
         sent_bytes: Total size of sent packets.
         arrived_bytes: Total size of packets that arrived.
-        delay_s: Time in the network, of packets that arrived.
+        delay_s: Time in the network of the packets that arrived.
         first_to_last_s: Time from the first arrival to the last.
         jitter_s: Interarrival jitter after the last packet (RFC 3550, section 6.4.1); nan for fewer than two packets.
         added_s: Mean delay that the sync policy added, before and after the network.
@@ -343,10 +343,10 @@ def seed_result(
         scenario: The scenario.
         seed: Its seed.
         run: The record.
-        states: States of agents, as `Recording.states`, at least for time 0.
+        states: States of agents in the form of `Recording.states`, at least for time 0.
         ended_by: The exception that ended it early, or None.
-        starts: States of all agents at their starts; None for the first ones in `states`.
-        lateness: As in the result.
+        starts: States of all agents at their starts; None for the first states in `states`.
+        lateness: Lateness of its windows; None if it was not a run in real time.
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None

@@ -203,7 +203,7 @@ def _cost_text(results: Sequence[SeedResult]) -> str:
 
 
 def _combined_digest(digests: Sequence[str]) -> str:
-    """Return the digest of a single run, or one hash over those of several runs."""
+    """Return the digest of a single run, or one hash over the digests of several runs."""
     if len(digests) == 1:
         return digests[0]
     return hashlib.blake2b("".join(digests).encode(), digest_size=16).hexdigest()

@@ -1,4 +1,4 @@
-"""`fieldkit cosim satisfy SCENARIO`: the paper's satisfaction loop, which changes error and cost, not the loss."""
+"""`fieldkit cosim satisfy SCENARIO`: the paper's loop that repeats a run until the loss is satisfactory."""
 
 import argparse
 from functools import partial

@@ -80,7 +80,7 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ...]:
-    """Return the seeds of the runs: those of the options, otherwise the scenario's."""
+    """Return the seeds from the options; without such options, the seeds of the scenario."""
     if arguments.seeds is not None:
         return tuple(range(1, arguments.seeds + 1))
     return chosen.seeds if arguments.seed is None else (arguments.seed,)
@@ -213,7 +213,7 @@ def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
 def note_commensurate_events(
     chosen: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
 ) -> None:
-    """Print a note on each window that is commensurate with a period of the scenario, with a better window.
+    """Print a note on each window that is commensurate with a period of the scenario; suggest a better window.
 
     Args:
         chosen: The scenario.

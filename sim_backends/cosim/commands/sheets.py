@@ -17,7 +17,7 @@ Value = str | int | float | None
 """A cell; nan and None are missing values."""
 
 _MAX_WIDTH: Final = 98
-"""Largest line length of legends, also in a wider terminal."""
+"""Largest line length of legends; it also applies in a wider terminal."""
 
 _MISSING: Final = "-"
 _NUMBER: Final = re.compile(r"-|-?[0-9][0-9.,]*(e[+-]?[0-9]+)?")
@@ -85,7 +85,7 @@ class Sheet:
         return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
 
     def legend(self, part: SheetPart, explained: Collection[str] = ()) -> dict[str, str]:
-        """Return the meanings of the headings of a part, without those that are already explained."""
+        """Return the meanings of the headings of a part, except headings that are already explained."""
         columns = [column for column in self.columns if column.name in part.columns and column.meaning]
         meanings = {column.head.partition(" (")[0]: column.meaning for column in columns}
         return {head: meaning for head, meaning in meanings.items() if head not in explained}
@@ -104,7 +104,7 @@ class Sheet:
 
 
 def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
-    """Print several tables in one of `FORMS`: JSON has all by their names, CSV the first one only.
+    """Print several tables in one of `FORMS`: JSON contains all of them by name, CSV only the first one.
 
     Args:
         sheets: The tables by name, the main one first.
@@ -119,7 +119,7 @@ def show_all(sheets: Mapping[str, Sheet], form: str) -> None:
 
 
 def number_text(value: float, digits: int = 3) -> str:
-    """Return a number with that many significant digits, without an exponent unless it would be long."""
+    """Return a number with `digits` significant digits, without an exponent unless it would be long."""
     if value == 0 or 1e-4 <= abs(value) < 1e3:
         return f"{value:.{digits}g}"
     return f"{value:,.0f}" if 1e3 <= abs(value) < 1e7 else f"{value:.2e}"

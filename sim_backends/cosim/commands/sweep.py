@@ -33,8 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the sweep; write a file per run, and the dataset of all results.
 
     Raises:
-        FieldkitError: A factor is invalid, the folder cannot be written, or runs failed; the exit code is that of the
-            first failed run.
+        FieldkitError: A factor is invalid, the folder cannot be written, or runs failed; the exit code is the exit
+            code of the first failed run.
     """
     factors = parse_factors(arguments.over)
     scenario = settings.scenario(arguments)
@@ -70,7 +70,8 @@ def _workers(plan: SweepPlan, workers: Workers) -> Workers:
     """Return the workers that can run a plan.
 
     Raises:
-        ConfigurationError: The scenario can only be run once at a time, and on this machine.
+        ConfigurationError: The scenario publishes events of EMANE, or needs a federate with an address but the
+            workers are a cluster.
     """
     scenarios = [setting.scenario for setting in plan.settings]
     if any(scenario.emane is not None for scenario in scenarios):

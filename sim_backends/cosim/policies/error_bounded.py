@@ -4,18 +4,19 @@ The network extrapolates the agents at the velocities that they had at the begin
 many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Physics and programs advance ahead of the
 network: arrivals count from the end of the window, so nothing that they do in the window depends on the network. At
 the time that they have reached, a pair of agents has an error x, the distance between their true relative position
-and the one that the network assumes. It grows at a speed v, which changes by at most the acceleration limit a: after
-a time t it is at most x + v t + a t^2 / 2. Before this can reach the bound, the policy evaluates the errors again; if
-less than one step of the physics remains, the window ends. So the bound holds for any motion, and no margin is lost
-to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
+and the relative position that the network assumes. It grows at a speed v, which changes by at most the acceleration
+limit a: after a time t it is at most x + v t + a t^2 / 2. Before the error can reach the bound, the policy evaluates
+the errors again; if less than one step of the physics remains, the window ends. The bound therefore holds for any
+motion, and no margin is lost to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6,
+49, 2006).
 
-The pairs are those of all agents that send, receive, forward or interfere. A bound in metres adds the pairs of each
-agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound in dB
-adds the pairs of each agent and a fixed source of interference.
+The policy examines the pairs of all agents that send, receive, forward or interfere. A bound in metres adds the pairs
+of each agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound
+in dB adds the pairs of each agent and a fixed source of interference.
 
 The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
-the error grows by u q between two steps. The step is that of the physics if u q is at most an eighth of the bound;
-otherwise it is shorter.
+the error grows by u q between two steps. The step is the step of the physics if u q is at most an eighth of the
+bound; otherwise it is shorter.
 
 While no program sends and the network has no events, positions are not used, and the window extends to the last step
 before the next event. If a network cannot extrapolate, it assumes that agents do not move, and x is the distance that
@@ -62,7 +63,7 @@ class ErrorBounded:
         exponent: Exponent of the log-distance law for `bound_db`.
 
     Raises:
-        PolicyError: One of them is not above 0.
+        PolicyError: One of these values is not above 0.
     """
 
     name = "error_bounded"
@@ -102,7 +103,8 @@ class ErrorBounded:
         end_ns = self.extended_end_ns(situation)
         if end_ns > now_ns:
             return end_ns
-        # At least until the next whole step: within a step, dead reckoning is as accurate as states at steps can be.
+        # The window ends at the next whole step or later: within a step, dead reckoning is as accurate as states at
+        # steps can be.
         end_ns = _step_begin_ns(situation) + situation.physics_step_ns
         use_ns = situation.next_use_ns
         if use_ns is not None and use_ns < end_ns:

@@ -1,4 +1,4 @@
-"""The sync policies by name, the built-in ones and those of entry points, and their parameters."""
+"""The sync policies by name, built in or from entry points, and their parameters."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ from sim_backends.cosim.policies.window_policies import (
 )
 
 PolicyKind = Callable[..., SyncPolicy]
-"""Returns a new policy; its parameters are some of those of `make_policy`."""
+"""Returns a new policy; it has some of the parameters of `make_policy`."""
 
 _KINDS: Final[tuple[type[SyncPolicy], ...]] = (
     EventDriven,
@@ -35,7 +35,7 @@ _KINDS: Final[tuple[type[SyncPolicy], ...]] = (
     ErrorBounded,
 )
 BUILTIN: Final[Mapping[str, PolicyKind]] = {kind.name: kind for kind in _KINDS}
-"""Every built-in policy by its name, exact ones first."""
+"""Every built-in policy by its name; the exact ones are first."""
 
 _WINDOW_S: Final = 0.001
 """The paper's initial window, section V."""
@@ -43,7 +43,7 @@ _WINDOW_S: Final = 0.001
 
 @cache
 def policies() -> Mapping[str, PolicyKind]:
-    """Return every policy by its name: built-in ones, then those of other packages, which are loaded on first use.
+    """Return every policy by its name: built-in ones, then policies of other packages, which are loaded on first use.
 
     Reading a policy of a package raises `ConfigurationError` if it cannot be loaded, lacks a member, or has another
     name than its entry point.

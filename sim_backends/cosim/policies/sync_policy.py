@@ -69,8 +69,8 @@ class SyncPolicy(Protocol):
         defers_sends: True if a packet enters the network at the end of the window in which it was sent.
         uses_end_states: True if the network uses the states at the end of a window for the whole window; its end then
             belongs to it. Otherwise it uses the states at its beginning.
-        defers_arrivals: True if an arrival counts from the end of its window; otherwise it has its own time, which
-            its receiver has passed already.
+        defers_arrivals: True if an arrival counts from the end of its window; otherwise it counts from its own time,
+            which its receiver has already passed.
     """
 
     name: str
@@ -108,8 +108,8 @@ class LookingAhead(SyncPolicy, Protocol):
 
         Args:
             situation: The present situation, except for the network, which is still at the beginning of the window:
-                its next event is the one that it had then. If a program has sent in the window, the network may need
-                positions immediately.
+                its next event is the next one after that time. If a program has sent in the window, the network may
+                need positions immediately.
 
         Returns:
             Time of the next call; `situation.now_ns` if the window must end now.
@@ -126,7 +126,7 @@ def missing_members(policy: object) -> list[str]:
 
 
 class PolicyError(ConfigurationError):
-    """A policy has no window; the message has the time, the pair and the reason."""
+    """A policy cannot determine a window; the message states the time, the pair and the reason."""
 
 
 def window_ns(policy: str, window_s: float) -> float:

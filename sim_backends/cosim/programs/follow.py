@@ -1,14 +1,14 @@
 """Programs that follow other agents, using only the states that the network delivers.
 
 The age of a received state is its transmission delay, which is known from its time stamp. The state is extrapolated
-to the present time with its velocity. So every delay, and every error of a delivery time, becomes a position error:
-after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower that
-receives no state for longer than a timeout stops.
+to the present time with its velocity. Every delay, and every error of a delivery time, therefore becomes a position
+error: after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower
+that receives no state for longer than a timeout stops.
 
-`FollowAtHeadway` keeps a constant time headway h, which is a distance r + h v. With the error e = gap - r - h v its
-acceleration is ((v_leader - v) + k e) / h, so that e decays as exp(-k t) (Ioannou and Chien, "Autonomous intelligent
-cruise control", IEEE Trans. Veh. Technol. 42, 1993). For a leader whose states arrive with the delay d and are
-extrapolated, the transfer function from leader to follower is
+`FollowAtHeadway` keeps a constant time headway h: at the speed v, the distance is r + h v, where r is the distance at
+standstill. With the error e = gap - r - h v its acceleration is ((v_leader - v) + k e) / h, so that e decays as
+exp(-k t) (Ioannou and Chien, "Autonomous intelligent cruise control", IEEE Trans. Veh. Technol. 42, 1993). For a
+leader whose states arrive with the delay d and are extrapolated, the transfer function from leader to follower is
 
     Gamma(s) = exp(-d s) (s + k (1 + d s)) / ((h s + 1) (s + k)).
 

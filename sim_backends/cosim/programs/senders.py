@@ -71,7 +71,7 @@ class PingRequest:
         flow: Its flow.
         number: Its number in the flow.
         size_bytes: Size of the request and of its reply.
-        protocol: Transport of both.
+        protocol: Transport of request and reply.
     """
 
     flow: str

@@ -61,9 +61,10 @@ _APPROACH_PER_S: Final = 1.0
 
 
 class DriveThrough(NeverSends):
-    """Drives a wheeled body from point to point, and stops at the last.
+    """Drives a wheeled body from point to point, and stops at the last point.
 
-    It turns towards a point at a rate proportional to the heading error, and drives slower the larger that error is.
+    It turns towards a point at a rate proportional to the heading error, and the larger the error is, the slower it
+    drives.
 
     Args:
         points_m: The waypoints, metres east and north.
@@ -118,7 +119,7 @@ class DriveThrough(NeverSends):
 
 
 class FlyThrough(NeverSends):
-    """Flies a body from point to point, and hovers at the last.
+    """Flies a body from point to point, and hovers at the last point.
 
     Args:
         points_m: The waypoints, metres east, north, up.
@@ -230,7 +231,7 @@ class VelocityProfile(NeverSends):
         begin_ns: Beginning of the first leg.
 
     Raises:
-        ConfigurationError: There are no legs, or the duration of one is not above 0.
+        ConfigurationError: There are no legs, or a duration is not above 0.
     """
 
     def __init__(self, legs: Sequence[ProfileLeg], *, begin_ns: int = 0) -> None:

@@ -11,7 +11,7 @@ from sim_backends.world.motion import State
 
 
 class CombinedProgram:
-    """Combines programs of one agent: each wakes at its own times, and all receive all datagrams.
+    """Combines programs of one agent: each wakes at its own times, and every program receives all datagrams.
 
     Args:
         programs: The programs; if several steer at the same time, the command of the last one applies.
@@ -67,7 +67,7 @@ class Outage:
         self._is_stopped = False
 
     def next_wake_ns(self) -> int | None:
-        """Return the program's next wake time; before the body was stopped, at most the start of the outage."""
+        """Return the program's next wake time; at most the start of the outage until the body has been stopped."""
         wake_ns = self._program.next_wake_ns()
         return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
 
@@ -117,13 +117,13 @@ class AgentClock:
             )
 
     def reading_ns(self, now_ns: int) -> int:
-        """Return its reading at a time."""
+        """Return the reading of the clock at a time."""
         if now_ns < self.begin_ns or (self.end_ns is not None and now_ns >= self.end_ns):
             return now_ns
         return now_ns + self.offset_ns + (now_ns - self.begin_ns) * self.rate_ppb // _BILLION
 
     def first_ns(self, shown_ns: int) -> int:
-        """Return the first time at which its reading is `shown_ns` or later."""
+        """Return the first time at which the reading of the clock is `shown_ns` or later."""
         if shown_ns < self.begin_ns:
             return shown_ns
         # After n ns in the interval it has advanced by floor(n (1 + rate)): find the smallest sufficient n.
@@ -142,7 +142,7 @@ class _Stamped:
 
 
 class Clocked:
-    """A program that uses only the clock of its computer, also for the time stamps of its datagrams.
+    """A program that uses only the clock of its computer, including for the time stamps of its datagrams.
 
     If the clock of one agent is wrong, the programs of all agents are wrapped, so that all can read the time stamps.
 

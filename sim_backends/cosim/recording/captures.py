@@ -29,7 +29,7 @@ _MULTICAST: Final = IPv4Address("239.255.0.1").packed
 _TOPIC_PORT, _DISCOVERY_PORT = 7411, 7400
 """Ports of DDS: of the first participant of a host, and of discovery (DDSI-RTPS 2.5, 9.6.1.1)."""
 _FIRST_PORT: Final = 40_000
-"""Destination port of the first flow; each further flow has the next."""
+"""Destination port of the first flow; each further flow has the next port."""
 _FIRST_EPHEMERAL_PORT: Final = 50_000
 """Source port of the first flow: a dynamic port (RFC 6335, section 6), not 49152, which tcpdump decodes specially."""
 _PORTS: Final = 9_000
@@ -49,12 +49,12 @@ _MSS: Final = 1460
 
 @dataclass(frozen=True)
 class CapturedFlow:
-    """Headers of the packets of a flow, where they are not the default ones.
+    """Headers of the packets of a flow that differ from the default ones.
 
     Attributes:
-        port: Destination port; None for a free one.
-        ping: Name of the ping whose echo requests or replies (ICMP) the packets are; empty for UDP and TCP.
-        is_reply: True for its replies.
+        port: Destination port; None for any free port.
+        ping: Name of the ping if the packets are its ICMP echo requests or replies; empty for UDP and TCP.
+        is_reply: True for replies of the ping.
     """
 
     port: int | None = None
@@ -70,7 +70,7 @@ NO_FLOWS: Final[Mapping[str, CapturedFlow]] = MappingProxyType({})
 
 
 def addresses(names: Sequence[str]) -> dict[str, IPv4Address]:
-    """Return the addresses of robots in captures: the first is 10.0.0.1, each further one has the next address.
+    """Return the addresses of robots in captures: the first is 10.0.0.1, each further robot has the next address.
 
     Args:
         names: The robots, in the order of their names.
@@ -94,7 +94,7 @@ class IpEncoder:
         self._flows: dict[object, int] = {}
 
     def encode(self, fragment: Fragment, max_bytes: int) -> bytes:
-        """Return the first bytes of an IP packet, or of a fragment of one.
+        """Return the first bytes of an IP packet or fragment.
 
         Args:
             fragment: The fragment.
@@ -216,7 +216,7 @@ _RECORD_HEADER: Final = struct.Struct("<IIII")
 
 
 class Captures:
-    """One pcap file per robot, with the packets that it sent and received; none for a robot without packets.
+    """One pcap file per robot that sent or received packets, with these packets.
 
     Files grow by whole packets, so they are readable even if the run is killed.
 
@@ -238,7 +238,7 @@ class Captures:
         self._written_bytes: dict[str, int] = {}
 
     def log(self, at_ns: int, name: str, fragment: Fragment) -> None:
-        """Add a packet, or a fragment of one, that a robot sent or that arrived at it (`IpLog`)."""
+        """Add an IP packet or fragment that a robot sent or that arrived at it (`IpLog`)."""
         data = self._encoder.encode(fragment, self._snap_bytes)
         if name not in self._pending:
             self._pending[name] = bytearray(
@@ -273,7 +273,7 @@ class Captures:
 
 
 def between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
-    """Return the packets of a capture of `Captures` with times from `begin_ns` until before `end_ns`, as a capture.
+    """Return a capture of the packets of another capture with times from `begin_ns` until before `end_ns`.
 
     Args:
         capture: The content of the file.
@@ -295,7 +295,7 @@ def _records(capture: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def first_tcp_ns(capture: bytes, port: int) -> int | None:
-    """Return the time of the first TCP packet to a port in a capture of `Captures`, or None if there is none.
+    """Return the time of the first TCP packet to a port in a capture; None if there is no such packet.
 
     Args:
         capture: The content of the file.
@@ -311,12 +311,12 @@ def first_tcp_ns(capture: bytes, port: int) -> int | None:
 class PacketObserver:
     """An observer that passes the packets of programs to the log of IP packets, and all calls to a recorder.
 
-    Each packet of a program is one UDP datagram without fragments, whatever its transport: at its source when it
-    enters the network, and at its destination when it arrives.
+    Each packet of a program is logged as one UDP datagram without fragments, also if its transport is not UDP. It is
+    logged at its source when it enters the network, and at its destination when it arrives.
 
     Args:
         recorder: The recorder, which accepts IP packets.
-        log: Its method `log_ip`.
+        log: The method `log_ip` of the recorder.
     """
 
     def __init__(self, recorder: WindowObserver, log: IpLog) -> None:

@@ -22,11 +22,11 @@ RUN_AGAIN: Final = "use a copy of the folder if there is one, or run the scenari
 """Remedy for a damaged recording."""
 _NAME: Final = "run.json"
 _CHECKSUM: Final = "content_hash"
-"""Key of the SHA-256 over the other keys, which are those of `RunManifest`."""
+"""Key of the SHA-256 over the other keys, which are the fields of `RunManifest`."""
 
 
 class RunEnding(StrEnum):
-    """The status of a run: under way, or the kind of its end."""
+    """The status of a run: it is under way, or how it ended."""
 
     UNDER_WAY = "under way"
     KILLED = "killed"
@@ -87,7 +87,7 @@ _CODEC: Final = Codec(RunManifest)
 
 
 def versions() -> dict[str, str]:
-    """Return the versions for `RunManifest.versions` of the running software."""
+    """Return the versions of the running software for `RunManifest.versions`."""
     return {"python": platform.python_version()} | {name: version(name) for name in ("fieldkit", "numpy")}
 
 
@@ -129,7 +129,7 @@ def _is_locked(folder: Path) -> bool:
 
 
 def read_manifest(folder: Path) -> RunManifest:
-    """Read `run.json`; a run that is under way there, but that no process writes, was killed.
+    """Read `run.json`; a run was killed if it is under way there but no process writes it.
 
     Raises:
         EvidenceError: It does not exist, is invalid, or was changed.

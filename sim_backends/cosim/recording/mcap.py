@@ -1,7 +1,7 @@
 """Exports a recording as an MCAP file, for Foxglove and other readers of MCAP: states of robots, and packets.
 
-The only module of `sim_backends` that imports mcap. File format: https://mcap.dev/spec; the schemas with names
-`foxglove.*` are those that Foxglove displays: https://docs.foxglove.dev/docs/sdk/schemas.
+The only module of `sim_backends` that imports mcap. File format: https://mcap.dev/spec; Foxglove displays the schemas
+with names `foxglove.*`: https://docs.foxglove.dev/docs/sdk/schemas.
 """
 
 import heapq
@@ -127,7 +127,7 @@ def _schema_of(topic: str) -> Json:
 def _states(recording: Recording) -> Iterator[Message]:
     for at_ns, agent, state in recording.states:
         time, position = _time(at_ns), _vector(state.position_m)
-        half_rad = (state.heading_rad or 0.0) / 2  # rotation about the up axis; without a heading, it is east
+        half_rad = (state.heading_rad or 0.0) / 2  # rotation about the up axis; 0 (east) without a heading
         transform = {
             "timestamp": time,
             "parent_frame_id": "world",

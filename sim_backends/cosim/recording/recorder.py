@@ -55,7 +55,7 @@ class StateSamples:
         recorder: The recorder, or None.
 
     Attributes:
-        states: Time in nanoseconds, agent, state, as `Recording.states`.
+        states: Time in nanoseconds, agent and state, in the form of `Recording.states`.
         log_ip: The recorder's method; missing if the recorder does not accept IP packets.
     """
 
@@ -101,17 +101,17 @@ class RunRecorder:
     """Records a run into a folder; a context manager around the run.
 
     Windows are collected in memory. About every two seconds of wall time they are written as one more part of each
-    table. The part of `windows` is written last, so that the parts of the same number are complete if it exists. A
-    run that is killed therefore loses only its last seconds.
+    table. The part of `windows` is written last. If it exists, the parts of the other tables with the same number are
+    complete. A run that is killed therefore loses only its last seconds.
 
     Args:
         folder: The folder; it is created at the start of the run, so an invalid scenario creates none.
         about: The scenario and its settings.
         states_every_ns: Interval at which true states are recorded, at ends of windows, in simulated nanoseconds.
         part_every_s: Interval at which parts are written, in seconds of wall time.
-        snap_bytes: Number of bytes kept of each IP packet in `captures/`, which has a file for each robot if the
-            network is given `log_ip`.
-        agents: The agents that are absent at time 0, whose packets `captures/` must have, too.
+        snap_bytes: Number of bytes kept of each IP packet in `captures/`. That folder has a file for each robot if
+            the network passes its packets to `log_ip`.
+        agents: The agents that are absent at time 0, whose packets `captures/` must also include.
         flows: Flows with special headers in the captures, by name.
     """
 
@@ -277,7 +277,7 @@ class RunRecorder:
                 written.append(self._folder / path)
                 state.checksums[path] = packet_tables.write_part(self._folder, table, state.parts, table_rows)
         except OSError:
-            for unfinished in written:  # to free their space
+            for unfinished in written:  # this frees their space
                 with suppress(OSError):
                     unfinished.unlink(missing_ok=True)
             raise

@@ -104,7 +104,7 @@ def _fate(row: Mapping[str, Any]) -> Fate:
         row["enters_ns"],
         row["protocol"],
     )
-    # The columns `known_*` have the states that the network assumed.
+    # The columns `known_*` contain the states that the network assumed.
     assumed, true = (
         (_state(row, f"{prefix}_source"), _state(row, f"{prefix}_destination")) for prefix in ("known", "true")
     )

@@ -52,7 +52,7 @@ class StandingPlan(Strict):
 
 
 class WayPointsPlan(Strict):
-    """The agent moves from point to point, and stays at the last.
+    """The agent moves from point to point, and stays at the last point.
 
     Attributes:
         kind: `way-points`.
@@ -105,7 +105,7 @@ class FollowPlan(Strict):
 
     Attributes:
         kind: `follow`.
-        leader: The agent that it follows or, if it flies, a list of several.
+        leader: The agent that it follows or, if it flies, a list of several agents.
         distance: Distance behind the leader at standstill, or height above it; from antenna to antenna.
         headway: Time headway behind the leader, in addition to the distance.
         timeout: Time without a state after which it stops.
@@ -137,7 +137,7 @@ MotionPlan = Annotated[
 Protocol = Literal["udp", "tcp", "topic", "ros1", "ros1-udp"]
 
 _MAX_BYTES = 65_000
-"""Largest packet: UDP carries 65,507 bytes (RFC 768, RFC 791), which must also hold the header of a topic."""
+"""Largest packet: UDP carries 65,507 bytes (RFC 768, RFC 791), which include the header of a topic."""
 
 _MAX_MESSAGES = 10**6
 """Largest bag: it is in memory as a whole, 100 bytes per message, even if only a part of it is played."""
@@ -208,7 +208,7 @@ class _Traffic(Strict, ABC):
 
     @property
     def flow_ends(self) -> tuple[tuple[str, str, str], ...]:
-        """Name, source and destination of every flow, including those of replies."""
+        """Name, source and destination of every flow, including the flows of replies."""
         return tuple((flow, self.source, to) for flow, to in self.flows.items())
 
     @property
@@ -218,7 +218,7 @@ class _Traffic(Strict, ABC):
 
     @abstractmethod
     def packets(self, duration_s: float) -> float:
-        """Return the approximate maximum number of packets that it sends in a scenario of a duration."""
+        """Return the approximate maximum number of packets that it sends in a scenario of this duration."""
 
 
 class StreamTraffic(_Traffic):
@@ -250,9 +250,9 @@ class StreamTraffic(_Traffic):
 class BagTraffic(_Traffic):
     """A recorded bag is played back, each message at its recorded time.
 
-    The defaults are the paper's: 10 s of accelerometer data. The size is that of a serialized `sensor_msgs/Imu` with
-    the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and 72 of
-    covariance with each. The rate is that of the Husky's simulated IMU.
+    The defaults are the paper's: 10 s of accelerometer data. The size is the size of a serialized `sensor_msgs/Imu`
+    with the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and
+    72 of covariance with each of the three. The rate is the rate of the Husky's simulated IMU.
 
     Attributes:
         kind: `bag`.
@@ -290,13 +290,13 @@ class BagTraffic(_Traffic):
 
 
 class FileTraffic(_Traffic):
-    """A file is sent as fast as possible, as by netcat.
+    """A file is sent as fast as possible, as netcat does.
 
     Attributes:
         kind: `file`.
         size_bytes: Size of the file.
         piece_bytes: Size of each write to the transport: netcat uses 8192 bytes.
-        port: Destination port in captures; a free one if omitted.
+        port: Destination port in captures; a free port if omitted.
     """
 
     kind: Literal["file"]
@@ -321,8 +321,8 @@ class PingTraffic(_Traffic):
         kind: `ping`.
         count: Number of requests.
         interval: Time between requests.
-        size_bytes: Size of a request and of its reply, without the header: ping reports 56 as 64 bytes, because
-            ICMP's header has 8 bytes, as UDP's.
+        size_bytes: Size of a request and of its reply, without the header: ping reports 56 as 64 bytes, because the
+            header of ICMP has 8 bytes, like the header of UDP.
     """
 
     kind: Literal["ping"]

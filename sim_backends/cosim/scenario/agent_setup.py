@@ -113,7 +113,8 @@ def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: 
     Args:
         scenario: The scenario.
         bodies: The body of each agent.
-        seed: Seed of the phases that the scenario does not set; controllers of different robots are not synchronous.
+        seed: Seed of the phases that the scenario does not set; the controllers of different robots do not run at the
+            same times.
     """
     programs = {
         name: _controller(plan, bodies[name], plan.lifetime.appears_ns, _phase_ns(name, plan, seed))
@@ -246,7 +247,7 @@ def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> 
             bag = file_pieces(traffic.size_bytes, traffic.piece_bytes)
         case BagTraffic():
             bag = generated_bag(
-                # The stream depends on the bag only, because every receiver gets the same bag.
+                # The random stream depends on the bag only, because every receiver gets the same bag.
                 RandomStream(seed, traffic.title, "recorded"),
                 length_ns=_ns(traffic.length),
                 rate_hz=traffic.rate,

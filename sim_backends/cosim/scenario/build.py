@@ -65,7 +65,7 @@ def radio_network(
         seed: Seed of all random draws.
         observer: Receives all IP packets if it has `log_ip`.
         path_losses_db: As for `WifiInWorld`; fixed links ignore them.
-        carrier: Network that carries its IP packets instead of the built-in radio; or None.
+        carrier: Network that carries its IP packets instead of the built-in radio, or None.
     """
     stations = antennas(scenario)
     radio: RadioModel[Fragment]
@@ -82,7 +82,7 @@ def radio_network(
         disturbances=tuple(_disturbances(scenario, world)),
         relay=scenario.relay if scenario.topology is Topology.MASTER else None,
     )
-    if scenario.relay is not None:  # even if it does not relay, it transmits as the host of the ROS 1 master
+    if scenario.relay is not None:  # even if this agent does not relay, it transmits as the host of the ROS 1 master
         network.transmitters |= {scenario.relay}
     if isinstance(observer, IpObserver):
         network.log_ip(observer.log_ip)
@@ -102,7 +102,7 @@ def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
 
 
 def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
-    """Return the description of captures with the headers of `Captures`; None if the network writes none."""
+    """Return the description of captures with the headers of `Captures`; None if the network writes no captures."""
     if not writes_captures(scenario):
         return None
     flows = captured_flows(scenario.traffic)
@@ -122,7 +122,7 @@ def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
-    """Return the transports; without publish-subscribe if no flow uses it, because it sends even without traffic."""
+    """Return the transports; publish-subscribe is omitted if no flow uses it, as it sends even without traffic."""
     topics: dict[str, TopicFlow] = {}
     ros1: dict[str, Ros1Flow] = {}
     for traffic in scenario.traffic:
@@ -190,7 +190,7 @@ class Simulation:
         policy: Its sync policy.
         agents: Bodies and programs.
         network: Carries packets.
-        coordinator: Runs both.
+        coordinator: Runs agents and network.
         federates: Ends the external federates when it is closed.
     """
 
@@ -209,7 +209,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """End the external federates; otherwise they end when they are not referenced any more."""
+        """End the external federates; without this call they end when they are no longer referenced."""
         self.federates.close()
 
     def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
@@ -242,13 +242,13 @@ def build(
 
     Args:
         scenario: The scenario.
-        policy: A sync policy or the name of one; None for the scenario's.
-        seed: Seed of all random draws; None for the scenario's first.
+        policy: A sync policy or its name; None for the policy of the scenario.
+        seed: Seed of all random draws; None for the first seed of the scenario.
         recorder: Receives every window, and every IP packet if it has `log_ip`; or None. With another network it
             receives the programs' packets as IP packets.
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
-        network: Replaces the scenario's network; faults of the radio are then its responsibility.
+        network: Replaces the scenario's network; it must then also apply the faults of the radio.
         measures_all: As for `Coordinator`.
         captures: Folder of captures for a network that writes them itself; the recorder then receives no IP packets.
 

@@ -80,7 +80,7 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         self._publish(states)
 
     def window(self, window: Window) -> None:
-        """Publish the states at the end of a window if they are due; a run in real time waits for their wall time."""
+        """Publish the states at the end of a window if they are due; in real time, this waits for their wall time."""
         if self._observer is not None:
             self._observer.window(window)
         if self._sampling.is_due(window.end_ns):
@@ -108,7 +108,7 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         return NemLocation(nem, *self._frame.geodetic(state.position_m), emane_velocity(state.velocity_m_s))
 
     def _pathlosses(self, states: Mapping[str, State]) -> list[SerializedEvent]:
-        """Return an event for each agent, with its losses from and to all others, which are equal."""
+        """Return an event for each agent, with its losses to all others, which are the same in both directions."""
         assert self._losses is not None
         names = [name for name in self._nems if name in states]
         losses_db = self._losses([states[name].position_m for name in names])

@@ -1,4 +1,4 @@
-"""External federates of a scenario: the one place where the co-simulation starts, connects or makes them."""
+"""External federates of a scenario; only this module of the co-simulation starts, connects or makes them."""
 
 import dataclasses
 import json
@@ -47,7 +47,7 @@ def has_addresses(scenario: CosimScenario) -> bool:
 
 
 def writes_captures(scenario: CosimScenario) -> bool:
-    """Return True if the network is a program that writes captures of the IP packets of its own transports."""
+    """Return True if the network is a program that itself writes captures of the IP packets of its transports."""
     where = None if scenario.network.transports == "builtin" else scenario.network.federate
     federate = None if where is None else named(where, NETWORK)
     return isinstance(federate, ProgramFederate) and federate.writes_captures
@@ -88,7 +88,7 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
 
 
 def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
-    """Return the configuration as JSON; the order of agents is that of the scenario, as results may depend on it."""
+    """Return the configuration as JSON; agents are in the order of the scenario, because results may depend on it."""
     radios = antennas(scenario)
     options = (scenario.physics if role == PHYSICS else scenario.network).options
     configuration = {
@@ -123,7 +123,7 @@ class SimulatorName(NamedTuple):
 
 
 def simulators() -> list[SimulatorName]:
-    """Return the built-in simulators and those of installed packages; none of them is imported.
+    """Return the built-in simulators and the simulators of installed packages; none of them is imported.
 
     Raises:
         ConfigurationError: The package of a simulator cannot be loaded.
@@ -136,7 +136,7 @@ def simulators() -> list[SimulatorName]:
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
 ) -> PhysicsFederate | None:
-    """Start, connect or make the scenario's external physics, if it has one; arguments as `make_hello`.
+    """Start, connect or make the scenario's external physics, if it has one; arguments as for `make_hello`.
 
     Raises:
         ConfigurationError: The name, the command or the address cannot be used.
@@ -162,15 +162,15 @@ def open_network(
     *,
     captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect or make the scenario's external network, if it has one; otherwise as `open_physics`.
+    """Start, connect or make the scenario's external network, if it has one; errors as for `open_physics`.
 
     Args:
-        scenario: As for `open_physics`, like the next ones.
+        scenario: The scenario.
         world: The world.
         bodies: The bodies.
         seed: The seed.
         deadline_s: The deadline.
-        captures: Description of the captures that a network with `writes_captures` writes; None for none.
+        captures: Description of the captures that a network with `writes_captures` writes; None if it writes none.
     """
     where = scenario.network.federate
     if where is None:
@@ -205,7 +205,7 @@ def open_network(
 
 
 def carried_radio(network: NetworkFederate, names: Sequence[str]) -> RadioModel[Fragment]:
-    """Return the radio of built-in transports whose IP packets an external network carries between stations."""
+    """Return the radio for built-in transports that uses an external network to carry IP packets."""
     return IpRadio(network, names)
 
 
@@ -213,7 +213,7 @@ def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  #
     """Return a federate in this process.
 
     Raises:
-        ConfigurationError: It does not support the scenario, or something is not installed.
+        ConfigurationError: It does not support the scenario, or required software is not installed.
     """
     service = federate.load()
     try:

@@ -1,4 +1,4 @@
-"""The federate of a scenario's physics or network, and its options: those of the simulator with its name."""
+"""The federate of a scenario's physics or network, and its options, which the named simulator defines."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Final
@@ -52,11 +52,11 @@ _VALIDATED_DEFAULT: Final = Field(validate_default=True)
 PhysicsFederateOptions = Annotated[
     Options, PlainValidator(_options_of(PHYSICS)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]
-"""Options of the federate `federate` in the same mapping, a physics."""
+"""Options of the physics that `federate` names in the same mapping."""
 NetworkFederateOptions = Annotated[
     Options, PlainValidator(_options_of(NETWORK)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]
-"""Options of the federate `federate` in the same mapping, a network."""
+"""Options of the network that `federate` names in the same mapping."""
 
 
 def agent_references(options: Options) -> Iterator[tuple[str, Location]]:
@@ -66,17 +66,17 @@ def agent_references(options: Options) -> Iterator[tuple[str, Location]]:
 
 
 def unsupported(options: Options, scenario: schema.Strict) -> Iterator[tuple[str, Location]]:
-    """Yield everything in a scenario that the simulator with these options does not support, with its keys."""
+    """Yield every part of a scenario that the simulator with these options does not support, with its keys."""
     if isinstance(options, SimulatorOptions):
         yield from options.unsupported(scenario.model_dump(mode="json", by_alias=True, exclude_none=True))
 
 
 def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) -> None:  # noqa: ANN401 (any YAML value)
-    """Remove the options of each federate that a change replaces, because they are only valid for it.
+    """Remove the options of each federate that a change replaces; they are valid only for the old federate.
 
     Args:
         data: A scenario file.
-        changes: Values that replace those of the file, by their keys.
+        changes: Values that replace values of the file, by their keys.
     """
     for role in ROLES.values():
         section = data.get(role) if isinstance(data, dict) else None

@@ -47,7 +47,7 @@ _SHIPPED: Final = Path(__file__).parent / "scenarios"
 
 
 def scenario_files() -> dict[str, Path]:
-    """Return the files of all scenarios by name: shipped ones, and those in the folder `scenarios/` of the lab."""
+    """Return the files of all scenarios by name: shipped files, and files in the folder `scenarios/` of the lab."""
     folders = (_SHIPPED, Path("scenarios"))
     files = {path.stem: path for folder in folders for path in folder.glob("*.yaml")}
     return dict(sorted(files.items()))
@@ -58,7 +58,7 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
 
     Args:
         name_or_path: Its name, or the path of a file that ends in `.yaml`.
-        changes: Values that replace those of the file, by their keys: `{"policy.window": "2ms",
+        changes: Values that replace values of the file, by their keys: `{"policy.window": "2ms",
             "agents.husky-2.along": "40m"}`.
 
     Raises:

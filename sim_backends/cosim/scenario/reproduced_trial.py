@@ -1,4 +1,4 @@
-"""The trial of robots that a scenario reproduces, so that both can be compared: its section of a scenario file."""
+"""Section of a scenario file: the trial of robots that the scenario reproduces, so that both can be compared."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -27,12 +27,13 @@ class ReproducedTrial(Strict):
     """The trial of robots that a scenario reproduces.
 
     A run with `--out` has a row for each protocol, with the columns of this trial, measured from captures as in a
-    trial of robots. The traffic must agree with the procedure: port of the transfer, number, interval and size of
-    the echo requests. Topology, line, robots and distance are those of the scenario.
+    trial of robots. These settings of the traffic must agree with the procedure: the port of the transfer, and the
+    number, interval and size of the echo requests. The scenario determines topology, line, robots and distance.
 
     Attributes:
         procedure: Name of the procedure.
-        record: Duration of every recording, as by `--record` of `fieldkit trial`; omitted, that of the procedure.
+        record: Duration of every recording, as with `--record` of `fieldkit trial`; if omitted, the duration that the
+            procedure states.
         tcp: The traffic under TCP.
         udp: The traffic under UDP.
     """
@@ -57,7 +58,7 @@ class ReproducedTrial(Strict):
         return {protocol: chosen for protocol, chosen in flows.items() if chosen is not None}
 
     def problems(self, traffic: Sequence[Traffic]) -> Iterator[tuple[str, Location]]:
-        """Yield each contradiction to the traffic of its scenario, with the keys of the wrong value."""
+        """Yield each contradiction between procedure and traffic, with the keys of the wrong value."""
         by_name = {entry.title: entry for entry in traffic}
         ends: set[tuple[str, ...]] = set()
         for protocol, flows in self.flows.items():

@@ -77,8 +77,8 @@ class PhysicsOptions(Strict):
         federate: An [external federate](federates.md) that replaces the built-in physics: the name of an installed
             simulator, a command, or an address of `tcp`, `udp`, `dds` or `ros1` (addresses: `fieldkit docs
             federates`). A command is started for each run of the scenario.
-        options: Options of the federate, for [installed simulators](reference/simulator-options.md) those of its
-            table.
+        options: Options of the federate; each [installed simulator](reference/simulator-options.md) has a table of
+            its options.
     """
 
     step: Annotated[Duration, Field(ge=1e-6, le=1)] = 0.001
@@ -98,8 +98,8 @@ class NetworkOptions(Strict):
         federate: An [external federate](federates.md) that replaces the built-in network, as for the physics. It is
             then responsible for the radio, `tcp` and the faults of radios.
         options: Options of the federate, as for the physics.
-        transports: `federate`: those of the federate. `builtin`: it carries IP packets (its transport `ip`) of the
-            built-in UDP, TCP, topics and ROS 1.
+        transports: `federate`: the transports of the federate. `builtin`: the built-in UDP, TCP, topics and ROS 1,
+            whose IP packets the federate carries with its transport `ip`.
     """
 
     federate: Federate = None
@@ -143,10 +143,11 @@ class AgentPlan(Strict):
         aside_m: Distance of the start from that line, to the left.
         height: Height of the start over the ground, for agents that fly.
         heading_deg: Initial heading, from east towards north.
-        radio: Its radio, instead of that of its robot profile.
+        radio: Its radio, instead of the radio of its robot profile.
         motion: Its motion.
         phase: Time of its controller's first command, within the 50 ms between commands; if omitted, it is random.
-        appears: Time when it appears at its start. Its motion begins then, and its traffic not before.
+        appears: Time when it appears at its start. Its motion begins at this time, and its traffic at this time or
+            later.
         disappears: Time when it disappears; never if omitted.
     """
 
@@ -200,7 +201,7 @@ class CosimScenario(Named):
     `fieldkit cosim schema` prints its JSON schema, with which an editor completes and checks it, see [the Python
     API](cosim-api.md#scenario-files). `robot` is the name of a robot profile, which has a radio. Bodies of `husky`,
     `iris`, `turtlebot3_burger` and `duckiedrone` are built in; another robot has the body of the TurtleBot, or of the
-    Duckiedrone, with its own top speed. The keys of `radio` are those of `emulated.radio` in the [site
+    Duckiedrone, with its own top speed. `radio` has the same keys as `emulated.radio` in the [site
     file](reference/site-file.md).
 
     Attributes:
@@ -213,7 +214,7 @@ class CosimScenario(Named):
         physics: The physics.
         network: The network.
         radio: The radio.
-        tcp: The TCP of all agents, also under ROS 1 topics.
+        tcp: The TCP of all agents, also for ROS 1 topics.
         topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
         relay: The agent whose access point relays.
         policy: The sync policy.

@@ -1,4 +1,4 @@
-"""The number of exchanges that keep a bound, with `error_bounded` and with the longest fixed window that keeps it."""
+"""The number of exchanges needed to keep a bound, with `error_bounded` and the longest sufficient fixed window."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -36,7 +36,7 @@ class BoundCost:
 
     @property
     def factor(self) -> float:
-        """Exchanges of that fixed window over those of `error_bounded`; nan if no fixed window keeps the bound."""
+        """Exchanges with that window per exchange with `error_bounded`; nan if no window keeps the bound."""
         return self.fixed_exchanges / self.exchanges if self.fixed_exchanges else math.nan
 
 
@@ -58,7 +58,7 @@ def bound_cost(
 ) -> BoundCost:
     """Return the cost of a bound in a scenario with one seed.
 
-    Fixed windows are those of `scheduled`, in which packets enter and arrive as with `error_bounded`, but the network
+    Fixed windows use the policy `scheduled`. Packets enter and arrive as with `error_bounded`, but the network
     assumes that agents stay where they were at the beginning of the window. No window is longer than `longest_s`.
 
     Args:
@@ -81,9 +81,10 @@ def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
 def longest_for_all(
     longest_s: Sequence[float], costs: Callable[[float], Sequence[FixedCost]], bound_m: float
 ) -> tuple[float, Sequence[FixedCost]]:
-    """Return the longest fixed window, to 2 %, that keeps a bound in all runs, and its cost in each.
+    """Return the longest fixed window that keeps a bound in all runs (to 2 %), and its cost in each run.
 
-    It is the window to choose before the next run. If there is none, the result is nan and an empty sequence.
+    It is the window that a user would choose for further runs. If there is none, the result is nan and an empty
+    sequence.
 
     Args:
         longest_s: The longest window that keeps the bound in each run.
@@ -91,7 +92,8 @@ def longest_for_all(
         bound_m: The bound.
     """
     window_s = min(longest_s, key=lambda run_longest_s: -math.inf if math.isnan(run_longest_s) else run_longest_s)
-    # A window may keep the bound by chance in one run, so even the shortest of them may exceed it in another run.
+    # A window may keep the bound by chance in one run, so even the shortest of these windows may exceed it in another
+    # run.
     while not math.isnan(window_s):
         all_costs = costs(window_s)
         if all(cost.largest_m <= bound_m for cost in all_costs):

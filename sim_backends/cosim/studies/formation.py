@@ -58,7 +58,7 @@ def _tracks(times_s: Floats, samples: Sequence[Mapping[str, State]]) -> Tracks:
 
 
 class SampledPhysics:
-    """Physics whose states are sampled at equal intervals, which does not change the motion.
+    """Physics whose states are sampled at equal intervals; sampling does not change the motion.
 
     Args:
         physics: The physics.
@@ -136,7 +136,7 @@ def station_errors_m(places_m: Floats, station_m: Floats, above_m: float) -> Flo
 
 
 def amplifications(signals: Floats) -> Floats:
-    """Return the amplification of a signal by each vehicle: the ratio of its L2 norm to that of the vehicle ahead.
+    """Return the ratio of the L2 norm of each vehicle's signal to the norm for the vehicle ahead (amplification).
 
     A convoy is string stable if no ratio is above 1 for any motion of the first vehicle: then a disturbance decays
     along the row (Ploeg, van de Wouw and Nijmeijer, "Lp string stability of cascaded systems", IEEE Trans. Control
@@ -182,9 +182,10 @@ class Formation:
         spacing_max_m: Its maximum.
         station_mean_m: Distance from the station above the leaders, mean over time and followers that fly.
         station_max_m: Its maximum.
-        amplification: Largest ratio of the L2 norm of the acceleration of a follower that drives to that of its
-            leader. At most 1 if the row was string stable for the motion of its first vehicle. Accelerations are 0
-            before and after a change of speed, so the end time of the run has no effect, as it would on speeds.
+        amplification: Largest ratio of the L2 norm of a driving follower's acceleration to the L2 norm of its
+            leader's acceleration. It is at most 1 if the row was string stable for the motion of its first vehicle.
+            Accelerations are 0 before and after a change of speed, so the end time of the run does not affect the
+            ratio. It would affect a ratio of speeds.
     """
 
     spacing_mean_m: float
@@ -237,7 +238,7 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
 
 
 def mean_formation(formations: Sequence[Formation]) -> Formation:
-    """Return the formations of several runs as one: means, or the largest of maxima.
+    """Return the combined formation of several runs: means, or the largest of maxima.
 
     Args:
         formations: At least one.

@@ -51,10 +51,10 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
 
     Args:
         value: The statistic of all repeats.
-        leave_one_out: The statistic of all repeats but one, for each, shape (n,).
+        leave_one_out: For each repeat, the statistic of all other repeats, shape (n,).
 
-    The variance over these is n - 1 times smaller than that of the statistic (Efron and Stein 1981, Ann. Stat.
-    9:586).
+    The variance of these values is n - 1 times smaller than the variance of the statistic (Efron and Stein 1981, Ann.
+    Stat. 9:586).
     """
     count = len(leave_one_out)
     if count < 2 or not np.isfinite(leave_one_out).all():
@@ -67,8 +67,8 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
 def repeats_needed(difference: float, deviation: float) -> int | None:
     """Return the number of pairs of repeats that detect a difference in four of five studies; None if it is zero.
 
-    It is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2; the second term compensates that the deviation is an estimate
-    (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low.
+    It is ((z_0.975 + z_0.8) s / d)^2 + z_0.975^2 / 2; the second term is a correction, because the deviation is an
+    estimate (Guenther 1981, Am. Stat. 35:243). Small numbers may be one too low.
 
     Args:
         difference: Mean of the differences within pairs.

@@ -1,8 +1,9 @@
 """Local errors: the errors of a sync policy in single windows that start from the state of the exact reference.
 
-They are measured as for solvers of differential equations: the reference runs exactly; at many times a fork of it
-runs one window with the policy and continues exactly. Differences from the reference are then caused by that window
-only, and not by earlier windows. If the window is halved, the errors decrease according to the order of the policy.
+They are measured as for solvers of differential equations. The reference runs exactly. At many times, a fork of the
+reference runs one window with the policy and then continues exactly. Differences from the reference are then caused
+by that window only, and not by earlier windows. If the window is halved, the errors decrease according to the order
+of the policy.
 
 A window affects the packets that, in the reference, were sent or arrived within it.
 """
@@ -29,9 +30,9 @@ MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
 position of sender and receiver; share of packets with another fate; position error of agents at the window's end."""
 
 TAIL_NS: Final = 200_000_000
-"""Time that forks continue after the window, so that the fates of the affected packets are decided."""
+"""Time for which forks continue after the window, so that the fates of the affected packets are decided."""
 _LONGEST_NS: Final = 3_600_000_000_000
-"""A time that is longer than any window if there are events."""
+"""A time that is longer than any window as long as there are events."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def local_errors(
             equivalent.
         parameters: The parameters.
         starts_ns: Start times of windows, ascending; whole steps of the physics.
-        tail_ns: Time that forks continue after the window; packets whose fate is undecided then are ignored.
+        tail_ns: Time for which forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:
         PolicyError: A policy has no window for a situation.

@@ -1,7 +1,7 @@
 """The paper's claims about its middleware: an adaptive window against a fixed one, masterless against master-based.
 
-Both are measured in the rows of its tables 1 and 3, with the same seeds, as changes of the mean delay of packets that
-arrive, and of the share that does not arrive.
+Both claims are measured in the rows of its tables 1 and 3, with the same seeds. The measures are the change of the
+mean delay of packets that arrive, and the change of the share of packets that do not arrive.
 """
 
 import math
@@ -36,14 +36,14 @@ LINES: Final[Mapping[str, tuple[Sight, ...]]] = {"all": tuple(Sight), **{str(lin
 
 
 class Claim(NamedTuple):
-    """A change from another system to the paper's, in some rows.
+    """The change from another system to the paper's system, in some rows.
 
     Attributes:
         than: The system with which the paper's own is compared.
         lines: One of `LINES`.
         quantity: `delay`, with a relative change, or `loss`, with a difference.
         claimed: The change that the paper states; None if it states none.
-        tabled: The change according to the paper's own tables; nan if they do not have it.
+        tabled: The change according to the paper's own tables; nan if the tables do not contain it.
         ours: The measured change, with its 95 % interval.
         rows: Number of rows that it is based on: for a delay, packets must have arrived in both systems.
     """
@@ -143,7 +143,7 @@ def _changes_in_paper_tables(lines: Sequence[Sight]) -> tuple[float, float]:
 
 
 def _printed_numbers(columns: Sequence[Sequence[Printed]]) -> Floats:
-    """Return printed numbers as if they were those of one seed, shape (rows, 1)."""
+    """Return printed numbers in the form of the results of one seed, shape (rows, 1)."""
     return np.array([[number.value] for column in columns for number in column], np.float64)
 
 

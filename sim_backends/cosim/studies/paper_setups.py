@@ -127,7 +127,7 @@ Changes = Mapping[str, Any]
 RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
     {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}
 )
-"""Radios of the mesh: that of the scenario file, and fixed links as in EMANE's model RF Pipe."""
+"""Radios of the mesh: the radio of the scenario file, and fixed links as in EMANE's model RF Pipe."""
 
 _DURATION: Final = "20s"
 """The run ends 9 s after the last packet of a bag; packets that are still under way then count as lost."""

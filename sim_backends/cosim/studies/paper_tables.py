@@ -40,7 +40,7 @@ class Printed:
     Attributes:
         text: Its digits, in the printed unit.
         per_si: Factor from SI units to the printed unit: 100 for %, 1000 for ms.
-        step: Precision of numbers of its kind; if empty, that of its last digit.
+        step: Precision of numbers of its kind; if empty, the precision is one unit of its last digit.
     """
 
     text: str
@@ -167,7 +167,7 @@ _LABELS: Final = {"topic": "topic", "ros1": "tcp", "ros1-udp": "udp"}
 
 
 Labels = Mapping[str, str | int]
-"""The labels of a row: line of sight, distance and protocol, or which radio, and when."""
+"""The labels of a row: line of sight, distance and protocol; or the radio and the time."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ class PaperCell:
 
     @property
     def off(self) -> float:
-        """Difference of our number from the printed one; nan without ours."""
+        """Difference of our number from the printed one; nan if our number is unknown."""
         return self.ours.value - self.printed.value
 
 
@@ -224,7 +224,7 @@ class RowSource(NamedTuple):
     Attributes:
         labels: Labels of the row.
         setup: Name of the setup.
-        flow: Name of the flow in it.
+        flow: Name of the flow in the setup.
         printed: The paper's delay and loss.
     """
 

@@ -1,12 +1,12 @@
 """The paper's satisfaction loop: a round is repeated with another window until its loss is accepted.
 
-The paper (section III, below algorithm 1): the network's loss is compared with a threshold; while it is above, the
-window is changed by algorithm 1, and the same round is run again, until a result "is deemed to be satisfactory". The
-window of a round is the result of the rule in the previous round.
+The paper (section III, below algorithm 1): the network's loss is compared with a threshold. While the loss is above
+the threshold, algorithm 1 changes the window, and the same round is run again, until a result "is deemed to be
+satisfactory". The window of a round is the result of the rule in the previous round.
 
-A sync policy does not change the losses of the radio. So each round is compared with the exact reference
-of the same scenario and seed, whose loss does not depend on a window. The loop only changes the error of the result,
-and every round adds to its cost.
+A sync policy does not change the losses of the radio. Each round is therefore compared with the exact reference of
+the same scenario and seed, whose loss does not depend on a window. The loop only changes the error of the result, and
+every round adds to its cost.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ class Round:
     Attributes:
         window_s: Its initial w.
         median_window_s: Median of the windows that the rule computed from it.
-        loss: Share of packets lost, of those whose fate is decided.
+        loss: Share of lost packets among the packets whose fate is decided.
         errors: Errors relative to the reference.
         exchanges: Number of windows.
     """

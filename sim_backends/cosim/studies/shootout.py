@@ -24,7 +24,7 @@ SAMPLING_NS = 100_000_000
 
 
 class Simulated(Protocol):
-    """A scenario that is ready to run, as `scenario.build.Simulation`."""
+    """A scenario that is ready to run, like `scenario.build.Simulation`."""
 
     agents: Agents
 
@@ -203,12 +203,12 @@ class Row:
 
     @property
     def errors(self) -> Errors | None:
-        """The errors of all seeds as one; None if there are none."""
+        """The combined errors of all seeds; None if there are none."""
         return mean_errors(self.by_seed) if self.by_seed else None
 
     @property
     def formation(self) -> Formation | None:
-        """The formations of all seeds as one; None if there are none."""
+        """The combined formations of all seeds; None if there are none."""
         return mean_formation(self.formations) if self.formations else None
 
 

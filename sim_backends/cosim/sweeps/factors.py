@@ -50,11 +50,11 @@ _QUANTITIES: Final = (
     ("_dbm", "dBm", {"dBm": 1.0}),
     ("_value", "1", FRACTION_PER_UNIT),
 )
-"""Suffix, unit and factors of units of the column of numbers of each kind of quantity."""
+"""For each kind of quantity: suffix and unit of its column of numbers, and the factors of all its units."""
 
 
 def _in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
-    """Return a quantity in a unit; only levels may be negative. Raises as `parse_quantity`."""
+    """Return a quantity in a unit; only levels may be negative. Errors are as for `parse_quantity`."""
     magnitude = text.removeprefix("-") if unit in {"dB", "dBm"} else text
     value = parse_quantity(magnitude, factors, "value")
     return value if magnitude == text else -value
@@ -74,7 +74,7 @@ class Factor:
 
     @property
     def key(self) -> str:
-        """The key in the scenario's file; that of `distance` depends on the scenario."""
+        """The key in the scenario's file; the key of `distance` depends on the scenario."""
         return _SHORT_NAMES.get(self.name, self.name)
 
     @property
@@ -86,7 +86,7 @@ class Factor:
     def numbers(self) -> tuple[str, str, tuple[float, ...]] | None:
         """Name, unit and values of a column of numbers in SI units; None if a value is not a number.
 
-        The distance has none, because a table has the distance of each flow.
+        The factor `distance` has no such column, because a table contains the distance of each flow.
         """
         if self.name == DISTANCE:
             return None
@@ -157,7 +157,7 @@ def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
     """Check that the keys above a setting exist; the schema checks the last one.
 
     Raises:
-        ConfigurationError: They do not, and a mapping would be added to the scenario.
+        ConfigurationError: They do not exist, so that a mapping would be added to the scenario.
     """
     document = schema.parse(schema.dump(scenario), source="").data
     names = [*_SHORT_NAMES, DISTANCE, *(key for key, _ in _leaves(document) if key not in _NOT_SETTINGS)]
@@ -182,7 +182,7 @@ def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
 
 
 def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa: ANN401 (any YAML value)
-    """Yield the keys of all values that are not mappings, and lists of mappings, with their values."""
+    """Yield the joined keys and the value of each entry that is neither a mapping nor a list of mappings."""
     items = value.items() if isinstance(value, dict) else enumerate(value)
     for key, item in items:
         name = f"{prefix}{key}"

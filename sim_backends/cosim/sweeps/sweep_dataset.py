@@ -39,7 +39,7 @@ _ADDED: Final[Mapping[str, Mapping[str, str]]] = {
 
 
 def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
-    """Replace the dataset of a sweep by one with the results so far, and return the number of its rows.
+    """Replace the dataset of a sweep by a dataset of the results so far, and return the number of its rows.
 
     Raises:
         ConfigurationError: It cannot be written; an existing dataset is unchanged.

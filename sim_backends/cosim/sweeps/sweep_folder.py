@@ -35,7 +35,7 @@ class RunFailure:
         reason: Why the last one failed.
         remedy: What to do; may be empty.
         exit_code: Exit code of the error.
-        rows: Columns of its flows until then.
+        rows: Columns of its flows until the failure.
         is_final: Whether another attempt would end in the same way.
     """
 
@@ -69,7 +69,7 @@ class SweepFolder:
 
     @contextmanager
     def opened(self, plan: SweepPlan) -> Iterator[None]:
-        """Create the folder or open it again, and lock it during the body.
+        """Create the folder or open it again, and lock it during the body of the `with` statement.
 
         Raises:
             ConfigurationError: It contains something else, another process runs the sweep, or it cannot be written.

@@ -65,10 +65,10 @@ def execute(run: SweepRun, *, verify: bool = False) -> RunResult:
 
     Args:
         run: The run.
-        verify: Whether to check that world and robot profiles are those of the process that planned the run.
+        verify: Whether to check that world and robot profiles are the same as in the process that planned the run.
 
     Raises:
-        ConfigurationError: They are not.
+        ConfigurationError: The world or a robot profile differs.
         FieldkitError: The run could not start.
     """
     scenario = run.setting.scenario

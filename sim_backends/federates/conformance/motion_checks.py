@@ -42,7 +42,7 @@ def _turned(hello: Hello, heading_rad: float) -> Hello:
 
 
 def _agents(probe: FederateProbe, command: int) -> list[str]:
-    """Return the names of the agents that a type of command suits."""
+    """Return the names of the agents for which a type of command is suitable."""
     kind, verb = ("twist", "drives") if command == TWIST else ("velocity", "flies")
     if command not in probe.welcome.commands:
         raise NotDeclaredError(f"it does not list the command {kind}")

@@ -21,12 +21,12 @@ _SIZE_BYTES: Final = 200
 _MAX_EVENTS: Final = 500
 _SEEDS: Final = 4
 _DISTANCES_M: Final = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)
-"""Distances at which packets are sent, because a network may lose some packets only at a part of them."""
+"""Distances at which packets are sent; a network may lose only some of the packets, at only some of the distances."""
 _GROUP: Final = 32
 """Packets at each distance."""
 _SPACING_NS: Final = 20 * _MS
 _RANDOM_CHANGES: Final = 4
-"""Least number of changes between arrivals and losses that a new route or association does not cause."""
+"""Minimum number of changes between arrivals and losses if losses are random; a new route causes fewer changes."""
 
 
 def _states(probe: FederateProbe) -> dict[str, State]:
@@ -34,7 +34,7 @@ def _states(probe: FederateProbe) -> dict[str, State]:
 
 
 def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
-    """Return packets between the first two agents, in both directions in turns."""
+    """Return packets between the first two agents, alternately in both directions."""
     ends = [agent.name for agent in probe.hello.agents[:2]]
     if len(ends) < 2:
         raise NotDeclaredError("the scenario has only one agent")
@@ -244,7 +244,7 @@ def check_determinism(target: Target) -> None:
 
 
 def _arrivals_ns(probe: FederateProbe, every: int = 1) -> dict[int, int]:
-    """Return the arrival time of each packet sent at several distances, or of every second packet."""
+    """Return the arrival times of packets that are sent at several distances; only every n-th packet is sent."""
     account, states = _Account(probe), _states(probe)
     packets = _packets(probe, [_MS + number * _SPACING_NS for number in range(len(_DISTANCES_M) * _GROUP)])
     first, second = (agent.name for agent in probe.hello.agents[:2])

@@ -20,7 +20,7 @@ _SAME_M: Final = 1e-6
 """Largest difference between positions that must be equal; results may depend on the order of additions."""
 _MOVED_M: Final = 0.02
 _JUMP_M: Final = 0.05
-"""A body moves at most this much, and by twice its speed, in a step."""
+"""In a step, a body moves at most by this length plus its motion at twice its speed."""
 _UNKNOWN_TYPE: Final = 32767
 _LIMIT_STEPS: Final = 10
 _COMMANDED_STEPS: Final = 1000
@@ -75,7 +75,7 @@ def check_start(target: Target) -> None:
 
 
 def check_remainders(target: Target) -> None:
-    """In windows of 1.1 steps, the states are always those at the last complete step."""
+    """In windows of 1.1 steps, the states are always the states at the last complete step."""
     probe = target.open()
     step_ns = probe.welcome.step_ns
     window_ns = step_ns + max(step_ns // 10, 1)
@@ -198,7 +198,7 @@ def check_determinism(target: Target) -> None:
 
 
 def check_lifetimes(target: Target) -> None:
-    """An agent has states from when it appears, at its start, until it disappears, if the federate removes agents."""
+    """An agent has states from its appearance at its start until it disappears, if the federate removes agents."""
     appears_steps, disappears_steps = 100, 300
     name = target.hello.agents[0].name
     step_ns = target.hello.step_ns

@@ -40,7 +40,7 @@ class Opener(Protocol):
     """Starts or connects a fresh federate."""
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
-        """Return its session, as `open_session`."""
+        """Return its session, like `open_session`."""
         ...
 
 
@@ -111,7 +111,7 @@ class FederateProbe:
     def request(
         self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
     ) -> Any:  # noqa: ANN401 (of `decode`)
-        """Send a request, and return the decoded answer; errors as `FederateSession.request`."""
+        """Send a request, and return the decoded answer; errors as for `FederateSession.request`."""
         what = kind.name.lower().replace("_", " ")
         return self._session.request(kind, copy, body, answer, decode=decode, what=lambda: what)
 
@@ -221,10 +221,10 @@ class Target:
         return self.hello.role == PHYSICS
 
     def open(self, hello: Hello | None = None) -> FederateProbe:
-        """Return a fresh federate, after the previous one has ended: one that listens may serve one at a time.
+        """Return a fresh federate after the last one has ended: a listening federate may serve one run at a time.
 
         Args:
-            hello: The hello that it receives, if it is not that of the target.
+            hello: The hello that it receives, if it is not the hello of the target.
         """
         self.close()
         self.exchange |= {"request": "hello", "answer": "none"}

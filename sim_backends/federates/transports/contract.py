@@ -112,7 +112,7 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True)
 class HostAndPort:
-    """An address with a port; `SCHEME-listen` is that of the side that listens.
+    """An address with a port; the side that listens has the scheme `SCHEME-listen`.
 
     Attributes:
         scheme: Its scheme, without `-listen`.

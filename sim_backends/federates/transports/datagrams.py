@@ -3,13 +3,12 @@
 A datagram has at most 1,200 bytes: a header of 40 bytes, `FKUD`, `version` u8 (1), `kind` u8, `reserved` u16,
 `connection` u64, `cookie` u64, `number` u64, `expected` u64, then, in data (kind 3), a part of the stream.
 
-- The side that connects draws `connection`, and sends open (1) with `cookie` 0, again after 50 ms and then after
-  twice the time, up to 1 s, until it receives cookie (2), which has the other side's `cookie` for this number and
-  address.
-  All later datagrams have both numbers; others are ignored, also those from other addresses. The side that connects
-  sends the first data.
-- Data are numbered from 0 in each direction, `number` of other kinds is that of the next data. `expected`
-  acknowledges all data before this number. At most 64 are unacknowledged.
+- The side that connects draws `connection`, and sends open (1) with `cookie` 0. It sends open again after 50 ms and
+  then at intervals that double up to 1 s, until it receives cookie (2). That datagram has the `cookie` that the other
+  side has drawn for this number and address. All later datagrams have both numbers. Other datagrams are ignored, also
+  if they come from another address. The side that connects sends the first data.
+- Data are numbered from 0 in each direction. In a datagram of another kind, `number` is the number of the next data.
+  `expected` acknowledges all data before this number. At most 64 are unacknowledged.
 - A side that waits sends an acknowledgement (4) of new data before it waits, and another every 2 s. Unacknowledged
   data are sent again after the time-out of RFC 6298, between 20 ms and 2 s.
 - A side that ends sends one close datagram (5), when all its data are acknowledged or after 0.5 s. The receiver ends
@@ -60,7 +59,8 @@ class DatagramHeader(NamedTuple):
         kind: Its kind.
         connection: Number that the connecting side has drawn.
         cookie: Number that the listening side has drawn for this connection and the address of the connecting side.
-        number: Number of the datagram among those with data; in others, that of the next one with data.
+        number: Number of the datagram, counting only datagrams with data; in a datagram without data, the number of
+            the next datagram with data.
         expected: Number that its sender expects next.
     """
 
@@ -81,7 +81,7 @@ def pack_datagram(header: DatagramHeader, data: bytes | memoryview = b"") -> byt
 
 
 def unpack_datagram(datagram: bytes) -> DatagramHeader | None:
-    """Return the header of a datagram, or None if it is not one of this transport."""
+    """Return the header of a datagram, or None if it is not a datagram of this transport."""
     if len(datagram) < DATAGRAM_HEADER_BYTES:
         return None
     magic, version, kind, _, *numbers = _HEADER.unpack_from(datagram)
@@ -138,7 +138,7 @@ class DatagramChannel:
         self._identity = connection, cookie
         self._number = self._expected = 0
         self._unacknowledged: dict[int, bytes] = {}
-        self._sent_s: dict[int, float] = {}  # without those that were sent again
+        self._sent_s: dict[int, float] = {}  # without datagrams that were sent again
         self._timer = RetransmissionTimer()
         self._resend_s = 0.0
         self._early: dict[int, bytes] = {}
@@ -191,7 +191,7 @@ class DatagramChannel:
         self._socket.close()
 
     def handle(self, datagram: bytes) -> None:
-        """Handle a received datagram; one that does not belong to this connection is ignored."""
+        """Handle a received datagram; a datagram of another connection is ignored."""
         header = unpack_datagram(datagram)
         if header is None or (header.connection, header.cookie) != self._identity:
             return

@@ -130,7 +130,7 @@ class DdsBus:
         return self._writer.matched() > 0 and self._matched_writers() > 0
 
     def close(self) -> None:
-        """Implement `SampleBus.close`, after the last samples have been acknowledged, or after half a second."""
+        """Implement `SampleBus.close`; wait up to half a second until the last samples have been acknowledged."""
         self._writer.drain(0.5)
         _PARTICIPANTS.close(self._address)
 

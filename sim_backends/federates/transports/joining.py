@@ -13,7 +13,7 @@ _JOIN_S: Final = 5.0
 
 
 def accept_federate(address: TransportAddress, expected_token: str, deadline_s: float) -> FrameChannel:
-    """Return the channel of a federate, which begins with `join` and the token; others are closed.
+    """Return the channel of a federate that begins with `join` and the token; other channels are closed.
 
     Args:
         address: Address at which to listen.

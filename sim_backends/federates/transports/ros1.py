@@ -34,7 +34,7 @@ MESSAGE: Final = RosMessageType(
     "MSG: std_msgs/MultiArrayDimension\nstring label\nuint32 size\nuint32 stride\n",
 )
 _MESSAGE_HEAD: Final = struct.Struct("<III")
-"""No dimensions, no offset, and the number of bytes."""
+"""Head of a message: number of dimensions (0), offset (0), and number of bytes."""
 
 
 class Ros1Bus:
@@ -105,7 +105,7 @@ class Ros1Address:
     Attributes:
         name: Its name.
         master: URI of the master.
-        host: Address of this machine for other nodes; empty for the one from which the master is reached.
+        host: Address of this machine for other nodes; empty for the address from which the master is reached.
         listens: See `TransportAddress`.
     """
 

@@ -1,9 +1,9 @@
 """Channels over a bus of samples, a pair of topics of DDS or ROS 1.
 
-The coordinator writes `requests` and reads `answers`, the federate the reverse. A sample is the `run`, a u64 that the
-coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run. DDS: topics
-`fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type `fieldkit::Frame { sequence<octet> data; }` in plain
-CDR, reliable, keep all, volatile. ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type
+The coordinator writes `requests` and reads `answers`; the federate does the reverse. A sample consists of the `run`,
+a u64 that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run. DDS:
+topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type `fieldkit::Frame { sequence<octet> data; }` in
+plain CDR, reliable, keep all, volatile. ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type
 `std_msgs/UInt8MultiArray` without dimensions.
 """
 
@@ -136,7 +136,7 @@ def _is_hello(sample: bytes) -> bool:
 
 
 class SampleListener:
-    """Accepts runs in the order of their `hello`; one that comes during another run waits.
+    """Accepts runs in the order of their `hello`; a `hello` that arrives during another run waits.
 
     Args:
         bus: The bus.

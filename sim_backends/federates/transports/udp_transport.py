@@ -32,8 +32,8 @@ _MAX_RETRY_S: Final = 1.0
 class UdpListener:
     """Accepts connections.
 
-    The socket of a connection is the one that listened, so that its other side always has the same port; the next
-    call of `accept` opens another one. While a connection exists, other programs are refused and try again.
+    A connection keeps the socket that listened, so that the other side always uses the same port. The next call of
+    `accept` opens another socket. While a connection exists, other programs are refused and try again.
 
     Args:
         address: The address.

@@ -83,10 +83,10 @@ class TcprosLink:
         self._silence_timer = WireTimer(wire, flow.subscriber, self._probe)
 
     def accept(self) -> None:
-        """Do nothing, at the publisher, which has sent its address to the subscriber."""
+        """Do nothing; the publisher has sent its address to the subscriber."""
 
     def connect(self) -> None:
-        """Open a connection, at the subscriber, which has received the publisher's address."""
+        """Open a connection from the subscriber, which has received the publisher's address."""
         self._connection_count += 1
         connection = self._subscriber_connection = self._connection_count
         self._reset_silence_timer()
@@ -96,7 +96,7 @@ class TcprosLink:
         self._streams.send(upstream, f"{self._name} {connection}", size_bytes, accept, reconnect)
 
     def publish(self, packet: Packet) -> None:
-        """Send a message, at the publisher."""
+        """Send a message from the publisher."""
         if not self._publisher_connection:
             self._wire.drop(packet.packet_id, NOT_CONNECTED)
             return
@@ -119,21 +119,21 @@ class TcprosLink:
         """Ignore the loss of a probe."""
 
     def _accept(self, connection: int) -> None:
-        """Process the subscriber's header, at the publisher, and send the publisher's header."""
+        """Process the subscriber's header at the publisher, and send the publisher's header."""
         if connection < self._publisher_connection:
-            return  # The subscriber has opened another connection since.
+            return  # The subscriber has since opened another connection.
         self._publisher_connection = connection
         size_bytes = LENGTH_BYTES + self._flow.header_bytes
         self._send(connection, size_bytes, partial(self._open, connection), partial(self._close, connection))
 
     def _open(self, connection: int) -> None:
-        """Process the publisher's header, at the subscriber."""
+        """Process the publisher's header at the subscriber."""
         if connection == self._subscriber_connection:
             self._retry_ns = self._options.reconnect.first_ns
             self._reset_silence_timer()
 
     def _reconnect_later(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
-        """Give up the connection and open another one later, at the subscriber, unless that has been done."""
+        """Give up the connection at the subscriber and open another one later, unless this has been done."""
         if connection != self._subscriber_connection:
             return
         self._subscriber_connection = 0
@@ -142,7 +142,7 @@ class TcprosLink:
         self._wire.at(self._wire.now_ns + retry_ns, self._flow.subscriber, self.connect)
 
     def _close(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
-        """Close a connection, at the publisher, whose TCP has given it up."""
+        """Close a connection at the publisher after its TCP has given up the connection."""
         if connection == self._publisher_connection:
             self._publisher_connection = 0
 
@@ -151,7 +151,7 @@ class TcprosLink:
         self._close(connection, reason)
 
     def _arrive(self, connection: int, packet_id: int) -> None:
-        """Deliver a message, at the subscriber."""
+        """Deliver a message to the subscriber."""
         if connection == self._subscriber_connection:
             self._wire.deliver(packet_id)
             self._reset_silence_timer()
@@ -163,7 +163,7 @@ class TcprosLink:
         self._silence_timer.set(self._wire.now_ns + self._options.silence_ns)
 
     def _probe(self) -> None:
-        """Probe the connection, at the subscriber, or give it up."""
+        """Probe the connection from the subscriber, or give it up."""
         if self._unanswered_probes == self._options.probes:
             self._reconnect_later(self._subscriber_connection, "")
             return
@@ -213,14 +213,14 @@ class UdprosLink:
         self.connected = False
 
     def connect(self) -> None:
-        """Do nothing, at the subscriber, which has sent its address to the publisher."""
+        """Do nothing; the subscriber has sent its address to the publisher."""
 
     def accept(self) -> None:
-        """Add the subscriber, at the publisher."""
+        """Add the subscriber at the publisher."""
         self.connected = True
 
     def publish(self, packet: Packet) -> None:
-        """Send a message, at the publisher."""
+        """Send a message from the publisher."""
         if not self.connected:
             self._wire.drop(packet.packet_id, NOT_CONNECTED)
             return
@@ -238,7 +238,7 @@ class UdprosLink:
             self._wire.transmit(IpPacket(source, destination, TRANSPORT, size_bytes, identity, block))
 
     def receive(self, packet: IpPacket) -> None:
-        """Process a datagram, at the subscriber."""
+        """Process a datagram at the subscriber."""
         block: Block = packet.body
         if block.index == 0 and block.packet_id != self._current:
             self._current, self._next = block.packet_id, 0

@@ -1,7 +1,7 @@
-"""Flows and options of ROS 1, with the sizes and times of the original.
+"""Flows and options of ROS 1, with the sizes and times of the ROS 1 libraries.
 
-Sizes are those of rospy and rosmaster 1.15.15 for a `sensor_msgs/LaserScan` on `/scan`, captured between `/talker`
-and `/listener`: HTTP with its headers for calls, and connection headers with the definition of the type.
+Sizes were captured with rospy and rosmaster 1.15.15 for a `sensor_msgs/LaserScan` on `/scan` between `/talker` and
+`/listener`. Calls include the HTTP headers; connection headers include the definition of the type.
 """
 
 from collections.abc import Mapping
@@ -18,13 +18,13 @@ REGISTER_PUBLISHER_BYTES: Final = 513
 PUBLISHER_REGISTERED_BYTES: Final = 425
 REGISTER_SUBSCRIBER_BYTES: Final = 516
 SUBSCRIBER_REGISTERED_BYTES: Final = 402
-"""Without a publisher; the captured response contained one."""
+"""Size without the address of a publisher, which the captured response contained."""
 PUBLISHER_UPDATE_BYTES: Final = 425
-"""Without a publisher, as captured."""
+"""Size without the address of a publisher, as captured."""
 PUBLISHER_UPDATED_BYTES: Final = 364
 GET_KEEPALIVE_BYTES: Final = 370
 KEEPALIVE_BYTES: Final = 402
-"""A call of `getParam`, and its response that the parameter does not exist."""
+"""Sizes of a call of `getParam`, and of the response that the parameter does not exist."""
 PUBLISHER_BYTES: Final = 56
 """Size of a publisher's address in the response to a subscriber and in a publisher update."""
 REQUEST_TOPIC_BYTES: Final = 508

@@ -24,9 +24,9 @@ class Ros1:
 
     An agent keeps its connection to the master, as rospy does, while each request to a publisher has a separate
     connection. Between hosts with the delay d, and an open connection to the master, the time from registration to
-    first message is 12 d: 2 for the response of the master, 4 for that of the publisher, 2 for the keep-alive query,
-    4 for connection and headers. This is the time of rospy 1.15.15 for messages that fill a segment or subscribers
-    that request `tcp_nodelay`; smaller messages wait for an ACK (Nagle), which takes 2 d more.
+    first message is 12 d: 2 for the response of the master, 4 for the response of the publisher, 2 for the keep-alive
+    query, 4 for connection and headers. This is the time of rospy 1.15.15 for messages that fill a segment or
+    subscribers that request `tcp_nodelay`; smaller messages wait for an ACK (Nagle), which takes 2 d more.
 
     Every flow is registered separately, as a topic with one publisher and one subscriber. Other traffic of nodes
     (other parameters, services, `/rosout`) is not modelled.
@@ -35,7 +35,7 @@ class Ros1:
         wire: The network below.
         flows: All flows of the scenario that use ROS 1, by name.
         master: The agent on which the master runs.
-        options: Options of nodes and their TCP; None for those of ROS.
+        options: Options of nodes and their TCP; None for the defaults of ROS.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Ros1:
         self._calls.call(subscriber, self._master, sizes.REGISTER_SUBSCRIBER_BYTES, serve, self._options.register)
 
     def _update(self, name: str) -> None:
-        """Send the publisher's address to a subscriber, at the master."""
+        """Send the publisher's address from the master to a subscriber."""
 
         def serve() -> CallResponse:
             self._request_topic(name)
@@ -123,7 +123,7 @@ class Ros1:
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
 
     def _request_topic(self, name: str) -> None:
-        """Request the connection parameters from a publisher, at the subscriber, unless this has been done."""
+        """Send the request for connection parameters from the subscriber to a publisher, unless already done."""
         if name in self._topic_requested:
             return
         self._topic_requested.add(name)
@@ -141,7 +141,7 @@ class Ros1:
         self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, request, topic=name)
 
     def _connect(self, name: str) -> None:
-        """Open a connection, at a subscriber; before the first one, query the master for the keep-alive setting."""
+        """Open a connection from a subscriber; before the first one, query the master for the keep-alive setting."""
         subscriber, link = self._flows[name].subscriber, self._links[name]
         if subscriber in self._has_keepalive:
             link.connect()

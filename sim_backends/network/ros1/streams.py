@@ -1,4 +1,4 @@
-"""Messages of ROS 1 over TCP, a transport on top of another transport; and calls by XML-RPC.
+"""Messages of ROS 1 over TCP (a transport on top of another transport), and calls by XML-RPC.
 
 Calls between nodes and their master are requests and responses over TCP, with retries.
 """
@@ -19,7 +19,8 @@ Lost = Callable[[str], None]
 class TcpStreams:
     """Carries messages over TCP connections, and reports delivery and loss to the ends by callbacks.
 
-    It is the `Wire` of its TCP; on the wire below, segments are packets of the transport to which it belongs.
+    It is the `Wire` of its TCP. On the wire below, segments are packets of the transport to which this object
+    belongs.
 
     Args:
         wire: The network below.
@@ -164,7 +165,7 @@ class RemoteCalls:
             serve: Executes the call at the callee and returns the response; a call that is repeated may be executed
                 twice.
             retry: Times of retries; None for no retry.
-            topic: Topic of the call if it has a separate connection, else empty.
+            topic: Topic of the call if it has a separate connection, otherwise empty.
         """
         connection = f"xmlrpc {caller} {callee} {topic}".rstrip()
 

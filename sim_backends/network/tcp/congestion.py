@@ -1,6 +1,7 @@
 """The congestion window: slow start and congestion avoidance of RFC 5681, and CUBIC (RFC 9438).
 
-CUBIC uses integer bytes and nanoseconds, so that results are equal on every machine. For Linux's see `linux_cubic`.
+CUBIC uses integer bytes and nanoseconds, so that results are equal on every machine. The CUBIC of Linux is in
+`linux_cubic`.
 """
 
 from typing import ClassVar, Final
@@ -60,7 +61,7 @@ class NewReno:
         self._credit = 0
 
     def on_timeout(self, flight_bytes: int, *, again: bool) -> None:
-        """Reduce the window after a timeout (RFC 5681, 3.1); `again` means without progress since the last one."""
+        """Reduce the window after a timeout (RFC 5681, 3.1); `again` is True without progress since the last one."""
         if not again:
             self.threshold_bytes = self._reduced_threshold(flight_bytes)
         self.window_bytes = self._segment_bytes
@@ -190,7 +191,7 @@ class Cubic(NewReno):
             self._cwnd_prior_bytes = window_bytes
 
     def _avoid_congestion(self, now_ns: int, acked_bytes: int, round_trip_ns: int) -> None:
-        """Increase the window by the cubic function, or like Reno if that is more (RFC 9438, 4.2 to 4.5)."""
+        """Increase the window by the cubic function, or like Reno if this is larger (RFC 9438, 4.2 to 4.5)."""
         if self._epoch_ns is None:
             self._start_epoch(now_ns)
             assert self._epoch_ns is not None

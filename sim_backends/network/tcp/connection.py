@@ -7,7 +7,7 @@ is given up, undelivered messages are dropped; the next message opens another co
 Standards: RFC 9293 with 2018, 3042, 5681, 6298, 6582, 6675, 6928, 6937, 7323, 8985 and 9438. The default is the TCP
 of Linux without tail loss probes (RFC 8985, 7), undo after a spurious timeout (RFC 5682), HyStart (RFC 9406),
 duplicate SACKs (RFC 2883), ECN, pacing, full send buffers, keep-alive, and closing. A receiver does not retransmit
-its SYN-ACK: the sender retransmits its SYN. Windows count bytes; those of Linux's CUBIC are whole segments.
+its SYN-ACK: the sender retransmits its SYN. Windows count bytes; the windows of Linux's CUBIC are whole segments.
 """
 
 from collections.abc import Callable
@@ -144,8 +144,8 @@ class TcpConnection:
         self._transmit(name.destination, name.source, "syn-ack" if segment.syn else "ack", segment)
 
     def _transmit(self, source: str, destination: str, kind: str, segment: Segment) -> None:
-        # Random numbers are derived from the number of earlier transmissions, so that each has others. An ACK is
-        # identified by the segment that it acknowledges.
+        # Random numbers are derived from the number of earlier transmissions, so that they differ between
+        # transmissions. An ACK is identified by the segment that it acknowledges.
         stream = f"{self._name.flow} {self._name.number} {kind} {segment.earlier_transmissions}"
         identity = stream, segment.number
         body = self._name, segment

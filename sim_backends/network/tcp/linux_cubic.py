@@ -1,4 +1,4 @@
-"""Linux's CUBIC (`net/ipv4/tcp_cubic.c`, Linux 4.x to 6.x), which robots run.
+"""The CUBIC of Linux (`net/ipv4/tcp_cubic.c`, Linux 4.x to 6.x), which robots use.
 
 It differs from RFC 9438 (`congestion.Cubic`) in three ways that matter on lossy links. Its estimate of Reno's window
 grows by at most 8/15 of a segment per round trip. Windows are whole segments. The growth rate is updated only when

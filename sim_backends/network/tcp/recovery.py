@@ -79,9 +79,9 @@ class RackScoreboard(Scoreboard):
         self._transmissions.append((segment, segment.transmissions))
 
     def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:
-        """Mark segments as lost that were sent before one that arrived, and more than the time limit ago.
+        """Mark segments as lost that were sent before an arrived segment and longer ago than the time limit.
 
-        The limit is a round trip and the reordering window.
+        The limit is the sum of a round trip and the reordering window.
         """
         limit_ns = self._round_trip_ns + self._reordering_window_ns(recovering=recovering)
         transmissions, undecided, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None

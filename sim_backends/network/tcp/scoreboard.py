@@ -1,4 +1,4 @@
-"""Sent segments that are not acknowledged: those that arrived (by SACK), those lost, those in flight (RFC 6675)."""
+"""Sent segments that are not acknowledged: segments that arrived (by SACK), are lost, or are in flight (RFC 6675)."""
 
 import heapq
 from bisect import bisect_left
@@ -120,7 +120,8 @@ class Scoreboard:
             recovering: True if a recovery is in progress.
 
         Returns:
-            The time to call this again if no ACK arrives before; None if only an ACK can show a further loss.
+            The time at which to call this method again if no ACK arrives before; None if only an ACK can show a
+            further loss.
         """
         if len(self._latest_sacked) == DUPLICATE_THRESHOLD:
             self._mark_overtaken_lost(self._latest_sacked[0])
@@ -135,7 +136,7 @@ class Scoreboard:
         self._examined = self._removed_count + len(self._sent)
 
     def next_lost(self) -> SentSegment | None:
-        """Return the first lost segment that was not sent again since, or None."""
+        """Return the first lost segment that has not been retransmitted since its loss, or None."""
         waiting = self._to_resend
         while waiting and (waiting[0].arrived or not waiting[0].lost or waiting[0].copies):
             waiting.popleft()

@@ -79,7 +79,7 @@ class Segment:
         first: Sequence number of its first byte.
         length: Number of data bytes.
         acknowledges: Acknowledgement number; None only in the first SYN.
-        sacks: Ranges beyond it that its sender has received, most recent first.
+        sacks: Ranges beyond that number that the sender of the segment has received, most recent first.
         window_bytes: Receive window of its sender, after scaling.
         sent_ns: Transmission time: the timestamp's value (TSval).
         echoes_ns: The echoed timestamp (TSecr); None in the first SYN.

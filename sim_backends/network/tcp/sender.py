@@ -105,7 +105,7 @@ class Sender:
             self._on_ack(segment)
 
     def close(self) -> None:
-        """Stop sending and all timers."""
+        """Stop sending, and stop all timers."""
         self._open = False
         self._timer.stop()
         self._reordering_timer.stop()
@@ -115,7 +115,7 @@ class Sender:
         self._timer.set(self._wire.now_ns + self.round_trips.timeout_ns)
 
     def _on_syn_ack(self, segment: Segment) -> None:
-        """Process a SYN-ACK; a repeated one is only acknowledged again."""
+        """Process a SYN-ACK; a repeated SYN-ACK is only acknowledged again."""
         if not self._open:
             self._open = True
             self._timer.stop()

@@ -1,4 +1,4 @@
-"""Options of TCP; the defaults are those of Linux."""
+"""Options of TCP, with the defaults of Linux."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -34,8 +34,8 @@ class TcpOptions:
         retries: Maximum number of consecutive retransmission timeouts without progress before the connection is given
             up (Linux: tcp_retries2).
         delayed_ack_ns: Maximum delay of an ACK by the receiver (Linux: 40 ms).
-        segments_per_ack: Number of received segments after which an ACK is sent immediately (RFC 5681, 4.2); 1 delays
-            no ACK.
+        segments_per_ack: Number of received segments after which an ACK is sent immediately (RFC 5681, 4.2); with 1,
+            no ACK is delayed.
         nagle: If True, a small segment waits while others are in flight (RFC 896). DDS over TCP disables it by
             TCP_NODELAY; TCPROS does so only if the subscriber requests it, which is assumed here.
         restart_after_idle: If True, the window is reset to the initial window after an idle period (RFC 5681, 4.1).
@@ -43,7 +43,7 @@ class TcpOptions:
             acknowledged bytes, as in Linux. RFC 5681 has 1, RFC 3465 up to 2.
 
     Raises:
-        ConfigurationError: With one of the values no connection can work.
+        ConfigurationError: No connection can work with one of the values.
     """
 
     mtu_bytes: int = 1500

@@ -3,11 +3,11 @@
 No master is needed. A participant announces itself by multicast. A participant that receives an announcement for the
 first time responds by unicast, and sends its publications and subscriptions over reliable built-in topics. CycloneDDS
 packs the data of these topics for one participant into one message; here they are one flow, with heartbeats and
-acknowledgements for all topics in each message. If nothing is received from a participant for a lease, it is removed
-with all its endpoints, and may be discovered again. Times are those of CycloneDDS (`ddsi_spdp_schedule.c`,
-`ddsi_discovery_spdp.c`); sizes were measured on version 11.0.1 from PyPI. Its participants respond to a new
-participant immediately and three more times at intervals of a second; no random delay separates the responses of
-different participants (`SPDPResponseMaxDelay` is 0 ms). The traffic of n participants grows with n^2.
+acknowledgements for all topics in each message. If nothing is received from a participant for the duration of a
+lease, it is removed with all its endpoints, and may be discovered again. Times are taken from CycloneDDS
+(`ddsi_spdp_schedule.c`, `ddsi_discovery_spdp.c`); sizes were measured on version 11.0.1 from PyPI. Its participants
+respond to a new participant immediately and three more times at intervals of a second; no random delay separates the
+responses of different participants (`SPDPResponseMaxDelay` is 0 ms). The traffic of n participants grows with n^2.
 """
 
 from collections.abc import Mapping
@@ -77,7 +77,7 @@ class SharedHeartbeats:
 
 @dataclass(slots=True)
 class _Remote:
-    """State of a remote participant at a participant.
+    """State of a remote participant, as one participant records it.
 
     Attributes:
         lease: Fires when the lease may have expired.
@@ -265,7 +265,7 @@ class TopicDiscovery:
 
 
 def _ignore_loss(sample: Sample, reason: str) -> None:
-    """Ignore the loss of a sample of the discovery, which no statistics include."""
+    """Ignore the loss of a sample of the discovery; no statistics include it."""
 
 
 def _endpoint_bytes(flow: TopicFlow, *, writer: bool) -> int:

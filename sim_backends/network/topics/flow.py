@@ -1,7 +1,7 @@
 """A flow of publish-subscribe: a writer, its reader, and the record of the result of each sample.
 
-The two ends exchange information only by messages. The record uses both: a sample will never arrive if its writer has
-given it up, no message with a part of it is in flight, and its reader does not hold it.
+The two ends exchange information only by messages. The record uses the state of both ends: a sample will never arrive
+if its writer has given it up, no message with a part of it is in flight, and its reader does not hold it.
 """
 
 from collections.abc import Callable

@@ -62,13 +62,13 @@ class WriterHistory:
         return samples
 
     def on_resend(self) -> None:
-        """Reduce the high watermark for a retransmission, once until all samples are acknowledged."""
+        """Reduce the high watermark for a retransmission, but only once until all samples are acknowledged."""
         if not self._resending:
             self._resending = True
             self._high_bytes = max(8 * self._high_bytes // 10, self._low_bytes)
 
     def admits(self, now_ns: int) -> bool:
-        """Return True if a writer may write now; raise the high watermark if it prevents that."""
+        """Return True if a writer may write now; raise the high watermark if it prevents writing."""
         if self._depth is not None or self.unacknowledged_bytes <= self._high_bytes:
             return True
         headroom_bytes = self._max_high_bytes - self._high_bytes

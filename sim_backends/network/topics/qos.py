@@ -11,7 +11,7 @@ SECOND: Final = 1000 * MS
 
 @dataclass(frozen=True, slots=True)
 class Qos:
-    """Quality of service of a flow; durability is always volatile. The defaults are those of ROS 2.
+    """Quality of service of a flow; durability is always volatile. The defaults are the same as in ROS 2.
 
     Attributes:
         reliability: `reliable`, or `best_effort`.
@@ -52,7 +52,7 @@ class TopicFlow:
     Attributes:
         publisher: Agent with the writer.
         subscriber: Agent with the reader.
-        qos: Quality of service of both.
+        qos: Quality of service of writer and reader.
         topic: Name of the topic in ROS; its length affects the size of discovery messages.
         type_name: DDS name of its type; its length also affects their size.
     """

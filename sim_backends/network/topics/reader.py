@@ -1,8 +1,8 @@
 """The reader of a flow: reassembles and orders samples, and requests missing ones from its writer.
 
-The times at which it responds, and at which it is silent so that data in flight is not requested twice, are those of
-CycloneDDS (`ddsi_acknack.c`, `ddsi_receive.c`): it responds to heartbeats immediately; it requests new data
-immediately, and the same data again after a delay, or when the writer has reported what it sent.
+The reader responds at the same times as CycloneDDS (`ddsi_acknack.c`, `ddsi_receive.c`), and it is also silent at the
+same times, so that data in flight is not requested twice. It responds to heartbeats immediately. It requests new data
+immediately, and the same data again after a delay or when the writer has reported what it sent.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,8 @@ class _Response:
     """The response that a reader may send now.
 
     Attributes:
-        kind: Kind of response; silent ones are not sent; a suppressed one acknowledges without requesting data.
+        kind: Kind of response; a silent response is not sent; a suppressed response acknowledges without requesting
+            data.
         numbers: Requested samples.
         missing_fragments: Requested fragments of the sample after them.
         is_timed_repeat: True if it is a request only because enough time has passed since the same request.
@@ -155,7 +156,7 @@ class TopicReader:
         self._complete[number] = data.sample
         data.sample.held = True
         if not self._reliable:
-            # Samples that were overtaken are not expected any more, and are discarded if they arrive.
+            # Samples that were overtaken are no longer expected, and are discarded if they arrive.
             self._skip(self._next, number)
         self._deliver_in_order()
 
@@ -268,7 +269,7 @@ class TopicReader:
         age_ns = self._wire.now_ns - self._matched_ns
         factor = next((factor for until_ns, factor in _INITIAL_BACKOFF if age_ns <= until_ns), 10)
         self._response_timer.bring_forward(self._wire.now_ns + factor * self._timing.first_acknack_repeat_ns)
-        # CycloneDDS sends the count 0, for which its writers have an exception; a normal count needs none.
+        # CycloneDDS sends the count 0, for which its writers have an exception; a normal count needs no exception.
         acknack = AckNack(self._next, (), self._next_count(), final=False)
         self._transmit((acknack,), ("acknack", self._response_count))
 

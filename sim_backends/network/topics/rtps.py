@@ -1,6 +1,6 @@
 """Messages of RTPS and their sizes (OMG DDSI-RTPS 2.5, clause 9.4), as far as they are used here.
 
-A message is a header and submessages. Message sizes include the headers of IP and UDP.
+A message consists of a header and submessages. Message sizes include the headers of IP and UDP.
 """
 
 from dataclasses import dataclass, field
@@ -31,7 +31,7 @@ class Sample:
         number: Its sequence number at its writer; 0 until it is sent.
         times_sent: Number of transmissions of each fragment.
         in_flight: Number of messages with a part of it that have neither arrived nor been lost.
-        held: True if its reader has it complete, possibly waiting for an earlier one.
+        held: True if its reader has received all of it, even if it cannot be delivered before an earlier sample.
         given_up: Reason why its writer will not send it again; empty while the writer may send it.
         settled: True if it was delivered or dropped.
         endpoint_flow: For a sample of the discovery, the flow whose endpoint it describes.
@@ -106,7 +106,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class AckNack:
-    """ACKNACK: the samples that a reader has, and those that it lacks (8.3.8.1).
+    """ACKNACK: the samples that a reader has, and the samples that it lacks (8.3.8.1).
 
     Attributes:
         base: It has all samples before this one.

@@ -17,10 +17,10 @@ _DISCOVERY: Final = DiscoveryTiming()
 class Topics:
     """The transport of packets on topics: each flow has its own writer and reader.
 
-    A subscriber receives data by unicast, like in CycloneDDS if multicast is restricted to discovery
-    (`AllowMulticast: spdp`); this is recommended for Wi-Fi, where multicast has no link-layer acknowledgement. A
-    program continues while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so
-    that its own history is never full.
+    A subscriber receives data by unicast, as in CycloneDDS if multicast is restricted to discovery (`AllowMulticast:
+    spdp`); this is recommended for Wi-Fi, where multicast has no link-layer acknowledgement. A program continues
+    while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so that its own
+    history is never full.
 
     Not modelled: durability other than volatile, HEARTBEAT_FRAG, which is optional, and the topics that ROS 2 adds to
     every node.
@@ -29,7 +29,7 @@ class Topics:
         wire: The network below.
         flows: All flows of the scenario that use topics, by name.
         discovery: Times of the discovery; None matches all endpoints from the start, without any traffic.
-        timing: Times of the protocol; None for CycloneDDS's.
+        timing: Times of the protocol; None for the times of CycloneDDS.
     """
 
     def __init__(

@@ -2,8 +2,8 @@
 
 It behaves like CycloneDDS (`ddsi_transmit.c`, `ddsi_hbcontrol.c`, `ddsi_receive.c`), which implements DDSI-RTPS 2.5,
 clauses 8.4.7 to 8.4.9. After every sample there is a heartbeat in the same message, which requires a response only if
-the previous sample was sent long ago. Separate heartbeats are sent while samples are unacknowledged, at growing
-intervals if the reader does not respond, and one after each retransmission.
+the previous sample was sent long ago. Separate heartbeats are sent while samples are unacknowledged; their intervals
+grow if the reader does not respond. One heartbeat is sent after each retransmission.
 """
 
 from collections.abc import Callable, Iterable
@@ -36,12 +36,12 @@ class TopicWriter:
         flow: Publisher, subscriber and quality of service.
         timing: Times of the protocol.
         transmit: Sends a message to the reader.
-        give_up: Called with a sample that will not be sent, or not again, and the reason.
+        give_up: Called with a sample that will not be sent or will not be retransmitted, and the reason.
 
     Attributes:
         on_reader_start: Called when its reader starts, or starts again.
-        share_heartbeat: Called with separate heartbeats at whole periods, to send them with those of other writers;
-            None sends them directly.
+        share_heartbeat: Called with separate heartbeats at whole periods, to send them together with heartbeats of
+            other writers; None sends them directly.
     """
 
     def __init__(
