@@ -24,8 +24,8 @@ from sim_backends.world.world import World
 STEP_M: Final = 0.1
 """Distance that a robot may move between two updates of the medium.
 
-Loss grows by 10 n / (ln 10 d) dB per metre, with n = 3 by 1.3 dB/m at 10 m: a step is 0.13 dB there. Fading, which
-changes within a wavelength of 0.12 m, continues between the updates.
+The loss grows by 10 n / (ln 10 d) dB per metre: at 10 m with n = 3 by 1.3 dB/m, so a step changes it by 0.13 dB.
+Fading, which changes within a wavelength of 0.12 m, continues between the updates.
 """
 
 _MIN_PERIOD_S: Final = 0.02

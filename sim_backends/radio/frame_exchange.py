@@ -39,7 +39,7 @@ from sim_backends.radio.reception import Reception
 from sim_backends.radio.rts_cts import NO_RTS_BYTES, ProtectedFrame, RtsCts
 from sim_backends.radio.stations import Peer, Station
 
-# 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
+# ACK timeout after SIFS: 10.3.2.11, one slot and aRxPHYStartDelay, which is 20 us in table 17-21.
 _ACK_TIMEOUT_AFTER_SIFS_NS: Final = SLOT_NS + 20_000
 
 # Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.random import Philox  # numpy would import it at the first draw, and delay a packet
+from numpy.random import Philox  # otherwise numpy imports it at the first draw, which delays a packet
 from numpy.typing import NDArray
 
 # Most streams are used for a few draws only: there is one per flow, attempt and purpose.

@@ -72,7 +72,7 @@ class Station(Generic[Payload]):
         self.exchange_id = self.offered = 0
 
     def use_categories(self, mapping: DscpMapping, band: Band) -> None:
-        """Replace the queue and the contention by those of the access categories."""
+        """Use the queues and the contention of the access categories instead of the single queue."""
         self.contention = self.categories = AccessCategories(mapping, band, self._backoff)
         self.queue = self.categories.active.frames
 

@@ -90,7 +90,8 @@ class Failsafes(Protocol):
 class ArduCopterFailsafes:
     """Battery and ground-station failsafes of ArduCopter.
 
-    A triggered battery failsafe lasts until the next boot, one of the ground station until a heartbeat arrives.
+    A triggered battery failsafe lasts until the next boot. A triggered ground-station failsafe lasts until a
+    heartbeat arrives.
 
     Args:
         parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.

@@ -109,7 +109,7 @@ def read(datagram: bytes) -> Iterator[Message]:
 
 
 def target_of(message: Message) -> tuple[int, int]:
-    """Return target system and component of a message; 0 is a broadcast, as is a message without these fields."""
+    """Return the target system and component of a message; both are 0 (broadcast) if it has no such fields."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 

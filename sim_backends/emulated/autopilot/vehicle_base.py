@@ -32,7 +32,7 @@ class VehicleBase:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
-        make_airframe: Puts it at a place; None for the airframe that the autopilot itself moves.
+        make_airframe: Creates the airframe at a place; None for an airframe that the autopilot itself moves.
 
     Attributes:
         body: Position and motion, relative to home.

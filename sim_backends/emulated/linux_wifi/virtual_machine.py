@@ -66,7 +66,7 @@ _INSTRUCTION_CLOCK: Final = "fieldkit.clock=instructions"
 _EMULATED_PROCESSOR: Final = "Nehalem"
 """The first processor with all instructions that numpy needs. Later ones, for example with AVX2, are slower."""
 _NS_PER_INSTRUCTION_EXPONENT: Final = 1
-"""An emulated instruction needs 2^1 ns: 500 million instructions per second, as of a slow processor."""
+"""An emulated instruction takes 2^1 ns: 500 million instructions per second, like a slow processor."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class JobResult:
 
 
 def kernel_roots() -> tuple[Path, ...]:
-    """Return the folders with `boot/`, `lib/modules/` and programs: that of `ROOT_VARIABLE`, and `/`."""
+    """Return the folders with `boot/`, `lib/modules/` and programs: the folder in `ROOT_VARIABLE`, and `/`."""
     extracted = os.environ.get(ROOT_VARIABLE)
     return (Path(extracted).absolute(), Path("/")) if extracted else (Path("/"),)
 
@@ -334,7 +334,7 @@ def _channel_options(descriptors: Sequence[int]) -> Iterator[str]:
 
 
 def clock_counts_instructions() -> bool:
-    """Return True if this process runs in a machine without KVM: times on its clock are no durations."""
+    """Return True if this process runs in a machine without KVM, whose clock does not measure real durations."""
     return _INSTRUCTION_CLOCK in Path("/proc/cmdline").read_text(encoding="ascii", errors="replace").split()
 
 

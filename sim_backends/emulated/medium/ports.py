@@ -163,7 +163,7 @@ def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
 
 
 def rounded_up(late_ns: int) -> int:
-    """Return the smallest number above `late_ns` with only its first four bits set: at most 1/8 more."""
+    """Return the smallest number above `late_ns` with at most 4 significant bits; it is at most 1/8 larger."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
 

@@ -44,7 +44,7 @@ Values = Mapping[str, bytes]
 
 
 def definition_of(kind: str, text: str) -> Definition:
-    """Return the definition that a publisher of the type `package/Name` announces; if ROS has none it is `text`.
+    """Return the definition that a publisher of the type `package/Name` announces; `text` if ROS has no definition.
 
     Errors as `template_of`, which first rejects types without a definition.
     """
