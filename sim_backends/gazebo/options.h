@@ -61,7 +61,7 @@ struct Options
                       error.what());
     }
 
-    // The name of a topic or service, of a pattern with `{world}` and `{model}`.
+    // The name of a topic or service, from a pattern with `{world}` and `{model}`.
     std::string Name(std::string pattern, const std::string& model = "") const
     {
         for (const auto& [key, value] : {std::pair<std::string, std::string>{"{world}", world}, {"{model}", model}})

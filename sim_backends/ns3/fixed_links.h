@@ -1,5 +1,5 @@
-// Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of sim_backends/radio/fixed_links.py under
-// the IP of ns-3, with equal random draws for equal packets.
+// Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of sim_backends/radio/fixed_links.py
+// below ns-3's IP layer, with the same random draws for the same packets.
 
 #ifndef FIELDKIT_FIXED_LINKS_H
 #define FIELDKIT_FIXED_LINKS_H
@@ -130,7 +130,7 @@ class FixedLinks : public SimpleChannel
         uint16_t protocol = 0;
         Mac48Address destination, source;
         size_t from = 0, to = 0;
-        std::vector<size_t> receivers; // stations that it is for, beyond the relay too
+        std::vector<size_t> receivers; // its final receivers, including those behind the relay
         PacketIdentity identity;
         DelayParts parts;
     };
