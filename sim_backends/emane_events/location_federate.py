@@ -35,7 +35,7 @@ class EmaneLocations:
     simulated.
 
     Args:
-        hello: The run; the options of its configuration are those of `EmaneOptions`.
+        hello: The run; its configuration has the options of `EmaneOptions`.
 
     Attributes:
         step_ns: See `PhysicsFederate`.

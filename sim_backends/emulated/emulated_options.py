@@ -53,7 +53,7 @@ class RobotOptions(Strict):
     ping: Ping | None = None
 
     def programs(self) -> set[str]:
-        """Return the programs that this machine must have for these variants, beyond those of every emulated lab."""
+        """Return the programs that this machine must have for these variants, besides those that every lab needs."""
         programs = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
         if self.netcat is not None:
             programs.add(NETCATS[self.netcat])

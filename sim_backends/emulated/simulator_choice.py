@@ -117,7 +117,7 @@ def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
 def _body(profile: RobotProfile) -> RobotBody:
     """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base.
 
-    The limits of a drone are those of its airframe: its autopilot keeps those of the profile.
+    A drone has the limits of its airframe, because its autopilot enforces the limits of the profile.
     """
     if mavlink_of(profile) is not None:
         return RobotBody(profile.name, quadrotor(profile.name))

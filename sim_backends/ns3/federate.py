@@ -39,7 +39,7 @@ def program(ns3_version: str) -> CompiledProgram:
         packages=("ns3-core", "ns3-wifi", "nlohmann_json"),
         install="apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev",
         flags=("-O2", standard_flag(ns3_version)),
-        # pkg-config also lists libgsl, which Debian's libns3-dev does not install, and which ns-3 itself links.
+        # pkg-config also lists libgsl. Debian's libns3-dev does not install it, and ns-3 itself links it.
         libraries=tuple(f"-lns3-{module}" for module in _MODULES),
         duration="about 20 s",
     )

@@ -342,7 +342,7 @@ class FrameExchange(Generic[Payload]):
         acknowledged: bool,
         is_sent: bool = True,
     ) -> None:
-        """End an attempt; `is_sent` is False if there was no CTS before the data, which says nothing about modes."""
+        """End an attempt; `is_sent` is False if a CTS was missing; the result is then not used for rate control."""
         if not acknowledged:
             if station.categories is None:
                 station.contention.set_busy_until(now_ns)

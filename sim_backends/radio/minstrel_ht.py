@@ -1,13 +1,13 @@
 """Minstrel-HT: the rate control of Linux for radios of 802.11n and later whose driver is a SoftMAC.
 
-The algorithm is that of `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
+The algorithm is from `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
 width, guard interval and number of streams. Each mode has a smoothed share of acknowledged frames, updated every
 50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At most
 every 20 ms a frame tries another mode once before the second mode of the chain.
 
-Three things differ. Rates of 802.11a/b/g are not used. Linux has no groups of 802.11ax; those here follow the same
-rules. A frame is tried up to the retry limit, at the end of its chain in the robust mode; Linux gives up a single
-frame at the end of its chain.
+Three things differ. Rates of 802.11a/b/g are not used. Linux has no groups of 802.11ax; here they follow the same
+rules. After its chain, a frame is tried in the robust mode up to the retry limit; Linux gives up a single frame at
+the end of its chain.
 """
 
 import math
@@ -326,5 +326,5 @@ def _duration_ns(mode: WifiMode) -> int:
 
 
 def _padded(modes: list[WifiMode]) -> tuple[WifiMode, ...]:
-    """Return the mode of each attempt: those of the chain, then its last mode up to the retry limit."""
+    """Return the mode of each attempt: the modes of the chain, then its last mode up to the retry limit."""
     return tuple((modes + modes[-1:] * SHORT_RETRY_LIMIT)[:SHORT_RETRY_LIMIT])

@@ -1,10 +1,10 @@
 """Power save of stations of an access point (IEEE 802.11-2020, 11.2.3), as a delay of the frames to them.
 
 A station dozes when it has sent and received nothing for a time. The access point buffers frames for it until the
-next beacon; the station, which hears every beacon, then wakes. If it sends a frame, which announces that it is awake,
-it gets the buffered ones immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for
-the next DTIM as long as any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every
-beacon is received, and waking takes no time.
+next beacon, which wakes the station. A frame from the station also ends its doze, and the access point then sends the
+buffered frames immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for the next
+DTIM as long as any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every beacon is
+received, and waking takes no time.
 """
 
 from collections.abc import Callable, Mapping, Sequence

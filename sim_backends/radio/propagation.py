@@ -72,7 +72,7 @@ _WAVES: Final = 256
 
 
 class Fading:
-    """Power gains of links by the positions of their ends, with mean 1: Rician with line of sight, else Rayleigh.
+    """Power gains of links by the positions of their ends, with mean 1: Rician with line of sight, Rayleigh without.
 
     A gain is the sum of 12 multipath components (echoes), each with its own directions of departure and arrival, and
     a constant component of K times their power. When an end moves, the phase of each echo changes with the distance

@@ -58,7 +58,7 @@ class RandomStream:
         return uniforms
 
     def _uniforms(self, counter: int, count: int) -> NDArray[np.float64]:
-        # Raw words are used, because numpy guarantees their values across versions, but not those of its
+        # Raw words are used, because numpy guarantees their values across versions, but not the values of its
         # distributions.
         return _uniforms(Philox(key=self._key, counter=counter).random_raw(count))
 

@@ -59,7 +59,7 @@ _SEGMENT_NS: Final = 6_000_000
 _LOW_SHARE, _HIGH_SHARE = 0.1, 0.95
 _SAMPLES: Final = 4
 _STALE_UPDATES: Final = 20
-# A mode of aggregates that fails is evaluated before the end of its interval, as in Linux's minstrel_ht.
+# If frames are aggregated, a failing mode ends the update interval early, as in Linux's minstrel_ht.
 _FAILING_ATTEMPTS, _FAILING_SHARE = 30, 0.2
 
 
@@ -76,7 +76,7 @@ class Minstrel(RateControl):
     This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of mac80211's minstrel.
 
     Three things differ. The initial shares are computed from the signal-to-noise ratio, like in drivers that start
-    from RSSI. The frames that sample, and the sampled modes, are drawn per frame and not counted, so that an
+    from RSSI. A random draw per frame, and not a counter, selects sampling frames and their modes, so that an
     additional frame does not change the results of others. The same algorithm selects modes of 802.11n and later.
     Linux has minstrel_ht for them, which measures the mean length of aggregates; here the length is an argument.
 

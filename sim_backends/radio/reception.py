@@ -125,7 +125,7 @@ class Reception(Generic[Payload]):
                 self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
 
     def abort(self, index: int, now_ns: int) -> None:
-        """Abort the transmission of a station, so that no station decodes it, and its reception."""
+        """Abort the transmission of a station, which then no station decodes, and abort its reception."""
         station = self._stations[index]
         if station.receiving is not None:
             station.receiving.receivers.discard(index)

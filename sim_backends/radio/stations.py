@@ -36,7 +36,7 @@ class Station(Generic[Payload]):
         offered: Number of packets that were passed to it for sending.
         aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
-        categories: Its access categories, of which `queue` is the active one; None if it has only one queue.
+        categories: Its access categories (`queue` belongs to the active one); None if it has only one queue.
     """
 
     __slots__ = (

@@ -158,7 +158,7 @@ def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorL
 
 
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the velocity towards a point relative to home from which it can brake to a stop there."""
+    """Return the velocity towards a point relative to home; from this velocity it can stop at the point."""
     east, north, up = (goal - current for goal, current in zip(goal_m, body.position_m, strict=True))
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s

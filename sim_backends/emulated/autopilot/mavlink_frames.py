@@ -179,7 +179,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register a message of a client; return False if there are `MAX_CLIENTS` others, so that it is ignored."""
+        """Register a message of a client; return False if it is ignored because there are `MAX_CLIENTS` others."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

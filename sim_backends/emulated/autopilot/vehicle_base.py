@@ -44,7 +44,7 @@ class VehicleBase:
         estimate: Its position estimate.
         fence: Its fence.
         guidance: Its goal and set-points.
-        home_m: Home in the world, metres east, north, up: where it was armed last, or else where it booted.
+        home_m: Home in the world, metres east, north, up: where it was armed last; before that, where it booted.
         failsafes: Its failsafes.
         status_texts: Texts that are not sent yet; the reader clears the list.
     """

@@ -335,7 +335,7 @@ def main() -> None:
     """Run the process; the command line has the descriptor of the socket, the seed and the framing."""
     channel = socket.socket(fileno=int(sys.argv[1]))
     medium = CosimulatedMedium(int(sys.argv[2]), FRAMINGS[sys.argv[3]], channel)
-    # A collection of all objects, most of which are modules, would delay packets.
+    # A garbage collection of all objects, which mostly belong to modules, would delay packets.
     gc.freeze()
     try:
         medium.run()

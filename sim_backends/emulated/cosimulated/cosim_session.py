@@ -101,7 +101,7 @@ class CosimSession:
         self._arrival_delays.pop(packet.packet_id, None)
 
     def network_delay(self, fate: Fate) -> tuple[Delay, int]:
-        """Return a packet's delay in the network divided into parts, and the delay of which no parts are known.
+        """Return the parts of a packet's delay in the network, and the rest of the delay, whose parts are unknown.
 
         Raises:
             FederateError: The parts exceed the delay.

@@ -245,7 +245,7 @@ class LabPhysics:
                 )
 
     def _restart(self) -> None:
-        """Start the physics with all robots at their present places; those that move are at rest afterwards."""
+        """Start the physics with all robots at their present places; moving robots are at rest afterwards."""
         self.close()
         self._physics = None
         self._followed.clear()

@@ -95,7 +95,7 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
 
 
 def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
-    """Return the files of modules and of those on which they depend, each after its dependencies.
+    """Return the files of modules and of their dependencies; a module follows its dependencies.
 
     A name that is built into the kernel (`modules.builtin`) is left out.
 

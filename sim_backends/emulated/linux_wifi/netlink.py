@@ -207,7 +207,7 @@ class FamilySocket:
         """Return the messages of the family and the errors in one datagram; an empty list if there is no datagram.
 
         Raises:
-            NetlinkFormatError: The kernel sent bytes that are no messages.
+            NetlinkFormatError: The kernel sent bytes that are not messages.
         """
         try:
             datagram, (port, _) = self._socket.recvfrom(MAX_DATAGRAM_BYTES)

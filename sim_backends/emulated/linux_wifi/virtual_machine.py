@@ -1,7 +1,7 @@
 """A virtual machine with Linux's Wi-Fi, made of the distribution's kernel and the files of this host.
 
 It boots the kernel with mac80211_hwsim, mounts the root file system of the host read-only below a layer in memory,
-runs one shell script as root, and switches off. It has no network. Its programs are those of the host: Python with
+runs one shell script as root, and switches off. It has no network. It uses the programs of the host: Python with
 fieldkit, iw, hostapd.
 
 Without KVM, the clock of the machine counts its instructions, and time passes at the rate of the host only while the
@@ -137,7 +137,7 @@ def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
     """Return the kernel of the machine.
 
     Args:
-        roots: Folders with `boot/`, `lib/modules/` and programs; None for those of `kernel_roots`.
+        roots: Folders with `boot/`, `lib/modules/` and programs; None for the folders of `kernel_roots`.
 
     Raises:
         ConfigurationError: The kernel or a program is missing; the message names all that is.

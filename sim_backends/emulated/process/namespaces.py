@@ -18,7 +18,7 @@ _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534
-"""Subordinate ids that a node needs: those of all accounts up to `nobody`."""
+"""Number of subordinate ids that a node needs: one for each id up to the id of the account `nobody`."""
 _USUAL_SUBORDINATES: Final = 65536
 _FIRST_SUBORDINATE: Final = 100_000
 """The first subordinate id that useradd assigns (SUB_UID_MIN of login.defs)."""
