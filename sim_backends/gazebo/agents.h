@@ -17,15 +17,15 @@ struct Agent
     std::string name, model;
     bool flies = false;
     Vector antenna; // in the axes of the model, from its origin
-    Vector start;   // of the model
+    Vector start;   // start position of the model
     double start_yaw = 0;
     protocol::Command command; // the command that applies now
     Pose pose;
     Vector velocity;
     int64_t appears_ns = 0, disappears_ns = -1; // -1 for never
-    bool is_present = true; // it has a model, which may not have been seen yet
-    bool is_new = false;    // its model has not been seen yet
-    bool had_model = true;  // before the run
+    bool is_present = true; // it has a model, which may not have published a pose yet
+    bool is_new = false;    // its model has not published a pose yet
+    bool had_model = true;  // it had a model before the run
 
     bool HasLifetime() const
     {

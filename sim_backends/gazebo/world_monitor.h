@@ -1,4 +1,4 @@
-// What a world of Gazebo has published: its clock and the poses of models; and waits for it.
+// The clock and the poses of models that a world of Gazebo has published, and waits for them.
 
 #ifndef FIELDKIT_GAZEBO_WORLD_MONITOR_H
 #define FIELDKIT_GAZEBO_WORLD_MONITOR_H
@@ -62,7 +62,7 @@ class WorldMonitor
     int repeated_clocks = 0;
     std::vector<Pose> poses;
     std::set<std::string> present; // models that have a pose
-    std::string names;             // of models and links, for messages
+    std::string names;             // names of models and links, for messages
 
     void Receive(const msgs::Clock& message)
     {

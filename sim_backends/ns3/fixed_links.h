@@ -50,7 +50,7 @@ class FixedLinks : public SimpleChannel
     int relay = -1;
     LinkParameters parameters;
     FrameTracker* tracker = nullptr;
-    std::function<PacketIdentity(uint64_t)> identity_of; // of a packet of the coordinator whose fate is open
+    std::function<PacketIdentity(uint64_t)> identity_of; // identity of a packet in transit, by its id
 
     void Connect(std::vector<Station>& stations)
     {
@@ -120,7 +120,7 @@ class FixedLinks : public SimpleChannel
         int64_t free_ns = 0; // end of the last transmission
         int64_t last_ns = 0; // last arrival
         int64_t off_ns = -1; // when the transmitter was switched off
-        std::deque<int64_t> starts_ns; // of the transmissions of queued packets
+        std::deque<int64_t> starts_ns; // start times of the transmissions of queued packets
     };
 
     // A packet on one link.

@@ -107,11 +107,11 @@ using protocol::DelayParts;
 // Counters of the frames from one station to another, like the counters of a radio's driver.
 struct LinkCounters
 {
-    uint64_t frames = 0; // whose first attempt has started
+    uint64_t frames = 0; // frames whose first attempt has started
     uint64_t retries = 0;
-    uint64_t failures = 0; // given up after the last retry
+    uint64_t failures = 0; // frames given up after the last retry
     uint64_t delivered = 0;
-    double rate_bit_s = NAN; // of the last attempt
+    double rate_bit_s = NAN; // rate of the last attempt
 };
 
 // Follows the frames of all stations by ns-3's traces.

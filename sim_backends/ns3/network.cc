@@ -693,7 +693,7 @@ class Network
     std::vector<Station> m_stations;
     std::vector<AgentEntry> m_agents;
     std::set<uint32_t> m_transmitters; // agents that forward or interfere
-    std::vector<Point> m_emitters_m;   // of jammers that no agent carries
+    std::vector<Point> m_emitters_m;   // positions of jammers that no agent carries
     std::unique_ptr<Channel> m_channel; // null with fixed links
     std::unique_ptr<Jammers> m_jammers; // null with fixed links
     Ptr<FixedLinks> m_links;            // null with Wi-Fi

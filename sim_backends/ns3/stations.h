@@ -163,7 +163,7 @@ FillArpCache(const Station& station, const std::vector<Station>& stations)
     }
 }
 
-// Give the stations, which have devices, IP addresses; callbacks of ns-3 keep references to `stations`.
+// Give IP addresses to the stations, which have devices; callbacks of ns-3 keep references to `stations`.
 inline void
 InstallIp(std::vector<Station>& stations, FrameTracker& tracker)
 {

@@ -218,7 +218,7 @@ class TcpTransport
         uint64_t queued_bytes = 0;
         uint64_t written_bytes = 0;
         uint64_t read_bytes = 0;
-        std::deque<Message> messages; // that have not arrived
+        std::deque<Message> messages; // messages that have not arrived
     };
 
     using ConnectionPointer = std::shared_ptr<Connection>;
@@ -321,7 +321,7 @@ class TcpTransport
             return;
         }
         m_connections[key] = nullptr;
-        m_closed.push_back(connection); // its socket is calling
+        m_closed.push_back(connection); // its socket calls this function
         connection->is_open = false;
         for (const Message& message : connection->messages)
         {
