@@ -116,7 +116,7 @@ class SyncOptions(Strict):
     @schema.model_validator(mode="before")
     @classmethod
     def _named(cls, value: object) -> object:
-        """Accept the name alone."""
+        """Accept a name without parameters."""
         return {"name": value} if isinstance(value, str) else value
 
     @property

@@ -44,7 +44,7 @@ PARAMETERS: Final = (
     CategoryParameters(2, (CW_MIN + 1) // 2 - 1, CW_MIN, 3_008_000),
     CategoryParameters(2, (CW_MIN + 1) // 4 - 1, (CW_MIN + 1) // 2 - 1, 1_504_000),
 )
-"""By access category."""
+"""Default parameters by access category."""
 
 _UNLIMITED_NS: Final = 1 << 62
 _PRIORITY: Final = (VOICE, VIDEO, BEST_EFFORT, BACKGROUND)

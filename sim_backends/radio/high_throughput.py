@@ -188,7 +188,7 @@ def mode_groups(first: PhyCapability, second: PhyCapability) -> tuple[tuple[Wifi
 def format_modes(
     phy_format: HighThroughput, band_name: BandName, width_mhz: int, streams: int, guard_interval_ns: int
 ) -> tuple[WifiMode, ...]:
-    """Return the modes of all MCS of a format, slowest first; always the same objects."""
+    """Return the modes of all MCS of a format, slowest first; each call returns the same objects."""
     return tuple(
         _mode(phy_format, BANDS[band_name], mcs, width_mhz=width_mhz, streams=streams, guard_ns=guard_interval_ns)
         for mcs in range(_MCS_COUNT[phy_format])

@@ -204,7 +204,7 @@ OFDM_MODES: Final[dict[BandName, tuple[WifiMode, ...]]] = {
     "5 GHz": _modes("a", BANDS["5 GHz"], _OFDM_TABLE),
     "6 GHz": _modes("a", BANDS["6 GHz"], _OFDM_TABLE),
 }
-"""The modes without high throughput of each band."""
+"""The non-HT modes of each band."""
 
 # Indices of the mandatory rates of clause 17, fastest first.
 _MANDATORY: Final = (4, 2, 0)

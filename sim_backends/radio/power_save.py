@@ -28,7 +28,7 @@ class PowerSave(Generic[Payload]):
     """The dozing stations, and the frames that the access point buffers for them.
 
     Args:
-        timeouts_ns: Time after the last frame after which a station dozes, by index; others never doze.
+        timeouts_ns: Time from the last frame until a station dozes, by index of the station; others never doze.
         beacon_phase_ns: Time of the first beacon, which has a DTIM.
         events: Scheduled events.
         release: Queues a frame at its transmitter.

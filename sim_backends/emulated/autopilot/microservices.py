@@ -25,7 +25,7 @@ _ACK, _NAK = 128, 129
 _OPEN_OPCODES: Final = frozenset({4, 11, 14})
 """Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
 _CLOSE_OPCODES: Final = frozenset({1, 2})
-"""TerminateSession, ResetSessions."""
+"""Opcodes that end sessions: TerminateSession, ResetSessions."""
 _LIST_DIRECTORY: Final = 3
 _END_OF_FILE, _UNKNOWN_COMMAND, _NOT_FOUND = 6, 7, 10
 

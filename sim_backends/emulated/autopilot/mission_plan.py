@@ -125,7 +125,7 @@ _RISEN_M: Final = 0.2
 
 
 class Mission:
-    """Items in their order.
+    """The items of a mission, in their order.
 
     Args:
         first: Number of the first item that is flown; ArduPilot's item 0 is home.

@@ -228,7 +228,7 @@ class CosimulatedMedium(MediumServer):
     def _write(
         self, session: CosimSession, fate: Fate, packet: RealPacket, end_ns: int, end_monotonic_ns: int
     ) -> None:
-        """Write a packet that arrived to its receiver, and count its delays."""
+        """Write an arrived packet to its receiver, and count its delays."""
         port = self._ports[fate.packet.destination]
         try:
             os.write(port.fd, packet.content)

@@ -110,7 +110,7 @@ class Steering(ABC):
         yield from self._stop_until(until_ns)
 
     def _stop_until(self, until_ns: int) -> Iterator[tuple[int, Command]]:
-        """Yield `idle` with its time if it is due until a time."""
+        """Yield `idle` with its time if it is due by a time."""
         if self._stops_ns is not None and self._stops_ns <= until_ns:
             yield self._stops_ns, self.idle
             self._stops_ns = None

@@ -196,8 +196,8 @@ def _battery_state(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
     measured = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
     state = struct.pack("<3B?", discharging, good, polymer, present)
-    no_cells = _float32s(()) * 2  # their voltages and temperatures
-    return measured + state + no_cells + packed_string("") * 2  # its place and serial number
+    no_cells = _float32s(()) * 2  # voltages and temperatures of the cells
+    return measured + state + no_cells + packed_string("") * 2  # place and serial number of the battery
 
 
 def _range(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
