@@ -15,7 +15,7 @@ from sim_backends.emane_events.protobuf import MalformedEventError
 
 _MREQN: Final = struct.Struct("=4s4si")  # struct ip_mreqn (Linux, ip(7))
 _MAX_EVENT_BYTES: Final = 1200
-"""Content of a datagram, which then fits into an Ethernet frame; a larger event is sent alone."""
+"""Maximum content of a datagram that fits into an Ethernet frame; a larger event is sent alone."""
 _RECEIVE_BYTES: Final = 1 << 16
 
 
@@ -45,7 +45,7 @@ class EventPublisher:
 
     Args:
         channel: Multicast group and port, `224.1.2.8:45703`.
-        device: Network interface; None for that of the route.
+        device: Network interface; None for the interface of the route to the group.
 
     Raises:
         ConfigurationError: The interface cannot be used.
@@ -98,7 +98,7 @@ class EventListener:
 
     Args:
         channel: Multicast group and port, `224.1.2.8:45703`.
-        device: Network interface; None for that of the route.
+        device: Network interface; None for the interface of the route to the group.
 
     Raises:
         ConfigurationError: The channel cannot be used.
@@ -123,7 +123,7 @@ class EventListener:
         """Return the events of the next datagram; None if there is none until a time.
 
         Args:
-            limit_s: The time, as of `time.monotonic`.
+            limit_s: The time, on the clock of `time.monotonic`.
         """
         while True:
             wait_s = max(limit_s - time.monotonic(), 0.0)

@@ -1,7 +1,8 @@
 """Encoding of EMANE's events: `event.proto`, `locationevent.proto` and `pathlossevent.proto` of EMANE 1.5.
 
-A datagram of the event channel is a big-endian u16 with the size of the message `Event`, and the message. It has the
-identifier and the sequence number of its publisher, and one or more serialized events, each for one NEM or for all.
+A datagram of the event channel is a big-endian u16 with the size of the message `Event`, and the message. The message
+has the identifier and the sequence number of its publisher, and one or more serialized events, each for one NEM or
+for all.
 """
 
 import math
@@ -111,7 +112,7 @@ class EventDatagram:
     events: Sequence[SerializedEvent]
 
     def encode(self) -> bytes:
-        """Return its bytes.
+        """Return the encoded bytes.
 
         Raises:
             ValueError: It is too large, or a number is invalid.
@@ -129,10 +130,10 @@ class EventDatagram:
 
     @staticmethod
     def decode(datagram: bytes) -> "EventDatagram":
-        """Return the datagram of its bytes.
+        """Return the datagram that is encoded in these bytes.
 
         Raises:
-            MalformedEventError: It is not one.
+            MalformedEventError: The bytes are not a datagram.
         """
         if len(datagram) < _SIZE.size or _SIZE.unpack_from(datagram)[0] != len(datagram) - _SIZE.size:
             raise MalformedEventError("the datagram has another size than it announces")
@@ -175,7 +176,7 @@ def decode_locations(content: bytes) -> list[NemLocation]:
     """Return the locations of a message `LocationEvent`; orientations are ignored.
 
     Raises:
-        MalformedEventError: It is not one, or a number is not finite.
+        MalformedEventError: The bytes are not a `LocationEvent`, or a number is not finite.
     """
     return [_location(as_bytes(value)) for field, value in fields(content) if field == 1]
 
@@ -207,7 +208,7 @@ def decode_pathlosses(content: bytes) -> list[NemPathloss]:
     """Return the losses of a message `PathlossEvent`.
 
     Raises:
-        MalformedEventError: It is not one.
+        MalformedEventError: The bytes are not a `PathlossEvent`.
     """
     losses = []
     for field, value in fields(content):

@@ -1,4 +1,4 @@
-"""The physics federate `emane`: agents that have the locations and path losses of EMANE's events, in real time."""
+"""The physics federate `emane`: agents with the locations and path losses in EMANE's events, in real time."""
 
 import math
 import time
@@ -29,13 +29,13 @@ from sim_backends.world.motion import STILL, State
 
 
 class EmaneLocations:
-    """A physics in which each agent has the position of the last location event of its NEM.
+    """A physics in which each agent has the position in the last location event for its NEM.
 
-    Simulated time passes as fast as wall time, from the first request on. The motion of the scenario's agents is not
+    From the first request on, simulated time passes as fast as wall time. The motion of the scenario's agents is not
     simulated.
 
     Args:
-        hello: The run; the options of its configuration are those of `EmaneOptions`.
+        hello: The run; its configuration has the options of `EmaneOptions`.
 
     Attributes:
         step_ns: See `PhysicsFederate`.

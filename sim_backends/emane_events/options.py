@@ -22,7 +22,7 @@ def split_channel(text: str) -> tuple[str, int]:
     """Return the multicast group and the port of an event channel, `224.1.2.8:45703`.
 
     Raises:
-        ValueError: It is not one.
+        ValueError: The text is not an event channel.
     """
     group, _, port = text.rpartition(":")
     try:
@@ -39,14 +39,14 @@ class EmaneOptions(SimulatorOptions):
 
     Attributes:
         channel: Multicast group and port of the events.
-        device: Network interface; if omitted, that of the route to the group.
+        device: Network interface; if omitted, the interface of the route to the group.
         nems: NEM identifiers of agents; if empty, 1, 2, ... in the order of the agents.
         reference: Latitude and longitude in degrees, and height above the ellipsoid in metres, of the world's origin.
         interval: Smallest time between two events of a run, in simulated time.
         pathloss: Publish the mean path loss between all agents, with obstacles, for `precomputed` propagation; or, if
             the run follows events, use the path losses in them.
-        real_time: Let the run wait for the wall clock, as EMANE's time is that of the wall clock.
-        wait: Longest wait for the first location of each agent, if the run follows events.
+        real_time: True if the run waits for the wall clock, because EMANE uses the wall clock.
+        wait: Maximum wait for the first location of each agent, if the run follows events.
     """
 
     channel: Annotated[str, AfterValidator(_checked_channel)] = "224.1.2.8:45703"

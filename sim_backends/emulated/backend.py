@@ -31,7 +31,7 @@ from sim_backends.emulated.ros import sensor_specs
 from sim_backends.world.world import load_world
 
 if TYPE_CHECKING:
-    from fieldkit.lab.protocol import Lab, Overview  # a trial needs none of them
+    from fieldkit.lab.protocol import Lab, Overview  # not needed for a trial
     from fieldkit.lab.robots import LabRobot
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")

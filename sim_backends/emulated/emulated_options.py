@@ -34,7 +34,7 @@ def uses_debian_ros(choice: RosChoice) -> bool:
 
 
 class RobotOptions(Strict):
-    """Tool variants of one robot; a tool that is not named is that of this machine.
+    """Tool variants of one robot; for a tool that is not named, the robot uses the tool of this machine.
 
     Attributes:
         ssh: Its SSH server: `openssh` or `dropbear`.
@@ -53,7 +53,7 @@ class RobotOptions(Strict):
     ping: Ping | None = None
 
     def programs(self) -> set[str]:
-        """Return the programs that this machine must have for these variants, beyond those of every emulated lab."""
+        """Return the programs that this machine must have for these variants, besides those that every lab needs."""
         programs = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
         if self.netcat is not None:
             programs.add(NETCATS[self.netcat])
@@ -116,7 +116,7 @@ class SyncOptions(Strict):
     @schema.model_validator(mode="before")
     @classmethod
     def _named(cls, value: object) -> object:
-        """Accept the name alone."""
+        """Accept a name without parameters."""
         return {"name": value} if isinstance(value, str) else value
 
     @property
@@ -154,11 +154,11 @@ class EmulatedOptions(Strict):
         physics: The robots move [on the co-simulation](lab-cosim.md), by this physics: `kinematic`, `mujoco` or
             `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
-        sync: The sync policy between both: its name, or name and parameters. The default is `event_driven`, which
-            adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an exchange at every event
-            of ns-3 takes too long for real time.
-        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [that of Linux](linux-wifi.md), over the same radio, in
-            a virtual machine if this kernel has no mac80211_hwsim.
+        sync: The sync policy between physics and network: its name, or name and parameters. The default is
+            `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
+            exchange at every event of ns-3 takes too long for real time.
+        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [the Wi-Fi of Linux](linux-wifi.md), over the same
+            radio, in a virtual machine if this kernel has no mac80211_hwsim.
     """
 
     ros: RosChoice = RosChoice.AUTO

@@ -24,8 +24,8 @@ from sim_backends.world.world import World
 STEP_M: Final = 0.1
 """Distance that a robot may move between two updates of the medium.
 
-Loss grows by 10 n / (ln 10 d) dB per metre, with n = 3 by 1.3 dB/m at 10 m: a step is 0.13 dB there. Fading, which
-changes within a wavelength of 0.12 m, continues between the updates.
+The loss grows by 10 n / (ln 10 d) dB per metre: at 10 m with n = 3 by 1.3 dB/m, so a step changes it by 0.13 dB.
+Fading, which changes within a wavelength of 0.12 m, continues between the updates.
 """
 
 _MIN_PERIOD_S: Final = 0.02
@@ -125,7 +125,7 @@ class Mobility:
         self._laptop = laptop
         self._placement: Placement | None = None
         self._out_of_range_role: Role | None = None
-        # Each with its start, by the monotonic clock.
+        # The motions, each with its start time on the monotonic clock.
         self._motions: list[tuple[int, Motion]] = []
         # Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
         self._path_starts_ns: dict[Role, int] = {}
@@ -255,7 +255,7 @@ class Mobility:
             return self._next_update_s(now_ns, states)
 
     def _extend_track(self, states: Mapping[str, State]) -> None:
-        """Append robots whose position or velocity has changed to the track."""
+        """Append to the track the robots whose position or velocity has changed."""
         utc_ns = time.time_ns()
         last = {point.role: point for point in self._track}
         for role, robot in self._cast.items():

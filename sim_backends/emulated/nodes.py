@@ -199,7 +199,7 @@ class EmulatedRobot(Node):
         self._worker.request({"do": "switch on", "interface": self.spec.interface})
 
     def kill(self, process: str) -> None:
-        """Kill every process of this name. Errors as `open_radio`, also if there is none."""
+        """Kill every process of this name. Errors as `open_radio`; it is also an error if there is none."""
         self._worker.request({"do": "kill", "process": process})
 
     def move(self, path: AssignedPath) -> None:
@@ -220,7 +220,7 @@ class EmulatedRobot(Node):
         if self._record is not None:
             self._record.close()
             self._record = None
-        for fd in self.physics_fds[1:]:  # the first is that of the record
+        for fd in self.physics_fds[1:]:  # the first descriptor belongs to the record
             os.close(fd)
         self.physics_fds = ()
 
@@ -284,7 +284,7 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
+    Arguments as `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
     and connect to it over the radio.
 
     Raises:

@@ -25,7 +25,7 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vec
     """Return the position of each antenna, metres east, north, up, on the world's line for the scenario.
 
     The sender is at the end of the line, where an obstacle blocks the line of sight if the scenario has one (paper,
-    section VI-A); the distances of the others from it are those of `geometry.positions_m`.
+    section VI-A); `geometry.positions_m` determines the distances of the other robots from it.
 
     Raises:
         ConfigurationError: The world has no line for the scenario.

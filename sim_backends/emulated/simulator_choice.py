@@ -1,4 +1,4 @@
-"""A lab's choice of simulators and sync policy: what it needs, and its check before a run."""
+"""A lab's choice of simulators and sync policy: defaults, requirements, and a check before a run."""
 
 import inspect
 import os
@@ -79,7 +79,7 @@ def _physics(options: EmulatedOptions) -> str:
 def _gazebo_options() -> dict[str, Any]:
     """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks.
 
-    Velocities are means over a window: those of its last step need a second request per window.
+    Velocities are means over a window: velocities over its last step would need a second request per window.
     """
     set_options = {
         option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
@@ -117,7 +117,7 @@ def bodies_of(robots: Iterable[Robot | LabRobot]) -> dict[str, RobotBody]:
 def _body(profile: RobotProfile) -> RobotBody:
     """Return the body of a profile, or of a TurtleBot3 if there is none, with the limits of its base.
 
-    The limits of a drone are those of its airframe: its autopilot keeps those of the profile.
+    A drone has the limits of its airframe, because its autopilot enforces the limits of the profile.
     """
     if mavlink_of(profile) is not None:
         return RobotBody(profile.name, quadrotor(profile.name))
@@ -130,7 +130,7 @@ def _body(profile: RobotProfile) -> RobotBody:
 
 
 def summary(options: EmulatedOptions) -> Mapping[str, str]:
-    """Return the physics, the network, the sync policy and the physics step of a lab as texts, by these words."""
+    """Return texts for `physics`, `network`, `sync` (the policy) and `step` (of the physics) of a lab."""
     sync = sync_of(options)
     policy = make_policy(sync.name, **sync.parameters)
     defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}

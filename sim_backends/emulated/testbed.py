@@ -171,7 +171,7 @@ class EmulatedTestbed:
 
 
 class LinuxWifiTestbed(EmulatedTestbed):
-    """Robots with the Wi-Fi of Linux, whose radio is measured as that of real robots. Arguments as the base class."""
+    """Robots with the Wi-Fi of Linux; their radio is measured as on real robots. Arguments as the base class."""
 
     @property
     @override

@@ -1,4 +1,4 @@
-// The agents of a run, which are models in Gazebo, and their commands.
+// The agents of a run (models in Gazebo), and their commands.
 
 #ifndef FIELDKIT_GAZEBO_AGENTS_H
 #define FIELDKIT_GAZEBO_AGENTS_H
@@ -17,15 +17,15 @@ struct Agent
     std::string name, model;
     bool flies = false;
     Vector antenna; // in the axes of the model, from its origin
-    Vector start;   // of the model
+    Vector start;   // start position of the model
     double start_yaw = 0;
-    protocol::Command command; // that applies
+    protocol::Command command; // the command that applies now
     Pose pose;
     Vector velocity;
     int64_t appears_ns = 0, disappears_ns = -1; // -1 for never
-    bool is_present = true; // it has a model, which may not have been seen yet
-    bool is_new = false;    // its model has not been seen yet
-    bool had_model = true;  // before the run
+    bool is_present = true; // it has a model, which may not have published a pose yet
+    bool is_new = false;    // its model has not published a pose yet
+    bool had_model = true;  // it had a model before the run
 
     bool HasLifetime() const
     {
@@ -49,7 +49,7 @@ struct Agent
         return std::remainder(command.values[3] - pose.Yaw(), 2 * M_PI);
     }
 
-    // Whether it has a direction that it has not reached yet.
+    // True if it has a target direction that it has not reached yet.
     bool Turns() const
     {
         return is_present && flies && !std::isnan(command.values[3]) && std::fabs(YawError()) > 1e-3;
@@ -61,7 +61,7 @@ struct Agent
     }
 };
 
-// The agents of hello, with their models and the starts of these.
+// The agents of hello, with their models and the start poses of the models.
 inline std::vector<Agent>
 AgentsOf(const protocol::Hello& hello, const Json& plans, const Options& options)
 {

@@ -131,8 +131,8 @@ class Connection
         }
     }
 
-    // Send a request that may arrive twice, and wait for its answer. The first answer to a new process may be lost, as
-    // Gazebo Transport does not wait until its connection is complete; so the request is repeated.
+    // Send a request that may arrive twice, and wait for its answer. The request is repeated, because the first answer
+    // to a new process may be lost: Gazebo Transport does not wait until its connection is complete.
     template <typename Request> void Call(const std::string& service, const Request& request)
     {
         Answer answer = Send(service, request);
@@ -165,7 +165,7 @@ class Connection
         return request;
     }
 
-    // Publish a command to the agent of an index; false if that failed.
+    // Publish a command to the agent with an index; false if that failed.
     bool Publish(size_t agent, const msgs::Twist& twist)
     {
         return m_receivers[agent].publisher.Publish(twist);
@@ -178,9 +178,10 @@ class Connection
 
     // Wait until Gazebo has received all commands.
     //
-    // Messages to a topic and requests to a service have no order between them. The plugin TriggeredPublisher answers
-    // a message that follows the commands on the same connection; without it, Gazebo's single thread of reception
-    // accepts one message and one request in turns, so that it has probably read the commands after that many requests.
+    // Messages to a topic and requests to a service have no common order. The plugin TriggeredPublisher answers a
+    // message that follows the commands on the same connection. Without the plugin, this sends one request more than
+    // there are agents: Gazebo's single receiving thread alternates between messages and requests, so it has then
+    // probably read all commands.
     void Acknowledge()
     {
         if (m_usesFence)
@@ -205,7 +206,7 @@ class Connection
     }
 
   private:
-    // What receives the commands of an agent.
+    // The receiver of the commands to an agent.
     struct CommandReceiver
     {
         std::string agent, topic;

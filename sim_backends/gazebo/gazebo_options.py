@@ -25,21 +25,21 @@ class GazeboOptions(SimulatorOptions):
     model.
 
     Attributes:
-        world: Name of Gazebo's world; if omitted, that of the scenario's world.
+        world: Name of Gazebo's world; if omitted, the name of the scenario's world.
         models: Name of the model of each agent whose model does not have the agent's name.
         origins_m: For each agent, the body's lowest point in the frame of its model; if omitted, `[0, 0, 0]`.
-        partition: Value of `IGN_PARTITION` and `GZ_PARTITION`; if omitted, that of the environment.
-        ip: Value of `IGN_IP` and `GZ_IP`; if omitted, that of the environment.
+        partition: Value of `IGN_PARTITION` and `GZ_PARTITION`; if omitted, the value in the environment.
+        ip: Value of `IGN_IP` and `GZ_IP`; if omitted, the value in the environment.
         control_service: Service that advances, pauses and resets the world.
         pose_service: Service that places robots.
         create_service: Service that creates the model of an agent when it appears.
         remove_service: Service that removes the model of an agent when it disappears.
-        model_files: SDF file, on the machine of Gazebo, of the model of each agent that has another model than in
-            `fieldkit cosim sdf` when it appears.
+        model_files: SDF file, on the machine of Gazebo, for each agent that appears with another model than the one
+            in `fieldkit cosim sdf`.
         pose_topic: Topic of the poses of the models.
         clock_topic: Topic of the simulated time.
         command_topic: Topic of the commands to an agent.
-        command_topics: Topic of the commands to each agent that has another one.
+        command_topics: Topic of the commands to each agent whose topic is not `command_topic`.
         acknowledge: Acknowledgement of the commands before each window: `auto` if the world has a plugin for it,
             `required`, or `off`; see [lock-step](gazebo.md#lock-step).
         fence_topic: Topic of requests for the acknowledgement.
@@ -56,7 +56,7 @@ class GazeboOptions(SimulatorOptions):
         limit_m_s2: Largest acceleration, for `error_bounded`; if omitted, that policy exchanges every step while an
             agent sends.
         deterministic: Declare that equal requests give equal answers.
-        timeout_s: Longest wait without progress, in wall time.
+        timeout_s: Maximum wait without progress, in wall time.
     """
 
     world: str | None = None
@@ -95,7 +95,7 @@ class GazeboOptions(SimulatorOptions):
 
     @override
     def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `sdf`: the model of each agent, by the version that has the names of its plugins."""
+        """Return `sdf`: the model of each agent in SDF, by version of the plugin names (`sdf.Version`)."""
         step_ns = round(parse_duration_s(configuration["scenario"]["physics"]["step"]) * 1e9)
         models: dict[str, dict[str, str]] = {}
         for agent, robot in configuration["robots"].items():
@@ -107,5 +107,5 @@ class GazeboOptions(SimulatorOptions):
 
 
 def _limits(body: Mapping[str, Any]) -> DriveLimits | QuadrotorLimits:
-    """Return the limits of a body in the configuration; only those of a quadrotor have a mass."""
+    """Return the limits of a body in the configuration; only a quadrotor has a mass there."""
     return QuadrotorLimits(**body) if "mass_kg" in body else DriveLimits(**body)

@@ -33,7 +33,7 @@ class LockStep
         return m_stepNs;
     }
 
-    // Connect, stop the robots, reset the world, place the robots, and let them come to rest: that is time 0.
+    // Connect, stop the robots, reset the world, place the robots, and wait until they are at rest: this is time 0.
     void Begin()
     {
         m_connection.Open();
@@ -175,7 +175,7 @@ class LockStep
             at = next;
             if (turned && at % period == 0)
             {
-                SendCommands(); // also when it has reached its direction, to stop it
+                SendCommands(); // also when an agent has reached its direction, to stop its rotation
             }
         }
         if (m_options.velocity == "window")
@@ -230,7 +230,7 @@ class LockStep
         SendCommands();
     }
 
-    // As for Create: the model is removed at the latest before the next step.
+    // As with Create, the model is removed at the latest before the next step.
     void Remove(Agent& agent)
     {
         msgs::Entity request;
@@ -268,7 +268,7 @@ class LockStep
         WaitForPoses(lock, before_ns + m_stepNs, before_ns, answer);
     }
 
-    // Advance by a number of steps: the poses are those after the last one.
+    // Advance by a number of steps; afterwards the poses are those of the last step.
     void Step(int64_t count)
     {
         while (count > 0)
@@ -348,7 +348,7 @@ class LockStep
         }
     }
 
-    // The agents whose models have been requested and not been seen, for messages.
+    // The agents whose models have been requested and have no pose yet, for messages.
     std::string NewAgents() const
     {
         std::string names;

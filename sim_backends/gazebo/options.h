@@ -25,7 +25,7 @@ struct Options
     std::string create_service, remove_service;
     std::string control_service, pose_service, pose_topic, clock_topic, command_topic, fence_topic, fence_answer;
     std::map<std::string, std::string> models, model_files, command_topics;
-    std::map<std::string, std::string> sdf; // of the model of each agent
+    std::map<std::string, std::string> sdf; // SDF of the model of each agent
     std::map<std::string, std::array<double, 3>> origins_m;
     double timeout_s, settle_s, start_error_m, gravity_m_s2, yaw_gain_per_s, control_period_s;
     double limit_m_s2 = std::numeric_limits<double>::infinity();
@@ -61,7 +61,7 @@ struct Options
                       error.what());
     }
 
-    // The name of a topic or service, of a pattern with `{world}` and `{model}`.
+    // The name of a topic or service, from a pattern with `{world}` and `{model}`.
     std::string Name(std::string pattern, const std::string& model = "") const
     {
         for (const auto& [key, value] : {std::pair<std::string, std::string>{"{world}", world}, {"{model}", model}})

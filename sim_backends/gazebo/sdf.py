@@ -18,12 +18,13 @@ from sim_backends.world.shapes import Box, Cylinder, Shape
 from sim_backends.world.world import World
 
 Version = Literal["fortress", "garden"]
-"""Names of the plugins: those of Fortress, or those of Garden, which later versions also accept."""
+"""Names of the plugins: the names of Fortress, or the names of Garden, which later versions also accept."""
 
 VERSIONS: Final[tuple[Version, ...]] = get_args(Version)
 
 REAL_TIME_FACTOR: Final = 5.0
-"""Upper limit of the speed. A paused Gazebo repeats its loop at this rate too, so a larger one uses the processor."""
+"""Maximum real-time factor. A paused Gazebo also repeats its loop at this rate; a larger rate needs more processor
+time."""
 POSE_HZ: Final = 2000
 """Largest rate of poses in wall time; at the default of 60 Hz each window takes up to 17 ms."""
 _SLAB_M: Final = 0.1
@@ -114,14 +115,14 @@ def world_sdf(
 
 
 def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int, version: Version) -> str:
-    """Return an SDF file with one robot at the origin, with which Gazebo creates its model; arguments as before."""
+    """Return an SDF file with one robot at the origin; Gazebo creates its model from it. Arguments as `world_sdf`."""
     root = Element("sdf", version="1.9")
     _add_robot(root, name, SdfRobot(limits, _UPRIGHT, 0.0), version, step_ns)
     return tostring(root, encoding="unicode")
 
 
 def _add_fence(world: Element, parent: World, version: Version) -> None:
-    """Add a plugin that answers the message after the commands of a window, so that these have been received."""
+    """Add a plugin that answers the message after the commands of a window; the answer proves their reception."""
     plugin = _plugin(world, version, "TriggeredPublisher", "triggered-publisher")
     kind = "ignition.msgs.Empty" if version == "fortress" else "gz.msgs.Empty"
     for tag, topic in (("input", "fence"), ("output", "passed")):
@@ -159,7 +160,7 @@ def _add_obstacle(world: Element, obstacle: Obstacle) -> None:
 
 
 def _add_ramp(link: Element, ramp: Ramp) -> None:
-    """Add a ramp as a slab, as wheels need an even surface."""
+    """Add a ramp as a slab, because wheels need an even surface."""
     (long_m, wide_m, high_m), yaw_rad = ramp.size_m, math.radians(ramp.yaw_deg)
     pitch_rad, slope_m = math.atan2(high_m, long_m), math.hypot(long_m, high_m)
     back_m = _SLAB_M / 2 * math.sin(pitch_rad)
@@ -204,7 +205,7 @@ def _add_shape(
 
 
 def _add_inertia(link: Element, mass_kg: float, size_m: Vector, position_m: Vector = (0.0, 0.0, 0.0)) -> None:
-    """Add the mass and the inertia of an even box of a size."""
+    """Add the mass and the inertia of a homogeneous box of a size."""
     x, y, z = (size * size * mass_kg / 12 for size in size_m)
     inertial = SubElement(link, "inertial")
     _pose(inertial, position_m)
@@ -222,7 +223,7 @@ def _add_robot(world: Element, name: str, robot: SdfRobot, version: Version, ste
 
 
 def _chassis(limits: DriveLimits) -> _Chassis:
-    """Return the Husky's geometry, or that of the TurtleBot, scaled to the size of the body."""
+    """Return the geometry of the Husky, or the geometry of the TurtleBot scaled to the size of the body."""
     if limits.radius_m == HUSKY_A200.radius_m:
         return _HUSKY
     scale = limits.radius_m / TURTLEBOT3_BURGER.radius_m
@@ -237,7 +238,7 @@ def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
     wheels = [(side, end) for side in (1, -1) for end in ((1, -1) if chassis.base_m else (0,))]
     wheel_kg = 0.05 * chassis.mass_kg
     low_m = chassis.clearance_m + size_m[2] / 2
-    # The centre of mass is low, as batteries and motors are.
+    # The centre of mass is low, because batteries and motors are low.
     _add_inertia(
         link, chassis.mass_kg - wheel_kg * len(wheels), size_m, (0.0, 0.0, chassis.clearance_m + size_m[2] / 4)
     )

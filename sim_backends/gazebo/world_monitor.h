@@ -1,4 +1,4 @@
-// What a world of Gazebo has published: its clock and the poses of models; and waits for it.
+// The clock and the poses of models that a world of Gazebo has published, and waits for them.
 
 #ifndef FIELDKIT_GAZEBO_WORLD_MONITOR_H
 #define FIELDKIT_GAZEBO_WORLD_MONITOR_H
@@ -54,15 +54,15 @@ class WorldMonitor
 
     int64_t reached_ns = -1; // time that the run has reached; -1 before its start
 
-    // What callbacks of Gazebo Transport change, with the lock.
+    // Members that callbacks of Gazebo Transport change; access them with the lock only.
     std::mutex mutex;
     std::condition_variable changed;
     int64_t clock_ns = -1, pose_ns = -1;
-    int64_t awaited_ns = -1; // time whose poses are awaited; earlier messages wake nothing. -1: each message does
+    int64_t awaited_ns = -1; // time whose poses are awaited: earlier messages do not notify; -1: all messages do
     int repeated_clocks = 0;
     std::vector<Pose> poses;
     std::set<std::string> present; // models that have a pose
-    std::string names;             // of models and links, for messages
+    std::string names;             // names of models and links, for messages
 
     void Receive(const msgs::Clock& message)
     {
@@ -170,13 +170,13 @@ class WorldMonitor
         return result;
     }
 
-    // Report to the coordinator, if necessary, that the request takes long.
+    // Report to the coordinator, if necessary, that the request is still running.
     void Beat()
     {
         m_heartbeat.Check(std::max<int64_t>(reached_ns, 0));
     }
 
-    // The end of a message of an error: the last time of the clock.
+    // The end of an error message: the last time of the clock.
     std::string LastMessage() const
     {
         if (clock_ns < 0)

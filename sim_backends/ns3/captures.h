@@ -1,4 +1,4 @@
-// Captures of the IP packets of all stations, with the addresses, ports and echo headers that fieldkit's captures have.
+// Captures of the IP packets of all stations, with the same addresses, ports and echo headers as fieldkit's captures.
 
 #ifndef FIELDKIT_CAPTURES_H
 #define FIELDKIT_CAPTURES_H
@@ -21,7 +21,8 @@ namespace fieldkit
 class IpCaptures
 {
   public:
-    // `setup` has the `folder`, the `addresses` of all agents, and `flows` with special headers: `port`, `ping`, `reply`.
+    // `setup` has the `folder`, the `addresses` of all agents, and `flows` with special headers (`port`, `ping`,
+    // `reply`).
     IpCaptures(const nlohmann::json& setup, const std::vector<Station>& stations)
         : m_folder(setup.at("folder").get<std::string>()),
           m_files(stations.size())
@@ -80,7 +81,7 @@ class IpCaptures
 
     struct Flow
     {
-        uint16_t port; // 0 for that of the transport
+        uint16_t port; // 0 for the port of the transport
         uint16_t ping; // identifier of echo requests; 0 for UDP and TCP
         bool is_reply;
     };
@@ -121,7 +122,7 @@ class IpCaptures
         Write(station, bytes, packet->GetSize());
     }
 
-    // Replace the port of the listener of a connection, which has this other end.
+    // Replace the listener's port of the connection with this other end.
     void RenamePort(std::vector<uint8_t>& bytes, std::pair<Ipv4Address, uint16_t> end, size_t at) const
     {
         auto connection = m_connections.find(end);
@@ -142,7 +143,7 @@ class IpCaptures
         {
             return;
         }
-        bytes[9] = 1; // ICMP; its header is as long as that of UDP (RFC 792)
+        bytes[9] = 1; // ICMP; its header is as long as the UDP header (RFC 792)
         if (is_first)
         {
             uint8_t* echo = &bytes[kIpBytes];
@@ -205,7 +206,7 @@ class IpCaptures
     std::string m_folder;
     std::vector<std::string> m_names;
     std::vector<std::ofstream> m_files;
-    std::map<Ipv4Address, Ipv4Address> m_addresses; // of captures, by those of ns-3
+    std::map<Ipv4Address, Ipv4Address> m_addresses; // addresses in captures, by address in ns-3
     std::map<std::string, Flow> m_flows;
     std::unordered_map<uint64_t, Datagram> m_datagrams; // by packet of the coordinator
     std::map<std::pair<Ipv4Address, uint16_t>, uint16_t> m_connections; // port of the listener, by the other end

@@ -19,7 +19,7 @@ namespace fieldkit
 class Channel
 {
   public:
-    // `radio` and `world` are those of the configuration; `names` are the stations by index.
+    // `radio` and `world` are sections of the configuration; `names` are the stations by index.
     Channel(uint64_t seed, const Json& radio, const Json& world, std::vector<std::string> names)
         : m_seed(seed),
           m_names(std::move(names)),
@@ -70,7 +70,7 @@ class Channel
         return link.mean_db - link.gain_db;
     }
 
-    // The loss without fading, of the positions of the last call of LossDb for this link.
+    // The loss without fading, at the positions in the last call of LossDb for this link.
     double MeanLossDb(size_t a, size_t b) const
     {
         bool swapped = m_names[b] < m_names[a];

@@ -13,7 +13,7 @@ from sim_backends.ns3.ns3_options import Ns3Options
 
 _MODULES: Final = ("core", "network", "internet", "mobility", "propagation", "traffic-control", "wifi")
 _CPP20_SINCE: Final = (3, 43)
-"""The headers of 3.37 are no C++20, and those of later versions in Debian (3.43 and 3.48) are no C++17."""
+"""The headers of 3.37 do not compile as C++20. Later versions in Debian (3.43 and 3.48) do not compile as C++17."""
 
 
 def version() -> str:
@@ -26,7 +26,7 @@ def version() -> str:
 
 
 def standard_flag(ns3_version: str) -> str:
-    """Return the option of the compiler for the C++ standard of a version's headers."""
+    """Return the compiler option for the C++ standard that the headers of a version require."""
     numbers = tuple(int(number) for number in re.findall(r"\d+", ns3_version)[:2])
     return "-std=c++20" if numbers >= _CPP20_SINCE else "-std=c++17"
 
@@ -39,7 +39,7 @@ def program(ns3_version: str) -> CompiledProgram:
         packages=("ns3-core", "ns3-wifi", "nlohmann_json"),
         install="apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev",
         flags=("-O2", standard_flag(ns3_version)),
-        # pkg-config also lists libgsl, which Debian's libns3-dev does not install, and which ns-3 itself links.
+        # pkg-config also lists libgsl. Debian's libns3-dev does not install it, and ns-3 itself links it.
         libraries=tuple(f"-lns3-{module}" for module in _MODULES),
         duration="about 20 s",
     )

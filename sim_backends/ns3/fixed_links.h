@@ -1,5 +1,5 @@
-// Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of sim_backends/radio/fixed_links.py under
-// the IP of ns-3, with equal random draws for equal packets.
+// Links with a given rate, delay, jitter and loss instead of Wi-Fi: the model of sim_backends/radio/fixed_links.py
+// below ns-3's IP layer, with the same random draws for the same packets.
 
 #ifndef FIELDKIT_FIXED_LINKS_H
 #define FIELDKIT_FIXED_LINKS_H
@@ -50,7 +50,7 @@ class FixedLinks : public SimpleChannel
     int relay = -1;
     LinkParameters parameters;
     FrameTracker* tracker = nullptr;
-    std::function<PacketIdentity(uint64_t)> identity_of; // of a packet of the coordinator whose fate is open
+    std::function<PacketIdentity(uint64_t)> identity_of; // identity of a packet in transit, by its id
 
     void Connect(std::vector<Station>& stations)
     {
@@ -120,7 +120,7 @@ class FixedLinks : public SimpleChannel
         int64_t free_ns = 0; // end of the last transmission
         int64_t last_ns = 0; // last arrival
         int64_t off_ns = -1; // when the transmitter was switched off
-        std::deque<int64_t> starts_ns; // of the transmissions of queued packets
+        std::deque<int64_t> starts_ns; // start times of the transmissions of queued packets
     };
 
     // A packet on one link.
@@ -130,7 +130,7 @@ class FixedLinks : public SimpleChannel
         uint16_t protocol = 0;
         Mac48Address destination, source;
         size_t from = 0, to = 0;
-        std::vector<size_t> receivers; // stations that it is for, beyond the relay too
+        std::vector<size_t> receivers; // its final receivers, including those behind the relay
         PacketIdentity identity;
         DelayParts parts;
     };

@@ -69,7 +69,7 @@ class IdTag : public NumberTag
     }
 };
 
-// The number of a broadcast, on the one IP packet that it has.
+// The number of a broadcast, which is one IP packet.
 class BroadcastTag : public NumberTag
 {
   public:
@@ -104,14 +104,14 @@ class FrameTag : public NumberTag
 
 using protocol::DelayParts;
 
-// Counters of the frames from a station to another one, as those of a radio's driver.
+// Counters of the frames from one station to another, like the counters of a radio's driver.
 struct LinkCounters
 {
-    uint64_t frames = 0; // whose first attempt has started
+    uint64_t frames = 0; // frames whose first attempt has started
     uint64_t retries = 0;
-    uint64_t failures = 0; // given up after the last retry
+    uint64_t failures = 0; // frames given up after the last retry
     uint64_t delivered = 0;
-    double rate_bit_s = NAN; // of the last attempt
+    double rate_bit_s = NAN; // rate of the last attempt
 };
 
 // Follows the frames of all stations by ns-3's traces.
@@ -123,10 +123,10 @@ class FrameTracker
     // Station whose access point forwards a frame before it acknowledges it, as it does without aggregates.
     size_t relay = kNoStation;
 
-    // Called with the id of a packet, one of whose frames is lost, and the reason.
+    // Called with the id of a packet of which a frame is lost, and the reason.
     std::function<void(uint64_t, const std::string&)> on_lost;
 
-    // Add the next station, whose frames are not those of Wi-Fi.
+    // Add the next station, which has no Wi-Fi.
     size_t AddStation(Ptr<MobilityModel> mobility)
     {
         m_mobilities.push_back(mobility);
@@ -135,7 +135,7 @@ class FrameTracker
         return m_mobilities.size() - 1;
     }
 
-    // Follow the frames of Wi-Fi of the next station; `mobility` has its position.
+    // Follow the Wi-Fi frames of the next station; `mobility` has its position.
     void Add(Ptr<WifiNetDevice> device, Ptr<MobilityModel> mobility)
     {
         size_t station = AddStation(mobility);
@@ -225,7 +225,7 @@ class FrameTracker
         int64_t propagation_ns = 0;
         bool is_received = false;
         bool is_acknowledged = false;
-        DelayParts parts; // of the hops before; once it is received, of this hop too
+        DelayParts parts; // parts of the earlier hops, and after reception also of this hop
     };
 
     // Time for which a channel was busy. ns-3 reports a transmission at its start, and other states at their ends.

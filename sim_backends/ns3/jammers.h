@@ -1,6 +1,6 @@
 // Jammers of a scenario: noise in the whole channel. YansWifiChannel carries frames only, so the noise is added to each
-// radio as a signal that is no frame: ns-3's interference model adds it to the interference of frames, and its energy
-// detection (-62 dBm) to the carrier sense.
+// radio as a signal that is not a frame. ns-3's interference model adds it to the interference of frames, and ns-3's
+// energy detection (-62 dBm) includes it in carrier sense.
 
 #ifndef FIELDKIT_JAMMERS_H
 #define FIELDKIT_JAMMERS_H
@@ -13,7 +13,7 @@
 namespace fieldkit
 {
 
-// Access to what ns-3 reserves for its radios.
+// Access to members that ns-3 reserves for its radios.
 class RadioAccess : public WifiPhy
 {
   public:
@@ -54,14 +54,14 @@ class Jammers
     {
     }
 
-    // Emit noise from a time on, until another one; `place` returns false if the jammer is absent.
+    // Emit noise between two times; `place` returns false if the jammer is absent.
     void Add(double power_dbm, Time from, Time until, std::function<bool(Point&)> place)
     {
         Simulator::Schedule(from - Simulator::Now(), [this, power_dbm, until, place] { Emit(power_dbm, until, place); });
     }
 
   private:
-    // Power is constant for this time, in which a robot hardly moves.
+    // The power is constant for this interval, because a robot hardly moves in it.
     static constexpr int64_t kSliceNs = 1'000'000;
 
     void Emit(double power_dbm, Time until, const std::function<bool(Point&)>& place)

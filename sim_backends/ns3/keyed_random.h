@@ -119,7 +119,7 @@ class RandomStream
   public:
     RandomStream(uint64_t seed, const std::vector<std::string>& name)
     {
-        // The text is that of Python's json.dumps.
+        // The text is equal to the result of Python's json.dumps.
         std::string text = "[" + std::to_string(seed);
         for (const auto& word : name)
         {

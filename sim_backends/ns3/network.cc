@@ -21,7 +21,7 @@
 namespace fieldkit
 {
 
-// Headers of RTPS in the datagram of a sample: of the message, its time stamp and its data.
+// Size of the RTPS headers in the datagram of a sample: message header, submessages for time stamp and data.
 constexpr int64_t kRtpsHeaderBytes = 20 + 12 + 24;
 
 // Transports of bare IP packets, which have their own headers in their size.
@@ -164,7 +164,7 @@ class Network
         return request.to_ns;
     }
 
-    // Samples of all radios now, and of their links to the stations to which they send frames.
+    // Samples of all radios, and of their links to the stations to which they send frames, at the present time.
     std::string SampleLinks()
     {
         std::vector<protocol::RadioSample> radios;
@@ -201,7 +201,7 @@ class Network
         return m_outcomes.Drops();
     }
 
-    // Sum of the times of all arrivals, which differs if one differs.
+    // Sum of the times of all arrivals, which changes if one of them changes.
     uint64_t checksum() const
     {
         return m_checksum;
@@ -323,7 +323,7 @@ class Network
         m_jammers = std::make_unique<Jammers>(m_stations, *m_channel, m_setup.noise_dbm);
     }
 
-    // A jammer at a place, or carried by an agent, if there is none.
+    // A jammer, carried by an agent if it has no place.
     void AddJammer(const Json& fault, const Json& place_m)
     {
         std::function<bool(Point&)> place;
@@ -541,7 +541,7 @@ class Network
         }
         else
         {
-            return; // not a fault of radios
+            return; // the fault does not affect radios
         }
         Simulator::Schedule(At(fault.at("from")), [change] { change(1); });
         if (fault.contains("to"))
@@ -644,8 +644,8 @@ class Network
         m_pending.erase(found);
     }
 
-    // The parts of a delay. A frame may have been queued before a message of TCP that it completes: no part exceeds
-    // what the others leave of the delay.
+    // The parts of a delay. A frame may have been queued before the TCP message that it completes, so each part is
+    // limited to the rest of the delay.
     static DelayParts WithinDelay(DelayParts parts, int64_t delay_ns)
     {
         parts.propagation_ns = std::min(parts.propagation_ns, delay_ns);
@@ -693,9 +693,9 @@ class Network
     std::vector<Station> m_stations;
     std::vector<AgentEntry> m_agents;
     std::set<uint32_t> m_transmitters; // agents that forward or interfere
-    std::vector<Point> m_emitters_m;   // of jammers that no agent carries
+    std::vector<Point> m_emitters_m;   // positions of jammers that no agent carries
     std::unique_ptr<Channel> m_channel; // null with fixed links
-    std::unique_ptr<Jammers> m_jammers; // as the channel
+    std::unique_ptr<Jammers> m_jammers; // null with fixed links
     Ptr<FixedLinks> m_links;            // null with Wi-Fi
     FrameTracker m_tracker;
     std::unique_ptr<UdpTransport> m_udp;
@@ -762,8 +762,8 @@ RunAlone(Network& network, const char* path)
     return stream == nullptr;
 }
 
-// Print losses in dB for a JSON text with seed, radio, world and names: of each row of `links`, which has a time, two
-// indices and positions, and then of each row of `places`, which has two positions.
+// Print losses in dB for a JSON text with seed, radio, world and names: first for each row of `links` (a time, two
+// indices and two positions), then for each row of `places` (two positions).
 int
 PrintLosses()
 {

@@ -64,7 +64,7 @@ class Ns3Options(SimulatorOptions):
 
     @override
     def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `link`, the parameters of fixed links; or `jammers`, the position of each that no agent carries."""
+        """Return `link` with the parameters of fixed links, or `jammers` with a position (or None) per fault."""
         scenario = configuration["scenario"]
         radio = RadioOptions.model_validate(scenario["radio"])
         if radio.fixed:
@@ -74,7 +74,7 @@ class Ns3Options(SimulatorOptions):
 
 
 def _jammer_m(fault: Mapping[str, Any], world: World) -> Vector | None:
-    """Return the position of a jammer; None if an agent carries it, and for other faults."""
+    """Return the position of a jammer; None for a jammer that an agent carries, and for other faults."""
     if fault["kind"] != "jammer" or "at_m" not in fault:
         return None
     east_m, north_m = fault["at_m"]

@@ -107,7 +107,7 @@ class Obstacles
     struct Part
     {
         Point centre;
-        Point half; // of a box, along its axes; of a cylinder: radius, radius, half its height
+        Point half; // half sizes: of a box along its axes; of a cylinder: radius, radius, half its height
         double cos = 1;
         double sin = 0;
         bool is_cylinder = false;

@@ -1,4 +1,4 @@
-// Control of ns-3's simulator: time of the next event, running to a time inclusively, reports while it computes.
+// Control of ns-3's simulator: the time of the next event, a run up to and including a time, reports while it computes.
 
 #ifndef FIELDKIT_SIMULATOR_H
 #define FIELDKIT_SIMULATOR_H
@@ -19,7 +19,7 @@ using protocol::Refusal;
 
 inline protocol::Heartbeat g_heartbeat;
 
-// Time of ns-3 at time 0 of the co-simulation. It is above 0 because ns-3 sends nothing before it has run for the first time.
+// Time of ns-3 at time 0 of the co-simulation. It is above 0, because ns-3 sends nothing before its first run.
 inline int64_t g_start_ns = 1'000'000;
 
 inline int64_t
@@ -76,7 +76,7 @@ class PeekScheduler : public MapScheduler
     uint64_t m_events = 0;
 };
 
-// Process all events up to a time, inclusively.
+// Process all events up to and including a time.
 inline void
 RunUntil(int64_t to_ns)
 {

@@ -146,7 +146,7 @@ ModeName(const std::string& mode, bool is_high_band)
     return mode[0] == 'n' ? "HtMcs" + number : (is_high_band ? "OfdmRate" : "ErpOfdmRate") + number + "Mbps";
 }
 
-// Add the addresses of all others to the ARP cache of a station, because fieldkit's network has no ARP.
+// Add the addresses of all other stations to the ARP cache of a station, because fieldkit's network has no ARP.
 inline void
 FillArpCache(const Station& station, const std::vector<Station>& stations)
 {
@@ -163,7 +163,7 @@ FillArpCache(const Station& station, const std::vector<Station>& stations)
     }
 }
 
-// Give the stations, which have devices, IP addresses; callbacks of ns-3 keep references to `stations`.
+// Give IP addresses to the stations, which have devices; callbacks of ns-3 keep references to `stations`.
 inline void
 InstallIp(std::vector<Station>& stations, FrameTracker& tracker)
 {
@@ -270,7 +270,7 @@ Install(std::vector<Station>& stations, const WifiSetup& setup, Channel& channel
         wifi.AssignStreams(devices, 1000 * static_cast<int64_t>(number));
         station.device = devices.Get(0);
         auto device = DynamicCast<WifiNetDevice>(station.device);
-        // There are no stations of 802.11b, for which ns-3 uses a long slot.
+        // ns-3 uses a long slot for stations of 802.11b, which do not exist here.
         device->GetPhy()->SetAttribute("Slot", TimeValue(MicroSeconds(9)));
         tracker.Add(device, station.mobility);
         g_heartbeat.Check(NowNs());

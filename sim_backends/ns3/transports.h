@@ -35,7 +35,7 @@ struct Fates
     std::function<void(uint64_t, const std::string&)> drop;
 };
 
-// Headers that ns-3 adds to a datagram, and that a bare IP packet has already.
+// Size of the headers that ns-3 adds to a datagram; a bare IP packet already contains them.
 constexpr int64_t kIpAndUdpBytes = 28;
 
 // Time after which no station can receive a broadcast any more: frames wait for at most 0.5 s in a queue of ns-3's MAC.
@@ -157,7 +157,7 @@ class TcpTransport
     {
         bool is_newreno = congestion == "newreno";
         auto type = TypeId::LookupByName(is_newreno ? "ns3::TcpLinuxReno" : "ns3::TcpCubic");
-        // The values of fieldkit's own TCP, which are those of Linux (sim_backends/network/tcp/tcp_options.py).
+        // The values of fieldkit's own TCP, which are Linux's values (sim_backends/network/tcp/tcp_options.py).
         Config::SetDefault("ns3::TcpL4Protocol::SocketType", TypeIdValue(type));
         Config::SetDefault("ns3::TcpCubic::HyStart", BooleanValue(false));
         Config::SetDefault("ns3::TcpSocket::SegmentSize", UintegerValue(1448));
@@ -218,7 +218,7 @@ class TcpTransport
         uint64_t queued_bytes = 0;
         uint64_t written_bytes = 0;
         uint64_t read_bytes = 0;
-        std::deque<Message> messages; // that have not arrived
+        std::deque<Message> messages; // messages that have not arrived
     };
 
     using ConnectionPointer = std::shared_ptr<Connection>;
@@ -270,7 +270,7 @@ class TcpTransport
             {
                 return;
             }
-            // Counted before, as Send may call this function again.
+            // It is counted before Send, because Send may call this function again.
             connection->written_bytes += size;
             int sent = connection->sender->Send(Create<Packet>(static_cast<uint32_t>(size)));
             if (sent < 0 || static_cast<uint64_t>(sent) < size)
@@ -321,7 +321,7 @@ class TcpTransport
             return;
         }
         m_connections[key] = nullptr;
-        m_closed.push_back(connection); // its socket is calling
+        m_closed.push_back(connection); // its socket calls this function
         connection->is_open = false;
         for (const Message& message : connection->messages)
         {

@@ -20,7 +20,7 @@ QOS_HEADER_BYTES: Final = HEADER_BYTES + 2
 """Headers of a QoS data frame: 9.2.4.5."""
 
 TYPICAL_FRAMES: Final = 16
-"""Length of aggregates for which rate control compares modes: our choice, between one frame and the window."""
+"""Number of frames per aggregate for which rate control compares modes. Our choice, between 1 and the window."""
 
 _DELIMITER_BYTES: Final = 4
 MAX_PPDU_NS: Final = 5_484_000
@@ -32,8 +32,8 @@ class AmpduLimits:
     """Limits of aggregates.
 
     Attributes:
-        window: Most frames between the oldest unacknowledged one and the newest: size of the bitmap.
-        max_bytes: Most bytes of an A-MPDU.
+        window: Maximum number of frames from the oldest unacknowledged one to the newest: size of the bitmap.
+        max_bytes: Maximum size of an A-MPDU.
     """
 
     window: int

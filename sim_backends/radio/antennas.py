@@ -41,7 +41,7 @@ class Antenna:
     Attributes:
         standard: Standard of its radio, if it has no `phy`.
         tx_power_dbm: Transmit power.
-        sensitivity_dbm: Weakest frame that it detects.
+        sensitivity_dbm: Received power of the weakest frame that it detects.
         phy: Its capability since 802.11n; None for 802.11g, or 802.11n with one stream in 20 MHz, at 2.4 GHz.
     """
 
@@ -81,7 +81,7 @@ def modes_between(first: Antenna, second: Antenna) -> tuple[WifiMode, ...]:
     """Return the modes between two stations of one band, slowest first."""
     if first.phy is not None and second.phy is not None:
         return common_modes(first.phy, second.phy)
-    # 802.11n of a station without `phy` is not combined with `phy` of another: its 20 MHz at 2.4 GHz are the same.
+    # A station with `phy` uses one stream in 20 MHz with a station of 802.11n that has no `phy`.
     names = {antenna.standard if antenna.phy is None else "802.11n" for antenna in (first, second)}
     return MODES["802.11n" if names == {"802.11n"} else "802.11g"]
 
@@ -103,7 +103,7 @@ def band_of(antennas: Mapping[str, Antenna]) -> Band:
 
 
 def fixed_mode(name: str | None, antennas: Mapping[str, Antenna]) -> WifiMode | None:
-    """Return the mode in which all stations must send; stations of 802.11n and later also support those of 802.11g.
+    """Return the mode in which all stations must send. Stations of 802.11n and later also support modes of 802.11g.
 
     Args:
         name: Name of the mode; None if each station chooses its mode.

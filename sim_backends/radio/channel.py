@@ -17,8 +17,8 @@ class RadioChannel(Protocol):
     Attributes:
         names: Names of the stations; all other methods identify stations by their index in this list.
         noise_mw: Noise power at each station, in mW.
-        sensitivity_mw: Weakest frame that each station detects, in mW; a station does not send while it detects a
-            frame.
+        sensitivity_mw: Received power of the weakest frame that each station detects, in mW. A station does not send
+            while it detects a frame.
         band: Band in which all stations send.
     """
 
@@ -47,7 +47,7 @@ class RadioChannel(Protocol):
         return self.band.difs_ns
 
     def rts_threshold_bytes(self, station: int) -> int | None:  # noqa: ARG002 (a default)
-        """Return the size of the largest frame or aggregate that a station sends without RTS; None for all."""
+        """Return the largest size of a frame or aggregate that a station sends without RTS; None for any size."""
         return None
 
     def dscp_mapping(self, station: int) -> DscpMapping | None:  # noqa: ARG002 (a default)
@@ -55,7 +55,7 @@ class RadioChannel(Protocol):
         return None
 
     def power_save_timeout_ns(self, station: int) -> int | None:  # noqa: ARG002 (a default)
-        """Return the time after its last frame after which a station dozes; None if it never does."""
+        """Return the time from a station's last frame until it dozes; None if it never dozes."""
         return None
 
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)

@@ -1,7 +1,7 @@
 """EDCA: four access categories with their own queue and contention in each station (IEEE 802.11-2020, 10.23.2).
 
-Parameters are those that Linux's mac80211 sets by default: table 9-155 with the TXOP limits of IEEE 802.11-2012 for
-voice and video, and without TXOPs of more than one exchange for the others.
+The parameters are the defaults of Linux's mac80211: table 9-155 with the TXOP limits of IEEE 802.11-2012 for voice
+and video. The other categories have no TXOPs of more than one exchange.
 """
 
 from collections import deque
@@ -44,7 +44,7 @@ PARAMETERS: Final = (
     CategoryParameters(2, (CW_MIN + 1) // 2 - 1, CW_MIN, 3_008_000),
     CategoryParameters(2, (CW_MIN + 1) // 4 - 1, (CW_MIN + 1) // 2 - 1, 1_504_000),
 )
-"""By access category."""
+"""Default parameters by access category."""
 
 _UNLIMITED_NS: Final = 1 << 62
 _PRIORITY: Final = (VOICE, VIDEO, BEST_EFFORT, BACKGROUND)
@@ -70,8 +70,8 @@ def category_of(dscp: int, mapping: DscpMapping) -> int:
 
     Args:
         dscp: Differentiated services code point, 0 to 63.
-        mapping: `linux`: its three upper bits are the user priority (cfg80211 up to Linux 6.10). `rfc8325`: that RFC;
-            there the classes for network control (CS6, CS7) are best effort.
+        mapping: `linux`: the three upper bits of the DSCP are the user priority (cfg80211 up to Linux 6.10).
+            `rfc8325`: the mapping of RFC 8325, in which the classes for network control (CS6, CS7) are best effort.
     """
     return _OF_USER_PRIORITY[dscp >> 3 if mapping == "linux" else _RFC_8325.get(dscp, 0)]
 
@@ -205,7 +205,7 @@ class AccessCategories(Generic[Payload]):
             queue.contention.defer_until(until_ns + queue.contention.ifs_ns)
 
     def wait_until(self, now_ns: int) -> None:
-        """Start the countdown not before the end of the wait for a response, during which the channel was idle."""
+        """Restart the countdown at the end of the wait for a response, during which the channel was idle."""
         for queue in self._queues:
             queue.contention.defer_until(now_ns)
 
@@ -226,8 +226,8 @@ class AccessCategories(Generic[Payload]):
     def select(self, now_ns: int) -> deque[Frame[Payload]]:
         """Return the queue whose first frame starts now; it becomes the active one.
 
-        Of several that could start, the one with the highest priority does, and others behave as after a collision:
-        10.23.2.4. All others count down until now.
+        If several categories can start, the one with the highest priority starts, and the others behave as after a
+        collision (10.23.2.4). Categories without frames count their backoff down until now.
         """
         if now_ns == self._continue_ns and self.active.frames and now_ns < self._txop_end_ns:
             return self.active.frames
@@ -247,7 +247,7 @@ class AccessCategories(Generic[Payload]):
         return winner.frames
 
     def remaining_ns(self, now_ns: int) -> int:
-        """Return the rest of the transmission opportunity; a long time if it has no limit."""
+        """Return the remaining time of the transmission opportunity; a long time if it has no limit."""
         return self._txop_end_ns - now_ns if self._txop_end_ns else _UNLIMITED_NS
 
     def continue_ns(self, now_ns: int, exchange_ns: int) -> int | None:

@@ -1,9 +1,9 @@
 """Packet errors by noise: bit errors of the modulation, and the convolutional code.
 
-The model is that of Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), after Miller,
-"Validation of 802.11a/UWB coexistence simulation" (NIST, 2003): hard decisions on a channel with additive white
-Gaussian noise; the error probability of the code by the union bound over its weight spectrum. Each spatial stream has
-the signal-to-noise ratio of the frame, as in ns-3.
+The model is from Pei and Henderson, "Validation of OFDM error rate model in ns-3" (2010), which follows Miller,
+"Validation of 802.11a/UWB coexistence simulation" (NIST, 2003). It assumes hard decisions on a channel with additive
+white Gaussian noise. The error probability of the code is the union bound over its weight spectrum. Each spatial
+stream has the signal-to-noise ratio of the frame, as in ns-3.
 """
 
 import math

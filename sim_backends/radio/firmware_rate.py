@@ -1,11 +1,11 @@
-"""Rate control by the firmware of a radio, as an envelope: it is not published and differs between versions.
+"""Rate control by the firmware of a radio. Real algorithms are not published and differ between versions.
 
 Most robots have such a radio: brcmfmac (FullMAC, Raspberry Pi) and ath10k select rates in firmware, iwlwifi in its
-firmware or its driver. The model has what they have in common, with two parameters. The firmware measures the signal
-of the peer's frames, and after each interval selects the fastest mode that has at most 10 % of errors with a margin
-below that signal. If fewer than half of an interval's frames were acknowledged, it selects a mode one step slower; if
-more than 90 % were, it goes one of these steps back. Each further attempt for a frame is one step slower than the
-last.
+firmware or its driver. The model contains what these algorithms have in common, with two parameters: margin and
+interval. The firmware measures the signal of the peer's frames. After each interval it selects the fastest mode that
+has at most 10 % of errors at a signal weaker by the margin. If fewer than half of an interval's frames were
+acknowledged, it selects a mode one step slower; if more than 90 % were acknowledged, it undoes one such step. Each
+further attempt for a frame is one step slower than the last.
 
 To bound a result, compare a margin of 0 dB and a short interval with 10 dB and a long interval.
 """

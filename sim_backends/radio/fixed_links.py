@@ -78,7 +78,7 @@ class FixedLink:
             packet: Identity that keys its random draws.
 
         Returns:
-            Arrival time and delay, whose parts add up to the time until the arrival; or the reason if it never
+            Arrival time and delay (the parts add up to the time until the arrival); or the reason why it never
             arrives.
         """
         parameters = self._parameters

@@ -39,7 +39,7 @@ from sim_backends.radio.reception import Reception
 from sim_backends.radio.rts_cts import NO_RTS_BYTES, ProtectedFrame, RtsCts
 from sim_backends.radio.stations import Peer, Station
 
-# 10.3.2.11: an ACK that has not started by then does not arrive; aRxPHYStartDelay of table 17-21 is 20 us.
+# ACK timeout after SIFS: 10.3.2.11, one slot and aRxPHYStartDelay, which is 20 us in table 17-21.
 _ACK_TIMEOUT_AFTER_SIFS_NS: Final = SLOT_NS + 20_000
 
 # Retry interval of a station that finds the channel jammed; a robot hardly moves in this time.
@@ -342,7 +342,7 @@ class FrameExchange(Generic[Payload]):
         acknowledged: bool,
         is_sent: bool = True,
     ) -> None:
-        """End an attempt; `is_sent` is False if there was no CTS before the data, which says nothing about modes."""
+        """End an attempt; `is_sent` is False if a CTS was missing; the result is then not used for rate control."""
         if not acknowledged:
             if station.categories is None:
                 station.contention.set_busy_until(now_ns)

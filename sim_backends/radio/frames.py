@@ -89,7 +89,7 @@ def success_probability(frame: Transmission, receiver: int, noise_mw: float) -> 
         noise_mw: Its noise power in 20 MHz.
     """
     bits = 8.0 * frame.size_bytes
-    if not frame.interferers:  # most frames, without a further call
+    if not frame.interferers:  # true for most frames; a call of part_success_probability would take longer
         mode = frame.mode
         return math.exp(log_success(mode, decibel(frame.powers_mw[receiver] / (noise_mw * mode.noise_factor)), bits))
     return part_success_probability(frame, receiver, noise_mw, (frame.start_ns, frame.end_ns), bits)
@@ -213,7 +213,7 @@ def attempt_record(
 ) -> TransmissionAttempt:
     """Return the log entry of an attempt at `frame`, decoded by the stations with the indices `received`.
 
-    `size_bytes` is its size with MAC header and FCS. Frames of one aggregate have the times of the whole.
+    `size_bytes` is its size with MAC header and FCS. Each frame of an aggregate has the times of the aggregate.
     """
     return TransmissionAttempt(
         transmission.start_ns,

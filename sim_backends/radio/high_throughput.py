@@ -1,6 +1,6 @@
 """Modes of 802.11n, ac and ax (HT, VHT, HE) with one or two spatial streams in 20, 40 and 80 MHz.
 
-Clauses 19 (HT) and 21 (VHT) are those of IEEE 802.11-2020, clause 27 (HE) that of IEEE 802.11ax-2021. Beamforming,
+Clauses 19 (HT) and 21 (VHT) are in IEEE 802.11-2020, clause 27 (HE) is in IEEE 802.11ax-2021. Beamforming,
 STBC, LDPC, dual carrier modulation, 1x HE-LTF, packet extension and multi-user frames are not modelled.
 """
 
@@ -72,14 +72,14 @@ class PhyCapability:
         amendment: Its amendment of 802.11.
         band_name: Its band.
         width_mhz: Widest channel.
-        streams: Most spatial streams.
+        streams: Maximum number of spatial streams.
         guard_interval_ns: Shortest guard interval.
         rate_control: Its rate control.
         firmware_margin_db: Margin of `firmware` below the measured signal.
         firmware_interval_ns: Time between two selections of `firmware`.
-        rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS; None for all.
+        rts_threshold_bytes: Largest size of a frame or aggregate that it sends without RTS; None for any size.
         access_categories: How it maps packets to its access categories; None if it sends all as best effort.
-        power_save_timeout_ns: Time after its last frame after which it dozes; None if it never does.
+        power_save_timeout_ns: Time from its last frame until it dozes; None if it never dozes.
     """
 
     amendment: WifiAmendment
@@ -156,8 +156,9 @@ def _common(first: PhyCapability, second: PhyCapability) -> _Common:
 def common_modes(first: PhyCapability, second: PhyCapability) -> tuple[WifiMode, ...]:
     """Return the modes that two stations of one band support, slowest first.
 
-    They use the latest amendment, the widest channel and the shortest guard interval that both support, and all
-    numbers of streams up to the largest. A station of 802.11ax uses 800 ns with one of an earlier amendment.
+    They use the latest amendment, the widest channel and the shortest guard interval that both support, and every
+    number of streams that both support. With a station of an earlier amendment, a station of 802.11ax uses a guard
+    interval of 800 ns.
     """
     common = _common(first, second)
     modes = [
@@ -187,7 +188,7 @@ def mode_groups(first: PhyCapability, second: PhyCapability) -> tuple[tuple[Wifi
 def format_modes(
     phy_format: HighThroughput, band_name: BandName, width_mhz: int, streams: int, guard_interval_ns: int
 ) -> tuple[WifiMode, ...]:
-    """Return the modes of all MCS of a format, slowest first; always the same objects."""
+    """Return the modes of all MCS of a format, slowest first; each call returns the same objects."""
     return tuple(
         _mode(phy_format, BANDS[band_name], mcs, width_mhz=width_mhz, streams=streams, guard_ns=guard_interval_ns)
         for mcs in range(_MCS_COUNT[phy_format])

@@ -1,13 +1,13 @@
 """Minstrel-HT: the rate control of Linux for radios of 802.11n and later whose driver is a SoftMAC.
 
-The algorithm is that of `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
+The algorithm is from `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
 width, guard interval and number of streams. Each mode has a smoothed share of acknowledged frames, updated every
 50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At most
 every 20 ms a frame tries another mode once before the second mode of the chain.
 
-Three things differ. Rates of 802.11a/b/g are not used. Linux has no groups of 802.11ax; those here follow the same
-rules. A frame is tried up to the retry limit, at the end of its chain in the robust mode; Linux gives up a single
-frame at the end of its chain.
+Three things differ. Rates of 802.11a/b/g are not used. Linux has no groups of 802.11ax; here they follow the same
+rules. After its chain, a frame is tried in the robust mode up to the retry limit; Linux gives up a single frame at
+the end of its chain.
 """
 
 import math
@@ -52,11 +52,12 @@ class _Statistics:
 
     Attributes:
         group: Index of its group.
-        duration_ns: Time of the symbols of a frame of 1200 bytes among 16.
+        duration_ns: Duration of the symbols of an aggregate of 16 frames of 1200 bytes, divided by 16.
         frames: Frames sent since the last update.
         acknowledged: How many of them were acknowledged.
         is_measured: True if the mode was used before the last update.
-        share: Smoothed share of acknowledged frames; for a mode that was not used, that of faster modes of its group.
+        share: Smoothed share of acknowledged frames. A mode that was not used has at least the highest share of the
+            faster modes of its group.
         previous_share: Value of `share` before its last measurement.
     """
 
@@ -155,11 +156,11 @@ class MinstrelHt(RateControl):
 
     @property
     def stages(self) -> tuple[tuple[WifiMode, int], ...]:
-        """Modes of the chain of a frame that is no sample, with their tries."""
+        """The modes of the chain with their numbers of tries, for a frame that is not a sample."""
         return tuple((mode, self._count_tries(mode)) for mode in (self._best, self._second, self._robust))
 
     def _lower_group(self, group: int) -> int | None:
-        """Return the group before this one that has no more streams; None if there is none."""
+        """Return the closest earlier group that has at most as many streams as this one; None if there is none."""
         streams = self._groups[group][0].streams
         lower = (number for number in range(group - 1, -1, -1) if self._groups[number][0].streams <= streams)
         return next(lower, None)
@@ -209,8 +210,9 @@ class MinstrelHt(RateControl):
     def _find_robust(self) -> WifiMode:
         """Return the third mode of the chain.
 
-        It is the mode with the highest throughput among those with more than 75 % success, or else the one with the
-        highest share; with several streams, the one of the groups with fewer streams than the best mode has.
+        It is the mode with the highest throughput among the modes with more than 75 % success. If no mode has more
+        than 75 %, it is the mode with the highest share. If groups with fewer streams than the best mode have usable
+        modes, it is selected from these groups.
         """
         best = self._statistics[self._best]
         robust, group_robust = self._groups[0][0], []
@@ -256,8 +258,9 @@ class MinstrelHt(RateControl):
     def _refill_samples(self) -> None:
         """Fill the lists of modes to sample.
 
-        The first list has, by group, the slowest mode that is faster than the best; the second has random faster
-        modes; the third has random modes between the fastest and the slowest of the chain, unless they are reliable.
+        The first list has the slowest mode of each group that is faster than the best mode. The second has random
+        modes that are faster than the chain. The third has random modes that are between the fastest and the slowest
+        mode of the chain and are not reliable.
         """
         best_ns, *others_ns = (
             self._statistics[mode].duration_ns for mode in (self._best, self._second, self._robust)
@@ -284,7 +287,7 @@ class MinstrelHt(RateControl):
         return None
 
     def _next_jump(self, fastest_ns: int, slowest_ns: int) -> WifiMode | None:
-        """Return a random mode that is faster than the chain; add slower ones that are drawn before to their list."""
+        """Return a random mode that is faster than the chain; add slower modes drawn before it to their list."""
         jumps, slower = self._samples[_JUMP], self._samples[_SLOWER]
         for step in range(1, len(self._groups) + 1):
             number = (self._last_group[_JUMP] + step) % len(self._groups)
@@ -323,5 +326,5 @@ def _duration_ns(mode: WifiMode) -> int:
 
 
 def _padded(modes: list[WifiMode]) -> tuple[WifiMode, ...]:
-    """Return the mode of each attempt: those of the chain, then its last mode up to the retry limit."""
+    """Return the mode of each attempt: the modes of the chain, then its last mode up to the retry limit."""
     return tuple((modes + modes[-1:] * SHORT_RETRY_LIMIT)[:SHORT_RETRY_LIMIT])

@@ -124,7 +124,7 @@ class WifiInWorld(Wifi[Payload]):
         options: Radio options.
         antennas: The stations.
         world: Obstacles between the stations; None for open ground.
-        path_losses_db: Returns the mean losses that replace those of the world, by transmitter and receiver; None if
+        path_losses_db: Returns the mean losses that replace losses in the world, by transmitter and receiver; None if
             there are none.
     """
 

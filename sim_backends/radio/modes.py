@@ -133,12 +133,12 @@ class WifiMode:
 
     @property
     def guard_interval_ns(self) -> int:
-        """Guard interval within the symbol, which lasts 12.8 us without it in HE and 3.2 us in other formats."""
+        """Guard interval: the symbol duration minus 12.8 us in HE and minus 3.2 us in other formats."""
         return self.symbol_ns - (12_800 if self.phy_format == "HE" else 3_200)
 
     @cached_property
     def noise_factor(self) -> float:
-        """Noise power relative to that in 20 MHz."""
+        """Noise power relative to the noise power in 20 MHz."""
         return self.width_mhz / 20
 
     def airtime_ns(self, size_bytes: int) -> int:
@@ -204,7 +204,7 @@ OFDM_MODES: Final[dict[BandName, tuple[WifiMode, ...]]] = {
     "5 GHz": _modes("a", BANDS["5 GHz"], _OFDM_TABLE),
     "6 GHz": _modes("a", BANDS["6 GHz"], _OFDM_TABLE),
 }
-"""The modes without high throughput of each band."""
+"""The non-HT modes of each band."""
 
 # Indices of the mandatory rates of clause 17, fastest first.
 _MANDATORY: Final = (4, 2, 0)
@@ -219,8 +219,8 @@ def basic_mode(band: Band) -> WifiMode:
 def control_mode(mode: WifiMode) -> WifiMode:
     """Return the mode of the ACK to a frame in `mode`: the fastest mandatory rate that is no faster (10.6.6.5).
 
-    The reference rate of an HT, VHT or HE mode is that of the clause 17 mode with its modulation and code rate
-    (10.6.11).
+    The reference rate of an HT, VHT or HE mode is the rate of the clause 17 mode with the same modulation and code
+    rate (10.6.11).
     """
     reference, modes = mode, OFDM_MODES[mode.band.name]
     if mode.ht:

@@ -1,10 +1,10 @@
 """Power save of stations of an access point (IEEE 802.11-2020, 11.2.3), as a delay of the frames to them.
 
 A station dozes when it has sent and received nothing for a time. The access point buffers frames for it until the
-next beacon; the station, which hears every beacon, then wakes. If it sends a frame, which announces that it is awake,
-it gets the buffered ones immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for
-the next DTIM as long as any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every
-beacon is received, and waking takes no time.
+next beacon, which wakes the station. A frame from the station also ends its doze, and the access point then sends the
+buffered frames immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for the next
+DTIM as long as any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every beacon is
+received, and waking takes no time.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +28,7 @@ class PowerSave(Generic[Payload]):
     """The dozing stations, and the frames that the access point buffers for them.
 
     Args:
-        timeouts_ns: Time after the last frame after which a station dozes, by index; others never doze.
+        timeouts_ns: Time from the last frame until a station dozes, by index of the station; others never doze.
         beacon_phase_ns: Time of the first beacon, which has a DTIM.
         events: Scheduled events.
         release: Queues a frame at its transmitter.

@@ -34,8 +34,9 @@ def two_ray_db(start_m: Floats, end_m: Floats, frequency_hz: float) -> Floats:
     """Return the loss with ground reflection: the sum of the direct and the reflected wave, with their phases.
 
     Heights are over flat ground at 0. The reflection is Fresnel's for vertical polarization on medium dry ground
-    (ITU-R P.2040-1, eq. 31b and table 3); see Rappaport, Wireless Communications, 4.5 and 4.6. The loss exceeds that
-    of the direct wave by at most 40 dB when the two cancel: no real ground is flat enough for more.
+    (ITU-R P.2040-1, eq. 31b and table 3); see Rappaport, Wireless Communications, 4.5 and 4.6. When the two waves
+    cancel, the loss exceeds the loss of the direct wave by at most 40 dB, because no real ground is flat enough for
+    more.
     """
     direct_m = _length_m(start_m, end_m)
     image_m = end_m * np.array((1.0, 1.0, -1.0))
@@ -71,16 +72,16 @@ _WAVES: Final = 256
 
 
 class Fading:
-    """Power gains of links by the positions of their ends, with mean 1: Rician with line of sight, else Rayleigh.
+    """Power gains of links by the positions of their ends, with mean 1: Rician with line of sight, Rayleigh without.
 
     A gain is the sum of 12 multipath components (echoes), each with its own directions of departure and arrival, and
     a constant component of K times their power. When an end moves, the phase of each echo changes with the distance
     moved in the echo's direction, as in the model of a ring of scatterers around each end (Akki and Haber, IEEE
     Trans. Veh. Technol. 35:2, 1986; Patel, Stuber and Pratt, IEEE Trans. Commun. 53:374, 2005). The autocorrelation
     of the echoes is therefore J0(2 pi d / wavelength) over a distance d moved by one end (Clarke, Bell Syst. Tech. J.
-    47:957, 1968), and the product of both if both ends move. Moving scatterers around two ends at rest give the same
-    kind of autocorrelation, J0(2 pi v t / wavelength). One gain applies to the whole channel: over some tens of
-    metres outdoors, echoes arrive less than 1/20 MHz = 50 ns late.
+    47:957, 1968). If both ends move, it is the product of the J0 of each end. Moving scatterers around two ends at
+    rest give the same kind of autocorrelation, J0(2 pi v t / wavelength). One gain applies to the whole channel: over
+    some tens of metres outdoors, echoes arrive less than 1/20 MHz = 50 ns late.
 
     A gain depends only on time and positions, not on the number or order of calls. Directions and phases of a link
     are drawn when the link is first used: if few of n stations send, few of the n^2 / 2 links are needed.
@@ -234,8 +235,8 @@ class Shadowing:
     The shadowing of a path is sigma (F(a) + F(b)) / sqrt(2), where F is a field with mean 0, variance 1 and the
     autocorrelation exp(-d / d0) of Gudmundson (Electron. Lett. 27:2145, 1991); it is the same in both directions, and
     paths with a common end are correlated (Agrawal and Patwari, IEEE Trans. Wirel. Commun. 8:5576, 2009). F is a sum
-    of 256 plane waves whose wave numbers have the density of that autocorrelation in two dimensions, with the
-    distribution 1 - 1 / sqrt(1 + (k d0)^2).
+    of 256 plane waves. Their wave numbers k follow the spectral density of that autocorrelation in two dimensions,
+    with the cumulative distribution 1 - 1 / sqrt(1 + (k d0)^2).
 
     Args:
         seed: Seed of the field.

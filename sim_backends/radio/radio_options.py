@@ -65,25 +65,24 @@ class RadioOptions(Strict):
         decorrelation: Distance over which shadowing decorrelates to 1/e.
         fading: True if multipath components fade: Rician with line of sight, Rayleigh without. `false` gives a link
             without randomness within its range.
-        k_db: Rician K factor in dB: power of the constant component over that of the scattered ones, with line of
-            sight. 6 dB is that of model F, large spaces indoors and outdoors, of IEEE 802.11-03/940r4 (TGn channel
-            models).
+        k_db: Rician K factor in dB: power ratio of the constant and the scattered components, with line of
+            sight. IEEE 802.11-03/940r4 (TGn channel models) has 6 dB for model F, large spaces indoors and outdoors.
         stir_m_s: Speed of moving objects around the robots (leaves, people), in m/s: a link between two robots at
-            rest fades as if one moved at this speed. The TGn models have 1.2 km/h (0.33 m/s), those of TGac (IEEE
-            802.11-09/0308r12) 0.089 km/h (0.025 m/s); 0.1 m/s lies between, and gives a coherence time of about 0.5
-            s.
+            rest fades as if one moved at this speed. The TGn models have 1.2 km/h (0.33 m/s), the TGac models (IEEE
+            802.11-09/0308r12) have 0.089 km/h (0.025 m/s); 0.1 m/s lies between, and gives a coherence time of about
+            0.5 s.
         noise_floor_dbm: Noise and interference at a receiver, in dBm. -95 dBm is thermal noise in 20 MHz (-101 dBm)
             and a noise figure of 6 dB.
         mode: Fixed transmission mode: `g6` to `g54` (Mbit/s), `a6` to `a54` above 2.4 GHz, `n0` to `n7` (MCS); with
-            `phy` also format, width in MHz, MCS, streams and guard interval, `vht80-mcs9-2ss-400ns`. Without it,
-            stations adapt the rate to acknowledgements.
+            `phy` also format, width in MHz, MCS, streams and guard interval, `vht80-mcs9-2ss-400ns`. If it is
+            omitted, stations adapt the rate to acknowledgements.
         queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
             Linux's default.
         loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted
             and one of the next three is given.
         delay: Fixed links: delay of a link in addition to queuing and serialization. The default is 0.2 ms, about
-            DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the host's
-            interrupt.
+            the sum of DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the
+            host's interrupt.
         rate: Fixed links: bit rate of every link, `20Mbit/s`, or `unlimited`; 54 Mbit/s if omitted.
         jitter: Fixed links: width of the uniformly distributed extra delay of a link.
     """

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.random import Philox  # numpy would import it at the first draw, and delay a packet
+from numpy.random import Philox  # otherwise numpy imports it at the first draw, which delays a packet
 from numpy.typing import NDArray
 
 # Most streams are used for a few draws only: there is one per flow, attempt and purpose.
@@ -58,7 +58,7 @@ class RandomStream:
         return uniforms
 
     def _uniforms(self, counter: int, count: int) -> NDArray[np.float64]:
-        # Raw words are used, because numpy guarantees their values across versions, but not those of its
+        # Raw words are used, because numpy guarantees their values across versions, but not the values of its
         # distributions.
         return _uniforms(Philox(key=self._key, counter=counter).random_raw(count))
 

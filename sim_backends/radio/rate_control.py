@@ -59,7 +59,7 @@ _SEGMENT_NS: Final = 6_000_000
 _LOW_SHARE, _HIGH_SHARE = 0.1, 0.95
 _SAMPLES: Final = 4
 _STALE_UPDATES: Final = 20
-# A mode of aggregates that fails is evaluated before the end of its interval, as in Linux's minstrel_ht.
+# If frames are aggregated, a failing mode ends the update interval early, as in Linux's minstrel_ht.
 _FAILING_ATTEMPTS, _FAILING_SHARE = 30, 0.2
 
 
@@ -71,14 +71,14 @@ class Minstrel(RateControl):
     in the most robust (the fastest with at least 95 % success), and finally in the slowest; each as often as fits
     into 6 ms, at most twice if its success share is above 95 % or below 10 %, and in total at most up to the
     standard's retry limit. A tenth of the frames are samples: a mode that is faster than the best, or was not used
-    for 20 updates, is tried before the best, at most four times per update if its share is above 95 % or below 10 %;
-    if there is no such mode, a slower mode replaces the second best, which costs nothing while the best succeeds. All
-    this is as in Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and in the documentation of mac80211's minstrel.
+    for 20 updates, is tried before the best, at most four times per update if its share is above 95 % or below 10 %.
+    If there is no such mode, a slower mode replaces the second best, which costs nothing while the best succeeds.
+    This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of mac80211's minstrel.
 
     Three things differ. The initial shares are computed from the signal-to-noise ratio, like in drivers that start
-    from RSSI. The frames that sample, and the sampled modes, are drawn per frame and not counted, so that an
-    additional frame does not change the results of others. Modes of 802.11n and later are selected by the same
-    algorithm, for which Linux has minstrel_ht; it measures the mean length of aggregates, which is an argument here.
+    from RSSI. A random draw per frame, and not a counter, selects sampling frames and their modes, so that an
+    additional frame does not change the results of others. The same algorithm selects modes of 802.11n and later.
+    Linux has minstrel_ht for them, which measures the mean length of aggregates; here the length is an argument.
 
     Args:
         modes: The available modes, two or more, slowest first.

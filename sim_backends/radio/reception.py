@@ -115,7 +115,7 @@ class Reception(Generic[Payload]):
             transmission.interferers.clear()
 
     def reserve(self, now_ns: int, transmission: Transmission, until_ns: int) -> None:
-        """Let the stations that have received a transmission, which ends now, wait until `until_ns`; before `end`."""
+        """Make the receivers of a transmission, which ends now, wait until `until_ns`; call it before `end`."""
         if transmission.interferers:
             return
         for index in transmission.receivers:
@@ -125,7 +125,7 @@ class Reception(Generic[Payload]):
                 self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
 
     def abort(self, index: int, now_ns: int) -> None:
-        """Abort the transmission of a station, so that no station decodes it, and its reception."""
+        """Abort the transmission of a station, which then no station decodes, and abort its reception."""
         station = self._stations[index]
         if station.receiving is not None:
             station.receiving.receivers.discard(index)
@@ -173,7 +173,7 @@ class Reception(Generic[Payload]):
     def decoded_frames(
         self, index: int, transmission: Transmission, aggregate: Aggregate[Payload]
     ) -> list[Frame[Payload]]:
-        """Return the frames of an aggregate that ends now and that a station decodes; call it once, before `end`."""
+        """Return the frames that a station decodes of an aggregate that ends now; call it once, before `end`."""
         if index not in transmission.receivers:
             return []
         noise_mw, draws = self._channel.noise_mw[index], self._link_draws(transmission.transmitter, index, "data")

@@ -81,8 +81,8 @@ class RtsCts(Generic[Payload]):
     def start(self, now_ns: int, frame: ProtectedFrame[Payload]) -> None:
         """Send RTS; the station's exchange has started.
 
-        Stations that receive the RTS wait for the CTS, and no longer if the data frame does not start after it
-        (10.3.2.4); the CTS reserves the channel until the end of the response.
+        Stations that receive the RTS wait for the CTS. They stop waiting if the data frame does not start after it
+        (10.3.2.4). The CTS reserves the channel until the end of the response.
         """
         mode = control_mode(frame.mode)
         end_ns = now_ns + mode.airtime_ns(RTS_BYTES)

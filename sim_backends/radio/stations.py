@@ -36,7 +36,7 @@ class Station(Generic[Payload]):
         offered: Number of packets that were passed to it for sending.
         aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
-        categories: Its access categories, of which `queue` is the active one; None if it has only one queue.
+        categories: Its access categories (`queue` belongs to the active one); None if it has only one queue.
     """
 
     __slots__ = (
@@ -72,7 +72,7 @@ class Station(Generic[Payload]):
         self.exchange_id = self.offered = 0
 
     def use_categories(self, mapping: DscpMapping, band: Band) -> None:
-        """Replace the queue and the contention by those of the access categories."""
+        """Use the queues and the contention of the access categories instead of the single queue."""
         self.contention = self.categories = AccessCategories(mapping, band, self._backoff)
         self.queue = self.categories.active.frames
 

@@ -44,13 +44,13 @@ class _Row:
 
     Args:
         revision: Revision of the positions for which it was computed.
-        mean_mw: Received power of the station at each other, without fading, in mW.
+        mean_mw: Received power of the station at each other station, without fading, in mW.
 
     Attributes:
         linked: True for each station that receives it and is received by it, without fading; None before the first
             use.
         slot: Number of the time slot (of the validity of a gain) for which `powers_mw` was computed; -1 for none.
-        powers_mw: Received power of the station at each other in that slot; without fading if the slot is -1.
+        powers_mw: Received power of the station at each other station in that slot; without fading if `slot` is -1.
     """
 
     __slots__ = ("linked", "mean_mw", "powers_mw", "revision", "slot")
@@ -176,7 +176,7 @@ class WorldChannel(RadioChannel):
         self._places, self._velocities = places, velocities
         self._present = np.array([place is not None for place in places])
         self._places_m = np.array([place or STILL for place in places], dtype=np.float64).reshape(-1, 3)
-        # If no station moves, the time must not matter, not even through rounding.
+        # If no station moves, the result must not depend on the time, not even by rounding.
         self._moved_ns = now_ns if self._in_motion else 0
         self._revision += 1
         if moved.all():
@@ -231,7 +231,7 @@ class WorldChannel(RadioChannel):
         return round(_GAIN_VALID_PERIODS * period_s * 1e9)
 
     def use_losses(self, loss_db: Floats) -> None:
-        """Use these losses from row to column, in dB, until an end of the path moves; infinity is out of range."""
+        """Use these losses in dB (rows: transmitters, columns: receivers) until an end moves; inf is out of range."""
         self._revision += 1
         self._loss_db = loss_db
         self._k = np.zeros(loss_db.shape)

@@ -121,7 +121,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "MPC_Z_VEL_MAX_DN", _CM),
         Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "MPC_Z_VEL_MAX_UP", _CM),
         integer("WP_YAW_BEHAVIOR", 2, 0, 3),
-        # Constants in its code, or parameters of PX4 that the vehicle reads.
+        # Constants in ArduCopter's code, or parameters of PX4 that the vehicle reads.
         fixed("", 2.1, "COM_DISARM_LAND"),
         fixed("", 1.0, "MPC_ACC_DOWN_MAX"),
         fixed("", 0.0, "MIS_TAKEOFF_ALT"),
@@ -136,7 +136,7 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
 
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
-    """Return the refusal of a change of mode; unarmed it accepts any (Copter::set_mode)."""
+    """Return the refusal of a change of mode; an unarmed vehicle accepts any mode (Copter::set_mode)."""
     if mode is not Mode.MISSION or not conditions.armed:
         return None
     text, commands = "Mode change to AUTO failed: init failed", conditions.mission_commands

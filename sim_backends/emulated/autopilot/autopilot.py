@@ -201,7 +201,7 @@ class Autopilot:
         yield from requested
 
     def _requested(self, kind: float, param2: float) -> list[Message]:
-        """Return the messages of an id, empty if the autopilot does not send them on request."""
+        """Return the messages with an id; empty if the autopilot does not send them on request."""
         if kind == AVAILABLE_MODES:
             return self._telemetry.available_modes(param2)
         build = self._telemetry.builders.get(int(kind)) if is_integer_up_to(kind, _LAST_MESSAGE_ID) else None

@@ -11,7 +11,7 @@ from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.vehicle import Refused, Vehicle
 
 FORCE: Final = 21196
-"""Second parameter of MAV_CMD_COMPONENT_ARM_DISARM that stops the motors also in the air."""
+"""Value of the second parameter of MAV_CMD_COMPONENT_ARM_DISARM that stops the motors even in the air."""
 
 _FRAME_RELATIVE: Final = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
@@ -85,7 +85,7 @@ class Commands:
         return _ACCEPTED
 
     def _take_off(self, message: Message) -> int:
-        """Take off to a height above home (COMMAND_LONG) or in the named frame; NaN or 0 is the default height."""
+        """Take off to a height above home (COMMAND_LONG) or in the named frame; NaN or 0 means the default height."""
         height_m, home_m = _seventh_parameter(message), self._vehicle.home_m
         if not math.isfinite(height_m) or height_m == 0:
             self._vehicle.take_off()
@@ -120,7 +120,7 @@ class Commands:
         return _ACCEPTED if self._change_custom_mode(number) else self._vehicle.firmware.unknown_mode
 
     def _change_custom_mode(self, custom_mode: int) -> bool:
-        """Change to the mode of a number; return True if the firmware has it."""
+        """Change to the mode with a number; return True if the firmware has this mode."""
         mode = self._vehicle.firmware.mode_of(custom_mode)
         if mode is not None:
             self._vehicle.change_mode(mode)
@@ -160,7 +160,7 @@ class Commands:
         return _ACCEPTED if self._select_item(message.param1) else _DENIED
 
     def _select_item(self, number: float) -> bool:
-        """Make an item the current one; return True if there is one of this number."""
+        """Make the item with a number the current item; return True if there is such an item."""
         mission = self._vehicle.mission
         if not is_integer_up_to(number, len(mission.items) - 1):
             return False

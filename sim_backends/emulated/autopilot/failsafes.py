@@ -90,7 +90,8 @@ class Failsafes(Protocol):
 class ArduCopterFailsafes:
     """Battery and ground-station failsafes of ArduCopter.
 
-    A triggered battery failsafe lasts until the next boot, one of the ground station until a heartbeat arrives.
+    A triggered battery failsafe lasts until the next boot. A triggered ground-station failsafe lasts until a
+    heartbeat arrives.
 
     Args:
         parameters: BATT_*, FS_GCS_*, SYSID_MYGCS.
@@ -181,9 +182,9 @@ class ArduCopterFailsafes:
 
 
 _BATTERY_ACTIONS: Final = {1: Mode.LAND, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
-"""BATT_FS_LOW_ACT, BATT_FS_CRT_ACT; SmartRTL is RTL here, and 5 (terminate) is not emulated."""
+"""Mode by BATT_FS_LOW_ACT or BATT_FS_CRT_ACT; SmartRTL is RTL here, and 5 (terminate) is not emulated."""
 _GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: Mode.LAND, 6: Mode.RTL, 7: Mode.LAND}
-"""FS_GCS_ENABLE."""
+"""Mode by FS_GCS_ENABLE."""
 
 
 class Px4Failsafes:
@@ -275,7 +276,7 @@ class Px4Failsafes:
 
 
 _DATA_LINK_ACTIONS: Final = {1: Mode.LOITER, 2: Mode.RTL, 3: Mode.LAND}
-"""NAV_DLL_ACT; 5 and 6 (terminate, lockdown) are not emulated."""
+"""Mode by NAV_DLL_ACT; 5 and 6 (terminate, lockdown) are not emulated."""
 _BATTERY_LEVELS: Final = {
     (1, 2): Mode.RTL,
     (1, 3): Mode.RTL,

@@ -27,7 +27,7 @@ class StreamGroup:
 
 @dataclass(frozen=True)
 class ModeConditions:
-    """The state of a vehicle that determines if a firmware accepts a change of mode.
+    """The state of a vehicle that determines whether a firmware accepts a change of mode.
 
     Attributes:
         armed: True if its motors turn.
@@ -122,5 +122,5 @@ class Firmware:
         return self.guided_holds
 
     def mode_of(self, custom_mode: int) -> Mode | None:
-        """Return the mode of a custom mode number, or None if the firmware has no such mode."""
+        """Return the mode with a custom mode number, or None if the firmware has no such mode."""
         return next((mode for mode, number in self.modes.items() if number == custom_mode), None)

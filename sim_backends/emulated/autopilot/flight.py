@@ -21,8 +21,8 @@ STEP_NS: Final = 10_000_000
 _STEP_S: Final = STEP_NS / 1e9
 
 _APPROACH: Final = 0.5
-"""Near its goal the speed falls in proportion to the remaining distance, by this share of the velocity gain: without
-lag it overshoots by 4 % at most (PX4 has 0.95 for MPC_XY_P, and 1.8 for MPC_XY_VEL_P_ACC)."""
+"""Near its goal the speed of the drone is the remaining distance times this share of the velocity gain. Without lag
+it overshoots by at most 4 % (PX4 has 0.95 for MPC_XY_P, and 1.8 for MPC_XY_VEL_P_ACC)."""
 
 _MIN_COURSE_M_S: Final = 0.3
 """A slower drone does not turn to its direction of flight."""
@@ -143,7 +143,7 @@ class Airframe:
 
 
 MakeAirframe = Callable[[Vector, float, int], Airframe]
-"""Puts a drone at a place: position of its lowest point in the world, heading, time."""
+"""Creates a drone at a place; arguments: position of its lowest point in the world, heading, time."""
 
 
 def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorLimits:
@@ -158,7 +158,7 @@ def limits_within(limits: QuadrotorLimits, parameters: Parameters) -> QuadrotorL
 
 
 def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the velocity towards a point relative to home from which it can brake to a stop there."""
+    """Return the velocity towards a point relative to home; from this velocity it can stop at the point."""
     east, north, up = (goal - current for goal, current in zip(goal_m, body.position_m, strict=True))
     distance_m = math.hypot(east, north)
     along_per_s, climb_per_s = limits.gains_per_s
@@ -170,7 +170,7 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 
 
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
-    """Return the position at which it can stop, relative to home, not below it.
+    """Return the position at which it can stop, relative to home; the position is not below home.
 
     It is the sum of the distance during the lags of attitude and velocity control, and of v^2 / 2a.
     """
@@ -181,7 +181,7 @@ def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
 
 
 def _approach(left_m: float, acceleration_m_s2: float, gain_per_s: float) -> float:
-    """Return the speed at this distance: proportional to it when near, else v^2 = a s, half of v^2 = 2 a s."""
+    """Return the speed at a distance s: proportional to s when near, otherwise v^2 = a s, half of 2 a s."""
     return min(left_m * _APPROACH * gain_per_s, math.sqrt(acceleration_m_s2 * left_m))
 
 

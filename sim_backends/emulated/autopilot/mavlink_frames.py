@@ -109,7 +109,7 @@ def read(datagram: bytes) -> Iterator[Message]:
 
 
 def target_of(message: Message) -> tuple[int, int]:
-    """Return target system and component of a message; 0 is a broadcast, as is a message without these fields."""
+    """Return the target system and component of a message; both are 0 (broadcast) if it has no such fields."""
     return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
@@ -179,7 +179,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register a message of a client; return False if there are `MAX_CLIENTS` others, so that it is ignored."""
+        """Register a message of a client; return False if it is ignored because there are `MAX_CLIENTS` others."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

@@ -23,7 +23,7 @@ _TICK_NS: Final = 20_000_000
 
 _MAX_BYTES: Final = 65_536
 _BURST: Final = 64
-"""Datagrams received before the next flight step, so that a flood of datagrams does not stop the flight."""
+"""Maximum number of datagrams between two flight steps, so that a flood of datagrams does not stop the flight."""
 
 
 class PhysicsFiles(NamedTuple):
@@ -127,7 +127,7 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
 
 
 def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
-    """Return the function that puts the drone of a physics at a place."""
+    """Return the function that creates the drone, which a physics moves, at a place."""
     from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (as above)
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
 

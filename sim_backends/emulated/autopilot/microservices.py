@@ -25,7 +25,7 @@ _ACK, _NAK = 128, 129
 _OPEN_OPCODES: Final = frozenset({4, 11, 14})
 """Opcodes that open a file or compute its checksum: OpenFileRO, OpenFileWO, CalcFileCRC32."""
 _CLOSE_OPCODES: Final = frozenset({1, 2})
-"""TerminateSession, ResetSessions."""
+"""Opcodes that end sessions: TerminateSession, ResetSessions."""
 _LIST_DIRECTORY: Final = 3
 _END_OF_FILE, _UNKNOWN_COMMAND, _NOT_FOUND = 6, 7, 10
 
@@ -33,8 +33,8 @@ _END_OF_FILE, _UNKNOWN_COMMAND, _NOT_FOUND = 6, 7, 10
 class ParameterService:
     """Lists, reads and sets parameters (https://mavlink.io/en/services/parameter.html).
 
-    PX4 encodes integers bytewise and reports an unknown name by a text. ArduPilot encodes them by a C cast, ignores
-    the type in the client's message, and does not answer for an unknown name.
+    PX4 encodes integers bytewise and reports an unknown name in a text message. ArduPilot encodes integers with a C
+    cast, ignores the type in the client's message, and does not answer for an unknown name.
 
     Args:
         firmware: Family of the autopilot.
@@ -199,7 +199,7 @@ class Streams:
 RETRY_NS: Final = 250_000_000
 """Time to wait for an item before the request is repeated."""
 TRIES: Final = 20
-"""Maximum number of requests for an item. The protocol's 5 suit links with little loss; a weak radio loses half."""
+"""Maximum number of requests for an item. The protocol recommends 5; a weak radio loses half of the messages."""
 
 _MISSION: Final = dialect.MAV_MISSION_TYPE_MISSION
 

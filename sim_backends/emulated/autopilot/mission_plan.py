@@ -1,4 +1,4 @@
-"""Mission of a vehicle: the uploaded items, the current one, and the goal to which the vehicle must fly for it."""
+"""Mission of a vehicle: the uploaded items, the current item, and the goal of this item."""
 
 import math
 from collections.abc import Iterator
@@ -125,14 +125,14 @@ _RISEN_M: Final = 0.2
 
 
 class Mission:
-    """Items in their order.
+    """The items of a mission, in their order.
 
     Args:
         first: Number of the first item that is flown; ArduPilot's item 0 is home.
 
     Attributes:
         items: The items as uploaded.
-        current: Number of the current item; that of the last one after the end.
+        current: Number of the current item; after the end, the number of the last item.
         speed_m_s: Ground speed that an item has set.
     """
 
@@ -161,7 +161,7 @@ class Mission:
         self._enter()
 
     def set_current(self, number: int) -> None:
-        """Make the item of this number the current one, or the nearest item if there is none."""
+        """Make the item with this number the current item, or the nearest item if there is none."""
         self.current, self._done = max(number, min(self._first, len(self.items) - 1), 0), False
         self._reached, self._repeated_reports = [], iter(())
         self._enter()
@@ -201,7 +201,7 @@ class Mission:
         return "LOITER"
 
     def _goal_m(self, item: Item, start_m: Vector, body: Airframe, home_m: Vector, near_m: float) -> Vector:
-        """Return the goal of an item; from the ground it first leads straight up."""
+        """Return the goal of an item; a vehicle on the ground first climbs vertically."""
         here_m = body.position_m
         if item.command == dialect.MAV_CMD_NAV_DELAY:
             return start_m

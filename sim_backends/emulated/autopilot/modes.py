@@ -31,5 +31,5 @@ PILOTED: Final = frozenset({Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD, Mode.BR
 
 
 def reported_mode(mode: Mode) -> Mode:
-    """Return the mode that is reported for a mode, which may be a phase of another one."""
+    """Return the mode that is reported to clients; a phase of a mode is reported as the whole mode."""
     return Mode.RTL if mode is Mode.HOMECOMING else mode

@@ -23,8 +23,8 @@ _CRITICAL: Final = dialect.MAV_SEVERITY_CRITICAL
 _PREARM_NS: Final = 30_000_000_000
 """ArduPilot repeats the reasons why it cannot be armed at this interval (AP_Arming)."""
 _OFFBOARD_LOST: Final = {3: Mode.RTL, 4: Mode.LAND}
-"""Mode when set-points are missing, by COM_OBL_RC_ACT; for the modes of a remote control, which need its sticks, PX4
-holds the position instead."""
+"""Mode when set-points are missing, by COM_OBL_RC_ACT. For values that name a mode of a remote control, PX4 holds the
+position instead, because such a mode needs the sticks."""
 
 
 class Refused(Exception):  # noqa: N818 (an answer of the autopilot, not an error)
@@ -91,7 +91,7 @@ class Vehicle(VehicleBase):
         """Take off; a repeated command, as after a lost answer, has no further effect until it lifts off.
 
         Args:
-            height_m: Height above home; None for that of the parameter.
+            height_m: Height above home; None for the height in the parameter.
 
         Raises:
             Refused: The motors are off, it is flying, or the height is not allowed.

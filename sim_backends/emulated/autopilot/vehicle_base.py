@@ -32,7 +32,7 @@ class VehicleBase:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
-        make_airframe: Puts it at a place; None for the airframe that the autopilot itself moves.
+        make_airframe: Creates the airframe at a place; None for an airframe that the autopilot itself moves.
 
     Attributes:
         body: Position and motion, relative to home.
@@ -44,7 +44,7 @@ class VehicleBase:
         estimate: Its position estimate.
         fence: Its fence.
         guidance: Its goal and set-points.
-        home_m: Home in the world, metres east, north, up: where it was armed last, or else where it booted.
+        home_m: Home in the world, metres east, north, up: where it was armed last; before that, where it booted.
         failsafes: Its failsafes.
         status_texts: Texts that are not sent yet; the reader clears the list.
     """

@@ -11,6 +11,6 @@
 | `steering` | commanded velocities of one robot, and the record of its motion | records in the robot |
 | `simulators` | builds the physics and the network | cosim, network, radio, physics |
 
-The coordinator is that of simulated co-simulations: windows, policies, ledger and their meaning are the same. Only
-its agents differ: the end of a window is a deadline of the monotonic clock.
+The coordinator is the same as in simulated co-simulations, with the same windows, policies and ledger. Only its
+agents differ: the end of a window is a deadline of the monotonic clock.
 """

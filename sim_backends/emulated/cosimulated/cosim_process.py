@@ -43,13 +43,13 @@ from sim_backends.radio.links import PACKET, PROCESSING_NS, TRANSMISSION_NS, Lin
 from sim_backends.world.motion import STILL, State
 
 _MAX_SLEEP_NS: Final = 10_000_000
-"""Longest sleep. After a longer one, packets may have waited for the excess."""
+"""Maximum sleep. If the process sleeps longer, packets may have waited for the additional time."""
 _END_NS: Final = 1 << 62
 _WINDOWS: Final = 1000
 """Number of windows after which the record of the coordinator is cleared."""
 _GIVE_UP_NS: Final = 1_000_000_000
 """A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
-Packets in it are delivered late, so their repeat is void."""
+Packets that wait during the lag are delivered late, so their repeat is void."""
 
 _START_NS: Final = 5_000_000
 """A request to place robots that takes longer has started a simulator."""
@@ -140,7 +140,7 @@ class CosimulatedMedium(MediumServer):
     def _poll(self, due_ns: int | None, *, answers: bool = True) -> None:
         """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
 
-        The earliest time at which packets can have arrived is determined as by the medium of a radio model.
+        The earliest time at which packets can have arrived is determined as in the medium of a radio model.
         """
         polled_ns = time.monotonic_ns()
         ready = self._epoll.poll(0)
@@ -217,7 +217,7 @@ class CosimulatedMedium(MediumServer):
             self._give_up(lag_ns)
 
     def _give_up(self, lag_ns: int) -> None:
-        """Delay simulated time, with the packets that were read and have not entered the network."""
+        """Delay simulated time, and the packets that were read and have not entered the network."""
         self._clock.give_up(lag_ns)
         now_ns = self._clock.now_ns()
         self._queue = deque(
@@ -228,7 +228,7 @@ class CosimulatedMedium(MediumServer):
     def _write(
         self, session: CosimSession, fate: Fate, packet: RealPacket, end_ns: int, end_monotonic_ns: int
     ) -> None:
-        """Write a packet that arrived to its receiver, and count its delays."""
+        """Write an arrived packet to its receiver, and count its delays."""
         port = self._ports[fate.packet.destination]
         try:
             os.write(port.fd, packet.content)
@@ -335,7 +335,7 @@ def main() -> None:
     """Run the process; the command line has the descriptor of the socket, the seed and the framing."""
     channel = socket.socket(fileno=int(sys.argv[1]))
     medium = CosimulatedMedium(int(sys.argv[2]), FRAMINGS[sys.argv[3]], channel)
-    # A collection of all objects, most of which are modules, would delay packets.
+    # A garbage collection of all objects, which mostly belong to modules, would delay packets.
     gc.freeze()
     try:
         medium.run()

@@ -36,7 +36,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 
 
 class CosimMedium(Devices, WindowObserver, Protocol):
-    """The process, as a session uses it."""
+    """The interface of the process that a session uses."""
 
 
 class CosimSession:
@@ -96,12 +96,12 @@ class CosimSession:
             close()
 
     def remove_packet(self, packet: Packet) -> None:
-        """Remove a packet whose fate is decided from the record of the coordinator."""
+        """Remove a packet that was delivered or lost from the record of the coordinator."""
         del self.coordinator.run.fates[packet.identity]
         self._arrival_delays.pop(packet.packet_id, None)
 
     def network_delay(self, fate: Fate) -> tuple[Delay, int]:
-        """Return the parts of a packet's delay in the network, and the delay that the network does not divide.
+        """Return the parts of a packet's delay in the network, and the rest of the delay, whose parts are unknown.
 
         Raises:
             FederateError: The parts exceed the delay.

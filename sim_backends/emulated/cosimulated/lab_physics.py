@@ -26,7 +26,7 @@ _MOVED_M: Final = 1e-6
 
 @runtime_checkable
 class Placing(PhysicsFederate, Protocol):
-    """A physics that can put a robot at a place during a run. Without this method the physics is restarted for it."""
+    """A physics that can put a robot at a place during a run. A physics without this method is restarted instead."""
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
         """Put a robot at a place, at rest.
@@ -49,15 +49,15 @@ class Flying(PhysicsFederate, Protocol):
 
 
 StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
-"""Starts a physics with the robots at these states, which are those of their antennas; its time begins at 0."""
+"""Starts a physics with the robots at these states of their antennas; its time begins at 0."""
 
 
 class LabPhysics:
     """The physics of a session of the co-simulation; implements `PhysicsFederate`.
 
-    It starts when the lab has placed all robots that can be driven, and moves a robot from the robot's first command
-    on. Before that, and after the lab has placed it again, a robot stays where the lab has put it. A station without
-    a body, such as the laptop, always does.
+    It starts when the lab has placed all robots that can be driven. It moves a robot from the robot's first command
+    on. Before that command, and after the lab has placed the robot again, the robot stays where the lab has put it. A
+    station without a body, such as the laptop, always stays there.
 
     Args:
         start: Starts the physics.
@@ -122,7 +122,7 @@ class LabPhysics:
 
     @property
     def states(self) -> Mapping[str, State]:
-        """The present states, also if the lab has changed them since the last call of `advance`."""
+        """The present states, including changes by the lab since the last call of `advance`."""
         return self._combined()
 
     def limit_m_s2(self, name: str) -> float:
@@ -245,7 +245,7 @@ class LabPhysics:
                 )
 
     def _restart(self) -> None:
-        """Start the physics with all robots at their present places; those that move are at rest afterwards."""
+        """Start the physics with all robots at their present places; moving robots are at rest afterwards."""
         self.close()
         self._physics = None
         self._followed.clear()

@@ -23,7 +23,7 @@ class RealPacket(NamedTuple):
         at_ns: Simulated time at which it was read from its device.
         source: Name of the robot.
         destination: Name of the receiver; None for a broadcast.
-        content: The packet as its device had it.
+        content: The packet as it was read from its device.
         size_bytes: Its size on the air, without MAC header.
         waited_ns: Longest time that it may have waited to be read.
     """
@@ -63,8 +63,8 @@ class Devices(Protocol):
 class RealAgents(Agents):
     """Robots with real programs. A window ends when its end is reached in real time.
 
-    The next event of a program is unknown until it happens. Policies that need its time wait for it, for one step of
-    the physics at most, after which they get the time of that step.
+    The next event of a program is unknown until it happens. Policies that need its time wait for the event for at
+    most one step of the physics. If there is no event, they get the time of that step.
 
     Args:
         physics: Moves the robots, also by the commands of their programs.

@@ -18,7 +18,7 @@ from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarge
 from sim_backends.world.motion import STILL, State
 
 _REPORT_NS: Final = 10_000_000
-"""Interval of the records while a robot moves: those of the robot's own base controller have 20 ms."""
+"""Interval of the records while a robot moves; the robot's own base controller uses 20 ms."""
 
 _PENDING_COMMANDS: Final = 1000
 """Commands that are kept while the simulation lags, by at most 1 s; older ones are dropped."""
@@ -32,7 +32,7 @@ class TimedCommand(NamedTuple):
     Attributes:
         time_ns: Its time, by the monotonic clock.
         command: The command.
-        is_idle: True if it need not be repeated: a robot without commands is in the state that it causes.
+        is_idle: True if it need not be repeated, because a robot without commands is in the state that it causes.
     """
 
     time_ns: int
@@ -49,7 +49,7 @@ class Steering(ABC):
         now_ns: The present time.
 
     Attributes:
-        idle: The command that follows after the last one has not been repeated for `TIMEOUT_NS`.
+        idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
         is_driven: True if the robot was commanded since the lab put it at its place.
         is_placed: True if the lab has put it at a place.
         rests: True if it is at rest, no command is active, and this is recorded.
@@ -91,9 +91,9 @@ class Steering(ABC):
         return self._start.heading_rad
 
     def commands(self, until_ns: int) -> Iterator[tuple[int, Command]]:
-        """Yield the times and commands until a time, and the command after a missing one.
+        """Yield the commands until a time, each with its time, and `idle` when a command is not repeated.
 
-        A simulation that lags behind reads commands that it has not reached; they are kept until then.
+        A simulation that lags behind may read commands with later times; they are kept until it reaches them.
         """
         last = self._read_command()
         if last is not None and self._seen_ns < last.time_ns and self.is_placed:
@@ -110,17 +110,17 @@ class Steering(ABC):
         yield from self._stop_until(until_ns)
 
     def _stop_until(self, until_ns: int) -> Iterator[tuple[int, Command]]:
-        """Yield the command after a missing one if it is due at a time."""
+        """Yield `idle` with its time if it is due by a time."""
         if self._stops_ns is not None and self._stops_ns <= until_ns:
             yield self._stops_ns, self.idle
             self._stops_ns = None
 
     def is_report_due(self, at_ns: int) -> bool:
-        """Return True if the motion at a time must be recorded; that of a robot that has stopped is recorded once."""
+        """Return True if the motion at a time must be recorded; for a robot at rest it is recorded once."""
         return not self.rests and (self._reported is None or at_ns - self._reported[0] >= _REPORT_NS)
 
     def report(self, at_ns: int, state: State, flight: FlightStatus | None = None) -> None:
-        """Record the motion of a robot that is driven, if that is due.
+        """Record the motion of a robot that is driven, if a record is due.
 
         Args:
             at_ns: Time of the state.
@@ -165,8 +165,8 @@ class GroundSteering(Steering):
     """Steering of a robot on wheels.
 
     Args:
-        descriptors: Of the record of its motion, the file of its assigned paths, and the record of its commanded
-            velocity (`EmulatedRobot.physics_fds`).
+        descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
+            paths, and the record of its commanded velocity.
         now_ns: The present time.
     """
 
@@ -187,8 +187,8 @@ class FlightSteering(Steering):
     """Steering of a drone by its autopilot; without commands its rotors are off, so that it falls.
 
     Args:
-        descriptors: Of the record of its motion, the file of its assigned paths, the record of the autopilot's
-            commands, and the record of its flight (`EmulatedRobot.physics_fds`).
+        descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
+            paths, the record of the autopilot's commands, and the record of its flight.
         now_ns: The present time.
     """
 
@@ -235,9 +235,9 @@ class FlightSteering(Steering):
 
 _STILL_M_S: Final = 1e-3
 _NO_TURN_RAD_S: Final = 1e-3
-"""Slower motions are those of a simulated contact: in MuJoCo a stationary robot is never exactly at rest."""
+"""Slower motions come from simulated contacts: in MuJoCo a stationary robot is never exactly at rest."""
 
 
 def _path(fd: int) -> Path:
-    """Return a path that opens the file of a descriptor again, also one of another mount namespace."""
+    """Return a path that opens the file of a descriptor again, even if the file is in another mount namespace."""
     return Path(f"/proc/self/fd/{fd}")

@@ -2,7 +2,7 @@
 
 Every channel in use has a separate radio model: frames on different channels do not interfere. hwsim does not report
 the channel to which a radio listens, so a radio is on the channel of its last frame, and on all channels before its
-first frame. All channels have the path loss of the radio model, that of 2.4 GHz.
+first frame. On all channels the radio model uses the path loss of 2.4 GHz.
 """
 
 from collections.abc import Mapping
@@ -288,7 +288,7 @@ class Air:
         return events
 
     def _place(self, now_ns: int, frequency_mhz: int) -> None:
-        """Place the radios that are on a channel, or may be."""
+        """Place the radios that are on a channel, or may be on it."""
         places_m = {
             name: place_m
             for name, place_m in self._places_m.items()

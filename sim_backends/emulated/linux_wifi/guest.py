@@ -33,7 +33,7 @@ exec """
 
 
 def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
-    """Run a command of fieldkit in a new virtual machine; its output is that of this process.
+    """Run a command of fieldkit in a new virtual machine; this process writes the output of the command.
 
     Args:
         argv: The words after `fieldkit`.
@@ -49,7 +49,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     """
     kernel = require_machine()
     results.mkdir(parents=True, exist_ok=True)
-    # Ctrl-C is for the command in the machine, which finishes its repeat. A second one ends the machine.
+    # Ctrl-C interrupts the command in the machine, which finishes its repeat. A second Ctrl-C ends the machine.
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         ended = run_in_machine(

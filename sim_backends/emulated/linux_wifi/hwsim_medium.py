@@ -1,6 +1,7 @@
 """The medium of mac80211_hwsim: frames from the kernel to the air, and results to the kernel.
 
-`HwsimMedium` has no socket: it maps messages to messages, so that recorded ones test it. `medium_program` runs it.
+`HwsimMedium` has no socket: it maps messages to messages, so tests can use recorded messages. `medium_program` runs
+it.
 """
 
 from collections import Counter
@@ -24,7 +25,7 @@ from sim_backends.radio.links import Pair
 MAX_FREQUENCY_MHZ: Final = 7_125
 MIN_FREQUENCY_MHZ: Final = 2_412
 _MAX_ADDRESSES: Final = 64
-"""Addresses that a radio may have: a robot can change the address of its interface any number of times."""
+"""Maximum number of addresses of a radio, because a robot can change the address of its interface at any time."""
 _RADIO_BIT: Final = 0x40
 
 
@@ -36,8 +37,8 @@ class LinkTotals:
         frames: Frames whose status was reported.
         acknowledged: Frames that were acknowledged.
         tries: Tries on the air.
-        reported_tries: Tries reported to the kernel: also those in modes that the radio model does not have. Without
-            the frames they are the `tx retries` of `iw`.
+        reported_tries: Tries reported to the kernel, including tries in modes that the radio model does not have.
+            `tx retries` of `iw` is this number minus `frames`.
         signal_dbm: Signal of the last frame that arrived; None before the first.
     """
 
@@ -79,7 +80,7 @@ class HwsimMedium:
         self.totals: dict[Pair, LinkTotals] = {}
         self._names = dict(radios)
         self._radio_of = {name: radio for radio, name in radios.items()}
-        # The first interface of a radio has its permanent address, which differs in one bit.
+        # The first interface of a radio has the radio's permanent address, which differs in one bit from `radio`.
         self._by_address = {bytes((radio[0] & ~_RADIO_BIT,)) + radio[1:]: name for radio, name in self._names.items()}
         self._address_counts = Counter(self._by_address.values())
 
@@ -112,8 +113,8 @@ class HwsimMedium:
             self.counts.rejected += 1
             return
         address = sent.transmitter
-        # An interface that existed before the medium started was not announced. An address of another radio is not
-        # taken from it.
+        # An interface that existed before the medium started was not announced. An address that already belongs to a
+        # radio is not reassigned.
         if address is not None and not address[0] & 1 and address not in self._by_address:
             self._add_address(address, name)
         self.air.transmit(now_ns, sent, name, self._by_address.get(sent.receiver))

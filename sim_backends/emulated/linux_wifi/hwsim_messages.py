@@ -168,7 +168,7 @@ def encode_status(frame: SentFrame, *, tries: Sequence[int], acknowledged: bool,
 
 
 def encode_received(frame: SentFrame, receiver: RadioAddress, *, rate_index: int, signal_dbm: int) -> bytes | None:
-    """Return the message that passes a frame to a receiving radio; None if the kernel accepts no frame so short.
+    """Return the message that passes a frame to a receiving radio; None if the frame is too short for the kernel.
 
     Args:
         frame: The frame.

@@ -1,9 +1,9 @@
 """The initial file system of the virtual machine: busybox, kernel modules and a start script, in a cpio archive.
 
 Everything else is the root file system of the host, which the machine mounts read-only over 9p, below a layer in
-memory that has all changes. The archive has the
-format `newc` (Linux, Documentation/driver-api/early-userspace/buffer-format.rst). It is written here, because
-a program that creates it would have to be installed, and needs a copy of each file.
+memory that has all changes. The archive has the format `newc` (Linux,
+Documentation/driver-api/early-userspace/buffer-format.rst). This module writes it, because a program for it would
+have to be installed, and needs a copy of each file.
 """
 
 import re
@@ -39,7 +39,7 @@ _DEPENDS: Final = re.compile(rb"\0depends=([^\0]*)\0")
 
 _SIGNED: Final = b"~Module signature appended~\n"
 _SIGNATURE_HEADER_BYTES: Final = 12
-"""After the signature; its last four bytes are the size of the signature."""
+"""Length of the header after the signature; its last four bytes are the size of the signature."""
 
 _START: Final = """\
 #!/bin/busybox sh
@@ -95,7 +95,7 @@ def build_initrd(modules: Path, *, radios: int, job: str, output: str) -> bytes:
 
 
 def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
-    """Return the files of modules and of those on which they depend, each after its dependencies.
+    """Return the files of modules and of their dependencies; a module follows its dependencies.
 
     A name that is built into the kernel (`modules.builtin`) is left out.
 

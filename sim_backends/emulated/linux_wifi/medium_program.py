@@ -57,7 +57,7 @@ class RadioSetup(Strict):
         address: Its address, `42:00:00:00:NN:00` for radio NN.
         standard: Standard of its radio.
         tx_power_dbm: Transmit power.
-        sensitivity_dbm: Weakest frame that it detects.
+        sensitivity_dbm: Received power of the weakest frame that it detects.
     """
 
     address: Annotated[str, AfterValidator(_radio_address)]
@@ -94,7 +94,7 @@ class MediumSetup(Strict):
 
 
 class KernelSocket(Protocol):
-    """The socket of the family, as `FamilySocket` has it."""
+    """The interface of a netlink socket that the medium uses; `FamilySocket` implements it."""
 
     overruns: int
 

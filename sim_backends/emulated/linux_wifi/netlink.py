@@ -35,8 +35,9 @@ _RECEIVE_BUFFER_BYTES: Final = 4 << 20
 _SO_RCVBUFFORCE: Final = 33
 _TIMEOUT_S: Final = 60.0
 _FIRST_PORT: Final = 1 << 30
-"""Above all process identifiers: the kernel gives the number of the process to other netlink sockets of the process,
-as `getaddrinfo` opens. hwsim ends the registration if a socket of any protocol with the same number is closed."""
+"""Lowest port number that is above all process identifiers. The kernel uses the process identifier as port number of
+other netlink sockets, which for example `getaddrinfo` opens. hwsim ends the registration when any netlink socket with
+the same port number is closed."""
 
 
 class NetlinkFormatError(ValueError):
@@ -80,7 +81,7 @@ def decode_messages(datagram: bytes) -> Iterator[NetlinkMessage]:
     """Yield the messages of a datagram.
 
     Raises:
-        NetlinkFormatError: A length exceeds the datagram, or is below that of a header.
+        NetlinkFormatError: A length exceeds the datagram, or is smaller than a header.
     """
     offset = 0
     while offset < len(datagram):
@@ -116,7 +117,7 @@ def decode_generic(payload: bytes) -> tuple[int, dict[int, bytes]]:
     """Return the command and the attributes of a generic netlink message; a repeated attribute replaces the first.
 
     Raises:
-        NetlinkFormatError: A length exceeds the message, or is below that of a header.
+        NetlinkFormatError: A length exceeds the message, or is smaller than a header.
     """
     if len(payload) < _GENERIC.size:
         raise NetlinkFormatError(f"a generic message has {len(payload)} bytes, fewer than {_GENERIC.size}")
@@ -144,7 +145,7 @@ def family_identifier(name: str, reply: NetlinkMessage) -> int:
 
     Raises:
         ConfigurationError: The kernel does not have the family.
-        NetlinkFormatError: The reply is not one to this request.
+        NetlinkFormatError: The message is not a reply to this request.
     """
     if reply.type == NLMSG_ERROR:
         raise ConfigurationError(
@@ -203,10 +204,10 @@ class FamilySocket:
         self._socket.sendto(NetlinkMessage(self._family, NLM_F_REQUEST, 0, payload).encode(), (0, 0))
 
     def receive(self) -> list[NetlinkMessage]:
-        """Return the messages of one datagram, those of the family and errors; an empty list if there is none.
+        """Return the messages of the family and the errors in one datagram; an empty list if there is no datagram.
 
         Raises:
-            NetlinkFormatError: The kernel sent bytes that are no messages.
+            NetlinkFormatError: The kernel sent bytes that are not messages.
         """
         try:
             datagram, (port, _) = self._socket.recvfrom(MAX_DATAGRAM_BYTES)

@@ -1,4 +1,4 @@
-"""The radios of mac80211_hwsim in this kernel, and their way into the network namespaces of robots."""
+"""The radios of mac80211_hwsim in this kernel, and their move into the network namespaces of robots."""
 
 import os
 import shutil
@@ -29,7 +29,7 @@ class HwsimRadio:
     Attributes:
         phy: Name of its device, `phy0`.
         interface: Name of its network interface, `wlan0`.
-        address: Address by which hwsim names it, which differs in one bit from that of the interface.
+        address: Address that identifies it in hwsim; it differs in one bit from the address of the interface.
     """
 
     phy: str

@@ -24,7 +24,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
 from sim_backends.radio.modes import G_MODES, N_MODES, SHORT_RETRY_LIMIT, WifiMode
 
 _DSSS_RATES: Final = 4
-"""1, 2, 5.5 and 11 Mbit/s, with which the list of the band at 2.4 GHz begins."""
+"""Number of DSSS and CCK rates (1, 2, 5.5 and 11 Mbit/s) at the beginning of the list of the 2.4 GHz band."""
 _FIRST_5_GHZ_MHZ: Final = 3_000
 _WIDE: Final = RATE_40_MHZ | RATE_80_MHZ | RATE_160_MHZ
 
@@ -86,7 +86,7 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
 
 
 def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
-    """Return the index of a mode in the list of the band; for an MCS, that of its modulation and code rate."""
+    """Return a mode's index in the list of the band; for an MCS, of the rate with equal modulation and code rate."""
     coding = (mode.modulation, mode.code_rate)
     indices = [index for index, g_mode in enumerate(G_MODES) if (g_mode.modulation, g_mode.code_rate) == coding]
     index = indices[0] if indices else len(G_MODES) - 1

@@ -24,7 +24,7 @@ _MAX_PENDING: Final = 2048
 
 
 class _ChannelStream:
-    """One stream: a socket pair whose near end is used by others, and the frames for it that wait."""
+    """One stream: a socket pair, whose near end other code uses, and the waiting frames for it."""
 
     def __init__(self) -> None:
         self.near, self.far = socket.socketpair()

@@ -1,7 +1,7 @@
 """A virtual machine with Linux's Wi-Fi, made of the distribution's kernel and the files of this host.
 
 It boots the kernel with mac80211_hwsim, mounts the root file system of the host read-only below a layer in memory,
-runs one shell script as root, and switches off. It has no network. Its programs are those of the host: Python with
+runs one shell script as root, and switches off. It has no network. It uses the programs of the host: Python with
 fieldkit, iw, hostapd.
 
 Without KVM, the clock of the machine counts its instructions, and time passes at the rate of the host only while the
@@ -66,7 +66,7 @@ _INSTRUCTION_CLOCK: Final = "fieldkit.clock=instructions"
 _EMULATED_PROCESSOR: Final = "Nehalem"
 """The first processor with all instructions that numpy needs. Later ones, for example with AVX2, are slower."""
 _NS_PER_INSTRUCTION_EXPONENT: Final = 1
-"""An emulated instruction needs 2^1 ns: 500 million instructions per second, as of a slow processor."""
+"""An emulated instruction takes 2^1 ns: 500 million instructions per second, like a slow processor."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class JobResult:
 
 
 def kernel_roots() -> tuple[Path, ...]:
-    """Return the folders with `boot/`, `lib/modules/` and programs: that of `ROOT_VARIABLE`, and `/`."""
+    """Return the folders with `boot/`, `lib/modules/` and programs: the folder in `ROOT_VARIABLE`, and `/`."""
     extracted = os.environ.get(ROOT_VARIABLE)
     return (Path(extracted).absolute(), Path("/")) if extracted else (Path("/"),)
 
@@ -137,7 +137,7 @@ def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
     """Return the kernel of the machine.
 
     Args:
-        roots: Folders with `boot/`, `lib/modules/` and programs; None for those of `kernel_roots`.
+        roots: Folders with `boot/`, `lib/modules/` and programs; None for the folders of `kernel_roots`.
 
     Raises:
         ConfigurationError: The kernel or a program is missing; the message names all that is.
@@ -334,7 +334,7 @@ def _channel_options(descriptors: Sequence[int]) -> Iterator[str]:
 
 
 def clock_counts_instructions() -> bool:
-    """Return True if this process runs in a machine without KVM: times on its clock are no durations."""
+    """Return True if this process runs in a machine without KVM, whose clock does not measure real durations."""
     return _INSTRUCTION_CLOCK in Path("/proc/cmdline").read_text(encoding="ascii", errors="replace").split()
 
 

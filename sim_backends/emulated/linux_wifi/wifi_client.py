@@ -1,4 +1,4 @@
-"""The lab's client of the medium of hwsim: it has the socket that is registered at the kernel."""
+"""The lab's client of the medium of hwsim: it has the socket that is registered with the kernel."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -52,7 +52,7 @@ class Framing:
 
 
 def mac_of(address: IPv4Address) -> bytes:
-    """Return the MAC address of the robot that has this address."""
+    """Return the MAC address of the robot that has this IPv4 address."""
     return _MAC_PREFIX + address.packed
 
 

@@ -61,7 +61,7 @@ class FlowDelays:
         """Add the delay of a packet that crossed the radio, if its flow was requested.
 
         The packet is counted if `receiver`, an address, is its destination. Any other receiver forwards it: the delay
-        of that hop is added, also if the packet is lost on a later hop.
+        of that hop is added, even if the packet is lost on a later hop.
         """
         is_later = packet[6] & _OFFSET or packet[7]
         key = self._datagrams.get(_datagram(packet)) if is_later else _key(packet)
@@ -163,7 +163,7 @@ def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
 
 
 def rounded_up(late_ns: int) -> int:
-    """Return the smallest number above `late_ns` with only its first four bits set: at most 1/8 more."""
+    """Return the smallest number above `late_ns` with at most 4 significant bits; it is at most 1/8 larger."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
 
@@ -185,7 +185,7 @@ class Port:
         self.refused = 0
         self.unroutable = 0
         self.not_ipv4 = 0
-        # Number of packets, of those read next, that may have waited in the device since `backlog_since_ns`.
+        # How many of the packets that are read next may have waited in the device since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
         # Delays of the written packets, by the robot that sent them; packets not written are counted by `refused`.

@@ -30,7 +30,7 @@ from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.links import PACKET, LinkCounters, Pair, processing_ns
 from sim_backends.radio.model import RadioModel, WifiInWorld
 
-# Longest sleep of the medium. After a longer sleep, packets may have waited for the excess.
+# Maximum sleep of the medium. If it sleeps longer, packets may have waited for the additional time.
 _MAX_SLEEP_NS: Final = 10_000_000
 
 

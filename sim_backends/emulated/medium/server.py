@@ -195,7 +195,7 @@ class MediumServer(ABC):
             self._route(positions_m.keys())
 
     def _route(self, present: Set[str]) -> None:
-        """Give each robot that is present routes to the others, and other robots none."""
+        """Give each robot that is present routes to the others that are present; absent robots have no routes."""
         self._routed = frozenset(present), len(self._ports)
         for port in self._ports.values():
             is_present = port.name in present

@@ -14,11 +14,11 @@ from sim_backends.emulated.process.worker import PATH
 _NAMESPACES: Final = ("--net", "--mount", "--propagation", "private", "--pid", "--uts", "--ipc")
 # Root inside is this user outside; other accounts inside (of sshd and tcpdump) are the user's subordinate ids.
 _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
-# First without subordinate ids: if the kernel refuses, unshare leaves a process behind that maps these ids.
+# The first attempt uses no subordinate ids: if the kernel refuses it, unshare leaves a process that maps such ids.
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534
-"""Subordinate ids that a node needs: those of all accounts up to `nobody`."""
+"""Number of subordinate ids that a node needs: one for each id up to the id of the account `nobody`."""
 _USUAL_SUBORDINATES: Final = 65536
 _FIRST_SUBORDINATE: Final = 100_000
 """The first subordinate id that useradd assigns (SUB_UID_MIN of login.defs)."""
@@ -31,8 +31,8 @@ _KERNEL_SETTINGS: Final = {
     "kernel.apparmor_restrict_unprivileged_userns": ("1", "0"),
     "user.max_user_namespaces": ("0", "10000"),
 }
-"""Kernel settings of Debian, of Ubuntu and of any system: a value that forbids user namespaces, one that allows
-them."""
+"""Kernel settings of Debian, of Ubuntu and of any system, each with a value that forbids user namespaces and one that
+allows them."""
 
 _TIMEOUT_S: Final = 10.0
 

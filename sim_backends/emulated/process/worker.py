@@ -79,7 +79,7 @@ REPLY_S: Final = 15.0
 
 _EXIT_S: Final = 2.0
 _EXIT_STATUS_S: Final = 0.5
-"""Time from when a process has closed its descriptors until its exit status is available."""
+"""Maximum time from when a process has closed its descriptors until its exit status is available."""
 _EXITED: Final = "it exited"
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 

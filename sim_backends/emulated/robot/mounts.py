@@ -75,7 +75,7 @@ def mount_overlay(source: Path, target: Path) -> None:
     Raises:
         OSError: The kernel refused, or has no overlay file system.
     """
-    # Two lower layers without an upper one: the result is read-only, as the host's folders are.
+    # Two lower layers without an upper one: the result is read-only, like the host's folders.
     _mount("overlay", str(target), "overlay", 0, f"lowerdir={source}:{target}")
 
 

@@ -113,7 +113,7 @@ def open_device() -> int:
 
 
 def _set_queue(index: int) -> None:
-    # Netlink is used, because the ioctl, also of busybox's ip, needs a capability that no user namespace grants.
+    # Netlink is used, because the ioctl (also in busybox's ip) needs a capability that no user namespace grants.
     link = struct.pack("=BxHiII", socket.AF_UNSPEC, 0, index, 0, 0)
     length = struct.pack("=HHI", 8, _IFLA_TXQLEN, QUEUE_PACKETS)
     size_bytes = _HEADER_BYTES + len(link) + len(length)
@@ -245,7 +245,7 @@ def _prepare_mesh(interface: str) -> None:
 
 
 def disable_ipv6() -> None:
-    """Disable IPv6, so that the kernel's neighbour discovery adds no packets to those of the robot's programs."""
+    """Disable IPv6, so that the kernel's neighbour discovery adds no packets to the traffic of the programs."""
     for scope in ("all", "default"):
         switch = Path(f"/proc/sys/net/ipv6/conf/{scope}/disable_ipv6")
         if switch.exists():

@@ -118,7 +118,7 @@ def write_setup(spec: RobotSpec) -> None:
     files = {}
     for path in map(Path, spec.setup):
         files[path] = setup_script(spec, path), 0o644
-        # A robot with ROS has middlewares; here they are those of the Python that runs fieldkit.
+        # A robot with ROS has middlewares; here they come from the Python that runs fieldkit.
         files[_ros_programs(path) / "python3"] = f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', 0o755
         files[_ros_programs(path) / "fieldkit"] = module_command("fieldkit"), 0o755
         if spec.ros == "builtin":

@@ -115,7 +115,7 @@ class Service:
     """Program or forked process that runs as long as the robot.
 
     Attributes:
-        name: Name, also of its log in `/run/robot`.
+        name: Name of the service and of its log in `/run/robot`.
         launch: Starts it with its output in a log; returns its process id.
         ready: Returns True if it is ready.
     """

@@ -129,8 +129,8 @@ class RobotSpec:
         ssh: Its SSH server.
         sftp: True if that server offers SFTP.
         userland: Source of `sh`, `tar`, `ip` and similar tools.
-        netcat: Its only netcat, as `nc` and by its full name; None for those of this machine or of the userland.
-        ping: Its `ping`; None as for `netcat`.
+        netcat: Its only netcat, as `nc` and by its full name; None for the netcat of this machine or of the userland.
+        ping: Its `ping`; None for the `ping` of this machine or of the userland.
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
         ros2: Its ROS 2 over the radio; None if it has none.
         routes_zenoh: True if it runs the Zenoh router.

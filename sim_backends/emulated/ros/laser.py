@@ -76,7 +76,7 @@ class _Scan:
                 self._hit(beam, across / divisor)
 
     def add_circle(self, centre: tuple[float, float], radius_m: float) -> None:
-        """Add an upright cylinder: t = m - sqrt(r^2 - d^2), if its centre is m along the beam and d beside it."""
+        """Add an upright cylinder: t = m - sqrt(r^2 - d^2); its centre is m along the beam and d beside it."""
         x, y = centre[0] - self._east_m, centre[1] - self._north_m
         distance_m = math.hypot(x, y)
         if distance_m <= radius_m or distance_m - radius_m > self._reach_m:

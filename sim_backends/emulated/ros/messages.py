@@ -6,8 +6,8 @@ because the libraries that support all types would cost each robot 20 MB of memo
 
 The motion of the robot comes from `own_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
 ahead, y to the left; in frames fixed to the world x is east and y north, as in the orientation of an IMU by REP 145.
-Covariances are those that the drivers of such robots report. The laser casts its beams at the world. Numbers that
-vary in a real sensor contain noise, so that they compress no better than real ones.
+Covariances are the values that drivers of such robots report. The laser ranges follow from the world. Numbers that
+vary in a real sensor contain noise, so that they compress no better than real data.
 """
 
 import math
@@ -25,8 +25,8 @@ from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Sens
 GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
-# Variances of x, y, z (m^2) and of rotations about them (rad^2), for pose and, per second, twist: those of a Husky's
-# controller (husky_control/config/control.yaml of github.com/husky/husky).
+# Variances of x, y, z (m^2) and of rotations about them (rad^2), for pose and, per second, twist, from the controller
+# of a Husky (husky_control/config/control.yaml of github.com/husky/husky).
 ODOMETRY_VARIANCES: Final = (0.001, 0.001, 0.001, 0.001, 0.001, 0.03)
 # Variances of orientation (rad^2), angular velocity (rad^2/s^2) and acceleration (m^2/s^4) that a TurtleBot3 reports:
 # constants, far above its noise (ROBOTIS OpenCR, turtlebot3_sensor.cpp).
@@ -196,8 +196,8 @@ def _battery_state(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
     measured = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
     state = struct.pack("<3B?", discharging, good, polymer, present)
-    no_cells = _float32s(()) * 2  # their voltages and temperatures
-    return measured + state + no_cells + packed_string("") * 2  # its place and serial number
+    no_cells = _float32s(()) * 2  # voltages and temperatures of the cells
+    return measured + state + no_cells + packed_string("") * 2  # place and serial number of the battery
 
 
 def _range(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:

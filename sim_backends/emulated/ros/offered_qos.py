@@ -11,7 +11,7 @@ BY_TYPE: Final[Mapping[str, QosProfile]] = {
     f"sensor_msgs/{name}": PROFILES["sensor_data"]
     for name in ("LaserScan", "Image", "CompressedImage", "PointCloud2")
 }
-"""QoS by ROS 1 type if it is not ROS 2's default: that of drivers with large messages."""
+"""QoS by ROS 1 type, for types whose drivers do not use ROS 2's default QoS because of large messages."""
 
 LATCHED: Final = replace(PROFILES["default"], depth=1, durability=Durability.TRANSIENT_LOCAL)
 """QoS of `/tf_static` (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""

@@ -1,4 +1,4 @@
-"""Motion of an emulated robot for its sensors: wheel odometry and position; also if the robot steers itself.
+"""Motion of an emulated robot for its sensors: wheel odometry and position, also of a robot that steers itself.
 
 The lab sends each path when it starts, and the robot computes its motion on it, so that no message can be late. The
 wheels do not turn when the lab puts a robot back to its place: its odometry continues from its last value.

@@ -28,7 +28,7 @@ class Slots:
 
     Args:
         fd: Descriptor of the file, which this object closes.
-        layout: Layout of the values, as of `struct`, without padding.
+        layout: Layout of the values in the notation of `struct`, without padding.
     """
 
     def __init__(self, fd: int, layout: str) -> None:

@@ -115,7 +115,7 @@ class Listener:
         """Yield the content of complete packets.
 
         Raises:
-            ValueError: A packet is malformed, or the header is not that of this topic.
+            ValueError: A packet is malformed, or the header is for another topic.
         """
         for payload in subscription.packets:
             if subscription.topic not in self._subscriptions:
@@ -144,7 +144,7 @@ def _header(payload: bytes, topic: str) -> Header:
     """Return the connection header of a publisher.
 
     Raises:
-        ValueError: A required field is missing, or the header is that of another topic.
+        ValueError: A required field is missing, or the header is for another topic.
     """
     header = unpack_header(payload)
     missing = {"topic", "type", "md5sum", "message_definition"} - header.keys()

@@ -44,7 +44,7 @@ Values = Mapping[str, bytes]
 
 
 def definition_of(kind: str, text: str) -> Definition:
-    """Return the definition that a publisher of the type `package/Name` announces; if ROS has none it is `text`.
+    """Return the definition that a publisher of the type `package/Name` announces; `text` if ROS has no definition.
 
     Errors as `template_of`, which first rejects types without a definition.
     """
@@ -84,7 +84,7 @@ def _full_name(kind: str) -> str:
 
 @cache
 def _types(kind: str, definition: str) -> "Typestore":
-    """Return ROS 1's types and those of a definition: fields of the type, then `MSG: package/Name` and fields."""
+    """Return ROS 1's types and the types in a definition: fields of the type, then `MSG: package/Name` and fields."""
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
 
     from fieldkit.ros.interfaces.definitions import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
