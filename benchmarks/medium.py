@@ -33,6 +33,10 @@ RADIO: Final = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sen
 PAYLOAD_BYTES: Final = 64
 DELAY_MS: Final = 5.0
 PROBE_PORT: Final = 9000
+START_S: Final = 60.0
+"""Maximum time from the start of the receiver to the first datagram: a busy machine starts the sender late."""
+IDLE_S: Final = 5.0
+"""Time without a datagram after which the remaining ones are lost."""
 # linux/socket.h: the kernel's receive time as struct timespec.
 SO_TIMESTAMPNS: Final = 35
 
@@ -128,9 +132,12 @@ def measure_delay(client: Namespace, server: Namespace, probes: int) -> list[flo
     assert receiver.stdout is not None
     receiver.stdout.readline()
     sender = client.start(sys.executable, *module, "--probe", "send")
-    delays, _ = receiver.communicate(timeout=probes * 0.002 + 30)
+    delays, _ = receiver.communicate(timeout=probes * 0.002 + START_S + IDLE_S + 30)
     sender.communicate(timeout=10)
-    return [float(word) for word in delays.split()]
+    delays_ms = [float(word) for word in delays.split()]
+    if len(delays_ms) < probes:
+        print(f"note: {probes - len(delays_ms)} of {probes} datagrams were lost", file=sys.stderr)
+    return delays_ms
 
 
 def send_probes(probes: int) -> None:
@@ -142,15 +149,19 @@ def send_probes(probes: int) -> None:
 
 
 def receive_probes(probes: int) -> None:
-    """Print the one-way delay in ms of each datagram of `send_probes`."""
-    delays_ms = []
+    """Print the one-way delay in ms of each datagram of `send_probes` that arrives."""
+    delays_ms: list[float] = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         receiver.bind(("", PROBE_PORT))
-        receiver.settimeout(10.0)
+        receiver.settimeout(START_S)
         print("ready", flush=True)
-        for _ in range(probes):
-            data, ((_, _, stamp),), _, _ = receiver.recvmsg(8, 64)
+        while len(delays_ms) < probes:
+            try:
+                data, ((_, _, stamp),), _, _ = receiver.recvmsg(8, 64)
+            except TimeoutError:
+                break
+            receiver.settimeout(IDLE_S)
             seconds, nanoseconds = struct.unpack("qq", stamp)
             delays_ms.append((seconds * 1_000_000_000 + nanoseconds - struct.unpack("q", data)[0]) / 1e6)
     print(*delays_ms)

@@ -90,6 +90,7 @@ def exchange(program: Path, folder: Path) -> bool:
 
 
 @pytest.mark.emulated
+@pytest.mark.quiet
 def test_fast_dds_and_cyclonedds_exchange_samples_through_the_agent(program: Path, tmp_path: Path) -> None:
     """Samples of one implementation arrive unchanged at the other."""
     # On a busy machine CycloneDDS sometimes does not discover an endpoint of Fast DDS that has discovered it.

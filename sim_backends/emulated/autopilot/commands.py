@@ -17,6 +17,8 @@ _FRAME_RELATIVE: Final = dialect.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
 
 _ACCEPTED: Final = int(dialect.MAV_RESULT_ACCEPTED)
 _DENIED: Final = int(dialect.MAV_RESULT_DENIED)
+_UNSUPPORTED_FRAME: Final = 9
+"""MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME of MAVLink's common.xml, which pymavlink 2.4 lacks."""
 
 
 class Commands:
@@ -142,11 +144,13 @@ class Commands:
         if message.get_type() != "COMMAND_INT":
             return int(dialect.MAV_RESULT_COMMAND_INT_ONLY)
         here_m = self._vehicle.body.position_m
-        goal = goal_m(message.frame, message.x, message.y, message.z, self._vehicle.home_m)
-        if not math.isfinite(message.z):
-            goal = goal_m(_FRAME_RELATIVE, message.x, message.y, here_m[2], self._vehicle.home_m)
+        keeps_altitude = not math.isfinite(message.z)
+        z_m = 0.0 if keeps_altitude else message.z
+        goal = goal_m(message.frame, message.x, message.y, z_m, self._vehicle.home_m)
         if goal is None:
-            return int(dialect.MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME)
+            return _UNSUPPORTED_FRAME
+        if keeps_altitude:
+            goal = (*goal[:2], here_m[2])
         if _CURRENT_COORDINATE in {message.x, message.y}:
             goal = (*here_m[:2], goal[2])
         self._vehicle.go_to(goal)

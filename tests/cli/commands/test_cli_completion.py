@@ -57,7 +57,7 @@ def completions(lab: Path, line: str) -> list[str]:
     ("line", "words"),
     [
         ("fieldkit re", ["resume", "report", "rebuild"]),
-        ("fieldkit lab s", ["shell", "ssh-config"]),
+        ("fieldkit lab s", ["shell", "sdf", "ssh-config"]),
         (
             "fieldkit trial ",
             sorted(path.stem for path in (ROOT / "procedures").glob("*.yaml")),

@@ -205,7 +205,7 @@ def test_an_emulated_lab_without_debian_s_ros_rejects_it(monkeypatch: pytest.Mon
     text = f"{DEFAULT_SITE.read_text(encoding='utf-8')}\nemulated: {{ros: builtin}}\n"
     document = schema.parse(text, source="fieldkit.yaml")
     backend = EmulatedBackend(schema.validate(document, Site), document)
-    monkeypatch.setattr("sim_backends.emulated.requirements.check", lambda _: None)
+    monkeypatch.setattr("sim_backends.emulated.requirements.check", lambda _, **__: None)
     with (
         pytest.raises(ConfigurationError, match="has a bridge, which needs Debian's ROS"),
         backend.open(cast(), seed=1, sink=lambda _: None, operator=UNATTENDED),

@@ -181,6 +181,18 @@ class TestFlight:
         position = gcs.last("LOCAL_POSITION_NED")
         assert 9.0 < math.hypot(position.x, position.y) <= 10.1
 
+    @pytest.mark.parametrize("up_m", [4.0, math.nan])
+    def test_a_position_in_an_unknown_frame_is_refused(self, gcs: GroundStation, up_m: float) -> None:
+        take_off(gcs)
+        start_m = gcs.autopilot.vehicle.body.position_m
+        x, y = degrees_e7(HOME_M[0] + 8, HOME_M[1])
+        gcs.send_message(
+            d.MAVLink_command_int_message(SYSTEM, 1, 99, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, up_m)
+        )
+        gcs.wait(5)
+        assert gcs.last("COMMAND_ACK").result == 9, "MAV_RESULT_COMMAND_UNSUPPORTED_MAV_FRAME"
+        assert math.dist(gcs.autopilot.vehicle.body.position_m, start_m) < 0.5
+
     def test_return_to_launch(self, gcs: GroundStation) -> None:
         take_off(gcs)
         x, y = degrees_e7(HOME_M[0] + 8, HOME_M[1])
