@@ -4,10 +4,10 @@ Only the standard library is imported, because the base process is imported unde
 """
 
 from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from sim_backends.emulated.robot.spec import STATE
-from sim_backends.emulated.ros.slots import Slots, open_record
+from sim_backends.emulated.ros.slots import Record
 
 COMMANDED: Final = Path(STATE, "commanded")
 """The file of the record in the robot."""
@@ -27,24 +27,10 @@ class Commanded(NamedTuple):
     turn_rad_s: float
 
 
-class CommandedRecord:
-    """The record in a file, with one writer and any number of readers.
+class CommandedRecord(Record):
+    """The record in a file, with one writer and any number of readers."""
 
-    Args:
-        fd: Descriptor of the file, which this object closes.
-    """
-
-    def __init__(self, fd: int) -> None:
-        self._slots = Slots(fd, "q2d")
-
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Return the record in a file, which is created if it is missing.
-
-        Raises:
-            OSError: It cannot be created.
-        """
-        return cls(open_record(path))
+    layout = "q2d"
 
     def write(self, commanded: Commanded) -> None:
         """Write a commanded velocity.
@@ -62,7 +48,3 @@ class CommandedRecord:
         """
         values = self._slots.read()
         return None if values is None else Commanded(*values)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._slots.close()

@@ -1,11 +1,10 @@
 """Records between the autopilot of a drone and the physics that flies it: commands, and the resulting flight."""
 
 import math
-from pathlib import Path
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.ros.slots import Slots, open_record
+from sim_backends.emulated.ros.slots import Record
 
 _COMMAND_LAYOUT: Final = "3q7d"
 _FLIGHT_LAYOUT: Final = "3q10d"
@@ -34,24 +33,10 @@ class FlightCommand(NamedTuple):
     climb_m_s2: tuple[float, float]
 
 
-class FlightCommandRecord:
-    """The last command, in a file with one writer and any number of readers.
+class FlightCommandRecord(Record):
+    """The last command, in a file with one writer and any number of readers."""
 
-    Args:
-        fd: Descriptor of the file, which this object closes.
-    """
-
-    def __init__(self, fd: int) -> None:
-        self._slots = Slots(fd, _COMMAND_LAYOUT)
-
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Return the record in a file, which is created if it is missing.
-
-        Raises:
-            OSError: It cannot be created.
-        """
-        return cls(open_record(path))
+    layout = _COMMAND_LAYOUT
 
     def write(self, command: FlightCommand) -> None:
         """Write a command.
@@ -90,10 +75,6 @@ class FlightCommandRecord:
             (down_m_s2, up_m_s2),
         )
 
-    def close(self) -> None:
-        """Close the file."""
-        self._slots.close()
-
 
 class FlightMotion(NamedTuple):
     """Motion of a drone, as its sensors measure it.
@@ -121,24 +102,10 @@ class FlightMotion(NamedTuple):
     pitch_rad: float
 
 
-class FlightRecord:
-    """The last motion, in a file with one writer and any number of readers.
+class FlightRecord(Record):
+    """The last motion, in a file with one writer and any number of readers."""
 
-    Args:
-        fd: Descriptor of the file, which this object closes.
-    """
-
-    def __init__(self, fd: int) -> None:
-        self._slots = Slots(fd, _FLIGHT_LAYOUT)
-
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Return the record in a file, which is created if it is missing.
-
-        Raises:
-            OSError: It cannot be created.
-        """
-        return cls(open_record(path))
+    layout = _FLIGHT_LAYOUT
 
     def write(self, flight: FlightMotion) -> None:
         """Write the motion.
@@ -166,7 +133,3 @@ class FlightRecord:
             return None
         time_ns, path_start_ns, is_supported, e, n, u, v_e, v_n, v_u, *angles = values
         return FlightMotion(time_ns, path_start_ns, bool(is_supported), (e, n, u), (v_e, v_n, v_u), *angles)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._slots.close()

@@ -8,19 +8,10 @@ import os
 import struct
 import zlib
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final, Self
 
 _NUMBER: Final = struct.Struct("<Q")
 _CRC: Final = struct.Struct("<I")
-
-
-def open_record(path: Path) -> int:
-    """Return a descriptor of the file of a record, which is created if it is missing.
-
-    Raises:
-        OSError: It cannot be created.
-    """
-    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
 
 class Slots:
@@ -74,3 +65,32 @@ class Slots:
         if _CRC.unpack(crc)[0] == zlib.crc32(slot):
             self._number, *values = self._slot.unpack(slot)
             self._values = tuple(values)
+
+
+class Record:
+    """A record with a fixed layout in a file; its classes add `write` and `read`.
+
+    Args:
+        fd: Descriptor of the file, which this object closes.
+
+    Attributes:
+        layout: Layout of the values, as for `Slots`.
+    """
+
+    layout: ClassVar[str]
+
+    def __init__(self, fd: int) -> None:
+        self._slots = Slots(fd, self.layout)
+
+    @classmethod
+    def open(cls, path: Path) -> Self:
+        """Return the record in a file, which is created if it is missing.
+
+        Raises:
+            OSError: It cannot be created.
+        """
+        return cls(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._slots.close()

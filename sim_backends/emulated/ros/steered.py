@@ -5,11 +5,10 @@ a time of the monotonic clock, which all processes of a machine share; readers e
 """
 
 import math
-from pathlib import Path
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.ros.slots import Slots, open_record
+from sim_backends.emulated.ros.slots import Record
 from sim_backends.world.motion import STILL, State
 
 SILENT_NS: Final = 500_000_000
@@ -76,26 +75,15 @@ class Steered(NamedTuple):
         return later._replace(velocity_m_s=STILL, turn_rad_s=0.0) if is_silent else later
 
 
-class SteeredRecord:
-    """The record in a file, with one writer and any number of readers.
+class SteeredRecord(Record):
+    """The record in a file, with one writer and any number of readers."""
 
-    Args:
-        fd: Descriptor of the file, which this object closes.
-    """
+    layout = _LAYOUT
 
     def __init__(self, fd: int) -> None:
-        self._slots = Slots(fd, _LAYOUT)
+        super().__init__(fd)
         self._values: tuple[Any, ...] | None = None
         self._last: Steered | None = None
-
-    @classmethod
-    def open(cls, path: Path) -> Self:
-        """Return the record in a file, which is created if it is missing.
-
-        Raises:
-            OSError: It cannot be created.
-        """
-        return cls(open_record(path))
 
     def write(self, motion: Steered) -> None:
         """Write the robot's motion.
@@ -123,10 +111,6 @@ class SteeredRecord:
         if values is not None and values is not self._values:
             self._values, self._last = values, _steered(*values)
         return self._last
-
-    def close(self) -> None:
-        """Close the file."""
-        self._slots.close()
 
 
 def _steered(time_ns: int, path_start_ns: int, *values: float) -> Steered:
