@@ -210,11 +210,14 @@ def lease_of(link: RecordingShell) -> DriveLease:
 def test_lease_repeats_the_order_until_robot_is_home() -> None:
     link = RecordingShell(status=["", '{"ended": ""}', "{", '{"ended": "home"}'])
     with lease_of(link) as lease:
-        assert (lease.status, lease.end_state) == ({}, "")
+        assert lease.status in ({}, {"ended": ""})  # A renewal can precede this line.
+        assert lease.end_state == ""
         lease.give_order("back")
         lease.wait(lambda: lease.end_state, Deadline.after(60))
         assert lease.status == {"ended": "home"}
-    assert [text.split()[1] for text in link.written[:2]] == ["wait", "back"]
+    orders = [text.split()[1] for text in link.written]
+    assert orders[0] == "wait"
+    assert orders[-1] == "back"
 
 
 @pytest.mark.parametrize("status_text", ["[1]", "[" * 100_000, '{"ended": ["home"]}'])
