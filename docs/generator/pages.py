@@ -22,6 +22,7 @@ from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
 from fieldkit.core import errors, events
 from fieldkit.core.columns import Column
+from fieldkit.core.model import MAX_STEPS
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.measure.transfers.fates import PACKET_COLUMNS
 from fieldkit.pytest import plugin
@@ -175,7 +176,7 @@ def procedure() -> str:
                 ("`during`", "required", "Steps to repeat for each combination of values."),
             ),
         ),
-        f"A file has at most {loops.MAX_STEPS:,} steps after expansion.",
+        f"A file has at most {MAX_STEPS:,} steps after expansion.",
     )
 
 

@@ -180,6 +180,19 @@ class Document:
             existing = (*existing, part) if (*existing, part) in self.lines else existing
         return existing
 
+    def has_key(self, key: str) -> bool:
+        """Return True if any mapping of the document has this key."""
+        remaining = [self.data]
+        while remaining:
+            value = remaining.pop()
+            if isinstance(value, dict):
+                if key in value:
+                    return True
+                remaining += value.values()
+            elif isinstance(value, list):
+                remaining += value
+        return False
+
     @contextmanager
     def locating_errors(self, *location: str | int) -> Iterator[None]:
         """Add `file:line` of a location to errors that the body raises without a place."""

@@ -110,6 +110,11 @@ class Status(StrEnum):
 MAX_REPEATS: Final = 100_000
 """Maximum number of repeats per protocol of one trial. This number of repeats would take weeks."""
 
+LOOP: Final = "for"
+"""Key of a loop in a list of steps."""
+MAX_STEPS: Final = 1000
+"""Maximum number of steps of a procedure's file after its loops are expanded."""
+
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """Final states of an attempt."""
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from fieldkit.analysis import judgements, table_files, wording
+from fieldkit.analysis import judgements, table_files
 from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import quantities
 from fieldkit.core import files
@@ -99,7 +100,7 @@ def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
 
 
 def _expectation_case(judgement: Judgement) -> ET.Element:
-    expected, subject, measured, interval, ruling = wording.judgement_texts(judgement)
+    expected, subject, measured, interval, ruling = judgement_texts(judgement)
     case = ET.Element("testcase", name=f"{expected} ({subject})" if subject else expected, time="0")
     if not judgement.holds:
         _add(case, "failure", f"{ruling}: {measured} {interval}".rstrip())

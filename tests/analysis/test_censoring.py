@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from fieldkit.analysis import expectations, judgements, paper_tables, result_tables, wording
 from fieldkit.analysis.cells import Cell, aggregate
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement, Ruling
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Repeats
@@ -105,7 +106,7 @@ def test_missing_repeats_are_counted_in_all_outputs() -> None:
     cell = gaps([0.2] * 8, missing=2)
     result = judge_text("rtt_gap_s < 2 s", cell)
     assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
-    assert wording.judgement_texts(result)[2] == "200 ms (8 of 10)"
+    assert judgement_texts(result)[2] == "200 ms (8 of 10)"
     quantities = [Quantity.of(column) for column in GAP]
     markdown = paper_tables.to_markdown(BY, [cell], [quantity for quantity in quantities if quantity])
     assert "(8 of 10)" in markdown

@@ -3,14 +3,13 @@
 import errno
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.judgements import Judgement, judge
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import (
@@ -36,6 +35,9 @@ from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.stop import Stop
 
+if TYPE_CHECKING:
+    from fieldkit.analysis.judgements import Judgement
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -53,7 +55,7 @@ class Outcome:
     cells: tuple[Cell, ...]
     valid: int
     failed: int
-    judgements: tuple[Judgement, ...] = ()
+    judgements: "tuple[Judgement, ...]" = ()
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
@@ -169,19 +171,25 @@ def run_repeats(
     robots.delete_remote()
     _report_unfetched(robots, sink)
     valid, void, failed = map(ledger.counts, ENDED)
-    judgements = judge(plan.procedure.expectations, cells)
-    _show_judgements(judgements, sink)
+    judgements = _judge(plan, cells, sink) if plan.procedure.expect else ()
     sink(TrialEnded(str(folder), valid, void, failed))
     return Outcome(folder, cells, valid, failed, judgements)
 
 
-def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
+def _judge(plan: Plan, cells: Sequence[Cell], sink: Sink) -> "tuple[Judgement, ...]":
+    """Judge the expectations of a procedure, and report each judgement."""
+    from fieldkit.analysis.judgements import judge  # noqa: PLC0415 (few procedures have expectations)
+
+    judgements = judge(plan.procedure.expectations, cells)
     for judgement in judgements:
         sink(_judgement_event(judgement))
+    return judgements
 
 
-def _judgement_event(judgement: Judgement) -> ExpectationJudged:
-    _, protocol, measured, interval, _ = wording.judgement_texts(judgement)
+def _judgement_event(judgement: "Judgement") -> ExpectationJudged:
+    from fieldkit.analysis.judgement_words import judgement_texts  # noqa: PLC0415 (few procedures have expectations)
+
+    _, protocol, measured, interval, _ = judgement_texts(judgement)
     estimate = judgement.estimate
     return ExpectationJudged(
         expectation=judgement.expectation.text,
