@@ -16,7 +16,7 @@ from fieldkit.core.model import Protocol, Topology
 from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.procedure import Procedure, Repeats, load_procedure, with_expectation
-from fieldkit.trial.sources import Note
+from fieldkit.trial.stored.sources import Note
 
 CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 

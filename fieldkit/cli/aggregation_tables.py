@@ -23,8 +23,8 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.executors import Workers
 from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_quantity
-from fieldkit.trial import sources
-from fieldkit.trial.sources import Sources
+from fieldkit.trial.stored import sources
+from fieldkit.trial.stored.sources import Sources
 
 _AdditionalRepeats = Sequence[Mapping[str, int]]
 """For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""

@@ -19,8 +19,9 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
-from fieldkit.trial import manifest, planned_evidence, store
+from fieldkit.trial import planned_evidence, store
 from fieldkit.trial.plan import PLAN_FILE, Plan
+from fieldkit.trial.stored import verification
 
 MAX_TRIALS: Final = 300
 """Maximum number of trials whose evidence is compared with the manifest and shown."""
@@ -166,8 +167,8 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
     chosen = _chosen(repeats, plans, first)
     for source in chosen:
         try:
-            if differences := manifest.differences(Path(source)):
-                summary = manifest.summarize(differences)
+            if differences := verification.differences(Path(source)):
+                summary = verification.summarize(differences)
                 unread.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
                 changed |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:

@@ -5,10 +5,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 from fieldkit.backends.protocols import Cast, Robot
-from fieldkit.config.program_files import LabProgram
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Placement, Protocol, Role, Vector, Verdict
@@ -19,6 +18,9 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
 from fieldkit.steps.motions import Motions
 from fieldkit.steps.variants import Tool, Variants
+
+if TYPE_CHECKING:
+    from fieldkit.config.program_files import LabProgram
 
 Shells = Mapping[Role, Shell]
 Announce = Callable[[str, float | None], None]
@@ -126,7 +128,7 @@ class PutProgram:
     """
 
     role: Role
-    program: LabProgram
+    program: "LabProgram"
     at: str
 
 

@@ -49,11 +49,12 @@ from fieldkit.ros.streams.topic_checks import TopicPlan
 from fieldkit.ros.streams.topic_columns import TopicTraffic
 from fieldkit.steps.scene import CommandResult
 from fieldkit.steps.view import View
-from fieldkit.trial import columns, journal, manifest, plan, rebuild, store
+from fieldkit.trial import columns, journal, plan, store
 from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.running import locks
+from fieldkit.trial.stored import rebuild, verification
 from tests.fuzz.federate_targets import federate_targets
 from tests.fuzz.harness import Target
 from tests.fuzz.motion_targets import motion_targets
@@ -263,7 +264,7 @@ def _read_csv(data: bytes, place: Path) -> None:
 
 
 def _verify_manifest(path: Path) -> None:
-    manifest.verify(path.parent)
+    verification.verify(path.parent)
 
 
 def _load_site(path: Path) -> None:

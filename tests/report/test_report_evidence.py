@@ -18,8 +18,9 @@ from fieldkit.report import distribution, packet_rasters, page, timeline, trial_
 from fieldkit.report.contents import build_contents, repeat_to_draw
 from fieldkit.report.series import Identities
 from fieldkit.report.trial_folders import load_evidence
-from fieldkit.trial import sources, store
+from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import sources
 from tests.helpers import recorded
 from tests.report.test_report_page import HOSTILE, Elements
 

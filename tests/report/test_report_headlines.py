@@ -10,8 +10,9 @@ from fieldkit.config import schema
 from fieldkit.report.coverage import everything_lost
 from fieldkit.report.headlines import Headline, headlines
 from fieldkit.report.trial_folders import Evidence, load_evidence
-from fieldkit.trial import sources, store
+from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import sources
 from tests.helpers import lawns, recorded
 from tests.helpers.tables import RepeatRow, parsed
 

@@ -16,8 +16,9 @@ from fieldkit.report.charts import Panel
 from fieldkit.report.contents import repeat_to_draw
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.ros.streams import topic_samples
-from fieldkit.trial import procedure, sources, store
+from fieldkit.trial import procedure, store
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import sources
 from tests.helpers import recorded
 
 BEGAN_NS = recorded.START_NS + 10 * recorded.SECOND_NS

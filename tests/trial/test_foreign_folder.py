@@ -15,11 +15,12 @@ from fieldkit.core import files, jsonl
 from fieldkit.core.columns import Measured
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, RepeatId, Status
-from fieldkit.trial import journal, manifest, store
+from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
-from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.stored import verification
+from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers import recorded
 from tests.helpers.casts import los_plan
 
@@ -101,7 +102,7 @@ def test_files_that_could_block_a_reader_are_rejected(trial: Path, place: str, m
     with pytest.raises(EvidenceError, match="not a regular file") as caught:
         rebuild(trial)
     assert caught.value.where == str(trial / place)
-    assert any(line.startswith(f"{place}: it is a ") for line in manifest.verify(trial))
+    assert any(line.startswith(f"{place}: it is a ") for line in verification.verify(trial))
 
 
 def test_a_pipe_as_a_table_does_not_block(
@@ -163,13 +164,13 @@ def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> Non
     for name in strange:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
     Path(os.fsdecode(os.fsencode(trial / "repeats/udp-01") + b"/\xff.txt")).write_text("x", encoding="utf-8")
-    lines = manifest.verify(trial)
+    lines = verification.verify(trial)
     assert len(lines) == len(strange) + 1
     assert all(line.isprintable() and line.endswith(": not in the manifest") for line in lines)
     (trial / store.MANIFEST_FILE).unlink()
     ledger = Ledger(store.read_plan(trial), trial, Stop())
     ledger.summarize()
-    assert manifest.verify(trial) == []
+    assert verification.verify(trial) == []
     assert os.system(f"cd '{trial}' && sha256sum --check --quiet MANIFEST.sha256") == 0
 
 

@@ -14,10 +14,11 @@ from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps import kinds
 from fieldkit.steps.base import step_types
-from fieldkit.trial import frozen, rows, store, tables
+from fieldkit.trial import frozen, rows, store
 from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.stored import tables
 from tests.helpers import meter, vendor_trials
 from tests.helpers.casts import los_plan
 from tests.helpers.outside_packages import write_package

@@ -69,7 +69,7 @@ def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
 
 
 def _load(arguments: argparse.Namespace) -> "Repeats":
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild, use_index=arguments.use_index)
     return data.read(undeclared=True)
@@ -77,7 +77,8 @@ def _load(arguments: argparse.Namespace) -> "Repeats":
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import mcap, timeline
-    from fieldkit.trial import sources, store
+    from fieldkit.trial import store
+    from fieldkit.trial.stored import sources
 
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
@@ -93,7 +94,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
 
 def _junit(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import junit
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     # `rebuild=True` includes trials without a table, because a CI server must show all trials.
     trials = sources.find(arguments.paths, show_note, rebuild=True).tables

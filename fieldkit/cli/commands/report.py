@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     # matplotlib takes half a second to import, so other commands must not import it.
     from fieldkit.campaign.plan import unmeasured
     from fieldkit.report import contents, figures, page
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     out, folder = arguments.out, arguments.figures
     _require_writable(out)

@@ -26,7 +26,7 @@ from fieldkit.core.events import (
 from fieldkit.core.model import ENDED, RepeatId
 from fieldkit.core.prompts import Answer
 from fieldkit.core.units import TimeEstimate
-from fieldkit.trial import estimates, journal, manifest, rows, store
+from fieldkit.trial import estimates, journal, rows, store
 from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import motion_control, preflight
@@ -125,7 +125,9 @@ def run_repeats(
     repeats = list(plan.order())
     finished = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
-        sink(Note(f"the evidence has changed since it was stored: {manifest.summarize(ledger.differences)}"))
+        from fieldkit.trial.stored import verification  # noqa: PLC0415 (only a resumed trial has a manifest)
+
+        sink(Note(f"the evidence has changed since it was stored: {verification.summarize(ledger.differences)}"))
     try:
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.stop_leftover_jobs()

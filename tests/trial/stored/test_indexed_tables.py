@@ -17,7 +17,7 @@ from fieldkit.analysis import table_index
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.executors import Workers
 from fieldkit.export import table
-from fieldkit.trial import indexed_tables, sources
+from fieldkit.trial.stored import indexed_tables, sources
 from tests.helpers.paths import ROOT
 
 STORED: Final = ROOT / "tests" / "data" / "fieldkit"
