@@ -13,7 +13,7 @@ from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site, is_ipv4
 from fieldkit.core import geometry
-from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Control, Fault, FaultKind, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Answer, Operator
@@ -225,8 +225,12 @@ class FieldTestbed:
         )
         try:
             yield
-        except Exception:
-            self._bring_back(name)
+        except Exception as error:
+            try:
+                self._bring_back(name)
+            except ConfigurationError as unanswered:
+                unanswered.what += f"; before, the move failed: {describe_exception(error)}"
+                raise
             raise
         self._bring_back(name)
 

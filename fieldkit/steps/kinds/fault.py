@@ -18,7 +18,7 @@ from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.core.threads import run_parallel
+from fieldkit.core.threads import is_mistake, run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import outage, outage_columns
 from fieldkit.measure.robot_clock import Offset, offset
@@ -156,11 +156,14 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             jobs.run(shell, recovery.job)  # `measure` evaluates whether the robot recovered
             jobs.stop(shell, watch.job)
             self._wait_for_steps(steps, scene, testbed)
-        except Exception:
+        except Exception as error:
             inner.halt.set()
             with suppress(FieldkitError):
                 end_inside(self, scene, testbed)
             wait([steps])
+            mistake = steps.exception()
+            if mistake is not None and mistake is not error and is_mistake(mistake):
+                raise mistake from error
             raise
         finally:
             inner.halt.set()
