@@ -20,6 +20,7 @@ from fieldkit.core.text import sanitized
 from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans
 
 _SEPARATOR: Final = "."
 """Separator of class names, by which servers group cases."""
@@ -53,7 +54,7 @@ def text(folders: Iterable[Path]) -> bytes:
 
 
 def _suite(folder: Path) -> ET.Element:
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     cases = [*_repeat_cases(plan, journal.history(folder, plan)), *map(_expectation_case, _judgements(folder, plan))]
     group = _SEPARATOR.join(("fieldkit", plan.procedure.name, plan.distance.replace(_SEPARATOR, "_"), plan.topology))
     for case in cases:

@@ -21,6 +21,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
 from fieldkit.trial import planned_evidence, store
 from fieldkit.trial.plan import PLAN_FILE, Plan
+from fieldkit.trial.stored import plans as stored_plans
 from fieldkit.trial.stored import verification
 
 MAX_TRIALS: Final = 300
@@ -160,7 +161,7 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
         if (Path(source) / PLAN_FILE).is_file():
             try:
-                plans[source] = store.read_plan(Path(source))
+                plans[source] = stored_plans.read_plan(Path(source))
             except FieldkitError as error:
                 unread.append(error.located)
     first = [repeats.texts["source"][repeats.row(attempt)]] if attempt else []

@@ -1,6 +1,6 @@
 """Procedures (`procedures/*.yaml`): the steps of a trial, which refer to robots by role."""
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -366,24 +366,3 @@ def read_procedure(path: Path) -> Procedure:
         ConfigurationError: The file cannot be read, or has an error.
     """
     return catalog.validate_named(schema.read(path), Procedure, path.stem)
-
-
-def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
-    """Return the procedures, with the expectation added to each procedure that measures its figure.
-
-    Args:
-        procedures: The procedures.
-        text: The expectation.
-
-    Raises:
-        ConfigurationError: The text is not an expectation, or no procedure measures the figure.
-    """
-    from fieldkit.analysis import expectations  # noqa: PLC0415 (few procedures have expectations)
-
-    quantity = expectations.parse(text, (figure for procedure in procedures for figure in procedure.figures)).quantity
-    return [
-        procedure.model_copy(update={"expect": (*procedure.expect, text)})
-        if quantity in {figure.name for figure in procedure.figures}
-        else procedure
-        for procedure in procedures
-    ]

@@ -18,10 +18,10 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.statistics import medians
 from fieldkit.core.columns import Column, Figure, Kind, columns, with_step_name
 from fieldkit.core.model import ENDED
-from fieldkit.measure.evidence import ping
+from fieldkit.measure.evidence import ping, ping_gaps
 
 BY = ("protocol",)
-GAP = (*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS)
+GAP = (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)
 RTT = tuple(column for column in (*ping.COLUMNS, *ping.SENT_COLUMNS) if "median" in column.name)
 NAN = math.nan
 

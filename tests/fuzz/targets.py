@@ -49,12 +49,12 @@ from fieldkit.ros.streams.topic_checks import TopicPlan
 from fieldkit.ros.streams.topic_columns import TopicTraffic
 from fieldkit.steps.scene import CommandResult
 from fieldkit.steps.view import View
-from fieldkit.trial import columns, journal, plan, store
+from fieldkit.trial import columns, journal, plan
 from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.running import locks
-from fieldkit.trial.stored import rebuild, verification
+from fieldkit.trial.stored import plans, rebuild, verification
 from tests.fuzz.federate_targets import federate_targets
 from tests.fuzz.harness import Target
 from tests.fuzz.motion_targets import motion_targets
@@ -246,7 +246,7 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
 
 @cache
 def _plan() -> plan.Plan:
-    return store.read_plan(LOS)
+    return plans.read_plan(LOS)
 
 
 def _rebuild_trial(name: str, data: bytes, place: Path) -> None:

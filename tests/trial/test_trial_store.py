@@ -9,7 +9,7 @@ from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.trial import manifest, store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.stored import verification
+from fieldkit.trial.stored import plans, verification
 from tests.helpers.casts import los_plan, plain_plan
 
 
@@ -28,8 +28,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_plan_is_written_and_read_back(folder: Path) -> None:
-    assert store.read_plan(folder) == plain_plan()
-    assert schema.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
+    assert plans.read_plan(folder) == plain_plan()
+    assert schema.dump(plans.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.ros
@@ -49,7 +49,7 @@ def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(f"trial: {plain_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"in trial: ") as caught:
-        store.read_plan(folder)
+        plans.read_plan(folder)
     assert caught.value.where.startswith(str(path))
 
 
@@ -84,7 +84,7 @@ def test_files_of_an_interrupted_attempt_are_not_in_the_manifest(folder: Path) -
 
 def test_a_folder_without_a_trial_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"there is no trial\.yaml"):
-        store.read_plan(tmp_path)
+        plans.read_plan(tmp_path)
     with pytest.raises(EvidenceError, match="no readable manifest"):
         verification.verify(tmp_path)
 

@@ -77,8 +77,7 @@ def _load(arguments: argparse.Namespace) -> "Repeats":
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import mcap, timeline
-    from fieldkit.trial import store
-    from fieldkit.trial.stored import sources
+    from fieldkit.trial.stored import plans, sources
 
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
@@ -87,7 +86,7 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
             remedy="one at a time: "
             + shell_command("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     sources.note_differences(folder, show_note)
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 

@@ -261,14 +261,22 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        return (*self.columns, *ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS) if self.gap else self.columns
+        if not self.gap:
+            return self.columns
+        from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
+
+        return (*self.columns, *ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)
 
     @override
     def measure(self, view: View) -> Measured:
         result = view.evidence.read_or_none(ping.read, self._file)
         replied_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
         ends = self.sender, self.receiver
-        gap = ping.measure_gap(result, self.interval) if self.gap else Measured()
+        gap = Measured()
+        if self.gap:
+            from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
+
+            gap = ping_gaps.measure_gap(result, self.interval)
         return (
             ping.measure(result)
             | gap

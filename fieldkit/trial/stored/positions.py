@@ -18,7 +18,7 @@ from fieldkit.measure.positions.position_sources import PositionSource, Position
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.stored import verification
+from fieldkit.trial.stored import plans, verification
 from fieldkit.trial.stored.rebuild import Rebuilt, rebuild
 
 MAX_BYTES: Final = 64 << 20
@@ -59,7 +59,7 @@ def set_positions(
             missing.
         EvidenceError: A file cannot be read, or the trial's evidence has changed.
     """
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     for role, source in sources.items():
         _require_role(plan, role)
         if isinstance(source, Path):
@@ -169,7 +169,7 @@ def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
         ConfigurationError: `folder` is not a trial.
         EvidenceError: The journal is damaged.
     """
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     for attempt in journal.ended(journal.history(folder, plan)):
         if attempt.status is Status.VALID:
             evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))

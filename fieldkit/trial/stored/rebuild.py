@@ -11,7 +11,7 @@ from fieldkit.trial import journal, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.stored import verification
+from fieldkit.trial.stored import plans, verification
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ def rebuild(folder: Path) -> Rebuilt:
         EvidenceError: The journal cannot be read, or the evidence differs from its checksums; nothing is written
             then.
     """
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     if differences := verification.differences(folder):
         raise EvidenceError(
             "the evidence is not what was measured; the tables are not changed: "

@@ -21,7 +21,7 @@ from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
 from fieldkit.trial import rows, store
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.stored import indexed_tables, tables
+from fieldkit.trial.stored import indexed_tables, plans, tables
 from fieldkit.trial.stored.indexed_tables import NO_INDEX, IndexedTables
 
 ALL_PROCESSORS: Final = Workers()
@@ -368,7 +368,7 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
             where=str(table),
             remedy="name the folder of the trial, or leave out --rebuild",
         )
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     note_differences(folder, note)
     return rows.to_csv(rebuild.measured(folder, plan), plan.table).encode()
 

@@ -14,6 +14,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import frozen, store
 from fieldkit.trial.columns import installed, trial_columns
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored.plans import read_plan
 
 Facts = Callable[[Path], TableFacts | None]
 """Returns the properties of a table that are known without reading it; None if they are unknown."""
@@ -54,8 +55,7 @@ def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
     plans = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     everywhere = set(trial_columns())
     declared = (
-        (plan, [column for column in store.read_plan(plan.parent).table if column not in everywhere])
-        for plan in plans
+        (plan, [column for column in read_plan(plan.parent).table if column not in everywhere]) for plan in plans
     )
     return trial_columns(merge_columns(declared).values())
 

@@ -12,6 +12,7 @@ from fieldkit.trial import manifest, store
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.store import MANIFEST_FILE
+from fieldkit.trial.stored import plans
 
 _MAX_LISTED: Final = 5
 
@@ -26,7 +27,7 @@ def verify(folder: Path) -> list[str]:
         EvidenceError: There is no manifest, or it cannot be read.
     """
     listed = manifest.read(folder)
-    unexpected = {str(path.relative_to(folder)): kind for path, kind in store.unexpected_files(folder)}
+    unexpected = {str(path.relative_to(folder)): kind for path, kind in plans.unexpected_files(folder)}
     present = {manifest.relative_name(folder, path): path for path in manifest.plain_files(folder)}
     present.pop(MANIFEST_FILE, None)
     return _sentences(_file_differences(listed.keys() - unexpected.keys(), listed, present) | unexpected)

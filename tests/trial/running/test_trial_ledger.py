@@ -26,7 +26,7 @@ from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running import ledger
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.stop import Stop
-from fieldkit.trial.stored import verification
+from fieldkit.trial.stored import plans, verification
 from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers.casts import CAST
 from tests.trial.test_trial_crash import PING, PROCEDURE
@@ -63,7 +63,7 @@ def trial(tmp_path: Path) -> Path:
 
 
 def reopened(folder: Path) -> Ledger:
-    return Ledger(store.read_plan(folder), folder, Stop())
+    return Ledger(plans.read_plan(folder), folder, Stop())
 
 
 def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,7 +97,7 @@ def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypat
 
 
 def test_a_small_trial_writes_every_row_immediately(trial: Path) -> None:
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
     keep(reopened(trial), plan, trial, list(plan.order())[2])
     after = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
@@ -123,7 +123,7 @@ def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
 
 
 def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
     keep(reopened(trial), plan, trial, list(plan.order())[2])
