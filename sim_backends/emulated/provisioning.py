@@ -25,7 +25,6 @@ from sim_backends.emulated.ros.sensor_specs import (
     Neighbour,
     Sensor,
 )
-from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, quadrotor
 from sim_backends.world.shapes import Cylinder, Shape
 from sim_backends.world.world import World
 
@@ -130,6 +129,12 @@ def neighbour(number: int, profile: RobotProfile) -> Neighbour:
 
     A profile whose body is not in the table has the body of the paper's robot of its kind.
     """
+    from sim_backends.physics.robot_limits import (  # noqa: PLC0415 (a dry run makes no robots)
+        BODIES,
+        TURTLEBOT3_BURGER,
+        quadrotor,
+    )
+
     default = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
     body = BODIES.get(profile.name, default)
     return Neighbour(number, body.radius_m, ANTENNA_M, max(body.height_m - ANTENNA_M, 0.0))

@@ -42,7 +42,7 @@ from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
-from fieldkit.ros.bags import bag
+from fieldkit.ros.bags import bag, recorded_topics
 from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples
 from fieldkit.ros.streams.topic_captures import CapturedTopic
 from fieldkit.ros.streams.topic_checks import TopicPlan
@@ -101,7 +101,7 @@ def _read_file(read: Callable[[Path], object], name: str, data: bytes, place: Pa
 def _read_bag(path: Path) -> None:
     bag.read(path)
     bag.battery_share(path, TOPIC)
-    bag.topic_stats(path)
+    recorded_topics.topic_stats(path)
 
 
 @cache

@@ -75,7 +75,7 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     plan = los_plan().model_copy(update={"columns": freeze(columns) or None})
     folder = tmp_path_factory.mktemp("trial")
     (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
-    assert [*frozen.read(folder / "trial.yaml")] == columns
+    assert [*plans.read_columns(folder / "trial.yaml")] == columns
     assert plans.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
     read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
     # A cell has nine digits of a number; a bound may have more.

@@ -2,14 +2,16 @@
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from fieldkit.config import schema
 from fieldkit.core import files, laptop_files
+from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.steps import base
-from fieldkit.trial import store
+from fieldkit.trial import frozen, store
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
@@ -113,3 +115,41 @@ def _missing_kinds(document: object) -> str | None:
         for kind, source in zip(absent, sources, strict=True)
     )
     return f"{', '.join(descriptions)} {'is' if len(absent) == 1 else 'are'} not installed"
+
+
+class _PlanColumns(schema.Strict):
+    """The part of a plan that lists its columns."""
+
+    columns: frozen.Columns | None = None
+
+
+def read_columns(path: Path) -> tuple[Column, ...]:
+    """Return the columns listed in a `trial.yaml`, without loading the step kinds of its procedure.
+
+    Raises:
+        ConfigurationError: The file cannot be read, or an entry is not a valid column.
+    """
+    document = schema.read(path)
+    if not isinstance(document.data, dict) or "columns" not in document.data:
+        return ()
+    plan = schema.validate(replace(document, data={"columns": document.data["columns"]}), _PlanColumns)
+    return tuple(column.column for column in plan.columns or ())
+
+
+class _ProcedureExpectations(schema.Strict):
+    """The part of a procedure that lists its expectations."""
+
+    expect: tuple[str, ...] = ()
+
+
+def read_expectations(path: Path) -> tuple[str, ...]:
+    """Return the expectations of the procedure in a `trial.yaml`, without loading its step kinds.
+
+    Raises:
+        ConfigurationError: The file cannot be read, or its expectations are invalid.
+    """
+    if b"expect:" not in files.read(path):  # a fast test: most plans have no expectations, and need not be parsed
+        return ()
+    procedure = schema.read(path).part("procedure")
+    data = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}
+    return schema.validate(replace(procedure, data=data), _ProcedureExpectations).expect

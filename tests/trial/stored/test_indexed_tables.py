@@ -89,7 +89,7 @@ def test_rows_come_from_the_index_and_equal_those_of_the_tables(
 
     monkeypatch.setattr("fieldkit.analysis.table_files._split", unread)
     monkeypatch.setattr("fieldkit.analysis.table_files.names", unread)
-    monkeypatch.setattr("fieldkit.trial.frozen.read", unread)
+    monkeypatch.setattr("fieldkit.trial.stored.plans.read_columns", unread)
     assert outcome(tmp_path / "trials", use_index=True) == expected
     selection = 'topology == "master" and distance_m < 20'
     some = outcome(tmp_path / "trials", use_index=True, selection=selection)
