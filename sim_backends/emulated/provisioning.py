@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
-from ipaddress import IPv4Network
+from ipaddress import IPv4Address, IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
@@ -35,6 +35,8 @@ NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
 """Address of the laptop; robots have lower addresses."""
 LAPTOP_NAME: Final = "laptop"
+MAX_LINKS: Final = 200
+"""Number of further links that have addresses: 10.42.N.0/24 is the network of the Nth."""
 
 _DEFAULTS: Final = EmulatedOptions.defaults()
 
@@ -183,6 +185,29 @@ def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
     return ros.middleware if find_spec(package) else ""
 
 
+def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions) -> dict[str, str]:
+    """Return a robot's address on each further link that the lab emulates, by the link's name.
+
+    Args:
+        profile: The robot's profile.
+        address: Its address on the radio; its addresses have the same last byte.
+        options: The lab's options.
+
+    Raises:
+        ConfigurationError: The lab does not emulate a link of the profile.
+    """
+    last_byte = int(IPv4Address(address)) - int(NETWORK.network_address)
+    for name in profile.further_links:
+        if name not in options.links:
+            raise ConfigurationError(
+                f"profile {profile.name} has the link {name!r}, which the lab does not emulate",
+                where="emulated.links",
+                remedy=f"write for example emulated: {{links: {{{name}: {{rate: 20Mbit/s, delay: 40ms}}}}}}",
+            )
+    networks = {name: number for number, name in enumerate(sorted(options.links), start=1)}
+    return {name: str(NETWORK.network_address + 256 * networks[name] + last_byte) for name in profile.further_links}
+
+
 def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:
     drive = drive_of(profile)
     if drive is None:
@@ -282,6 +307,10 @@ def robot_spec(
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=ros2_over_radio,
         bridge=_bridge(robot),
+        links={
+            name: (robot.profile.further_links[name], f"{address}/{NETWORK.prefixlen}")
+            for name, address in link_addresses(robot.profile, robot.address, options).items()
+        },
         routes_zenoh=options.ros2.router == robot.name,
         **tools.model_dump(),
     )

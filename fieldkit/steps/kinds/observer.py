@@ -65,7 +65,7 @@ class Observer:
             argv: tuple[str, ...] = ("sh", "-c", _WATCH, "sh", self.fault.process, interval)
         else:
             argv = ping.command_line(
-                self.scene, self.role, ("-i", interval), self.scene.robot(self.fault.role).address
+                self.scene, self.role, ("-i", interval), self.scene.link(self.fault.role, self.fault.link).address
             )
         job = Job(
             folder=self.scene.folder,

@@ -172,6 +172,26 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
     return fd
 
 
+def add_link(interface: str, address: str) -> int:
+    """Bring up the interface of a further link, without routes for multicast.
+
+    Returns:
+        The device's descriptor, for the medium of the link.
+
+    Raises:
+        FieldkitError: The interface cannot be created.
+        RobotError: `ip` rejected a setting.
+    """
+    fd = open_tun(interface)
+    run_ip(f"link set {interface} mtu {MTU_BYTES} up", f"address add {address} broadcast + dev {interface}")
+    return fd
+
+
+def switch_on_link(interface: str) -> None:
+    """Bring the interface of a further link up again; errors as `switch_on`."""
+    run_ip(f"link set {interface} up")
+
+
 def configure(interface: str, address: str) -> None:
     """Bring up loopback and an interface with its address and routes. Errors as `run_ip`."""
     run_ip(
