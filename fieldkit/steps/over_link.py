@@ -12,6 +12,9 @@ from fieldkit.config.schema import Field, Strict
 from fieldkit.core.model import Role, Verdict
 from fieldkit.steps.scene import CommandResult, Need, Scene
 
+LOOPBACK: Final = "lo"
+"""Interface of a link whose address is reached over any other link of a robot, by the decision of its routes."""
+
 _DEVICE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})", re.ASCII)
 
 
@@ -26,9 +29,12 @@ class OverLink(Strict):
     over: LinkName = Field(default="", exclude_if=schema.is_empty)
 
     def route_need(self, scene: Scene, source: Role, destination: Role) -> Iterator[Need]:
-        """Yield the check that the route from a robot to another uses this link; none for the radio under test."""
-        if self.over:
-            here, there = scene.link(source, self.over), scene.link(destination, self.over)
+        """Yield the check that the route from a robot to another uses this link.
+
+        There is none for the radio under test, and for a link that may use any interface.
+        """
+        here, there = scene.link(source, self.over), scene.link(destination, self.over)
+        if self.over and here.interface != LOOPBACK:
             argv = ("ip", "-o", "route", "get", there.address)
             yield Need(source, f"route over {self.over}", argv, partial(judge_route, here, there))
 

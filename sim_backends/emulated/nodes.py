@@ -196,8 +196,12 @@ class EmulatedRobot(Node):
     def open_links(self) -> None:
         """Bring up the interfaces of its further links. Errors as `open_radio`."""
         for name, (interface, address) in self.spec.links.items():
-            request = {"do": "open link", "interface": interface, "address": address}
-            _, (self.link_fds[name],) = self._worker.request(request)
+            mesh = self.spec.mesh_hello_s is not None
+            _, fds = self._worker.request(
+                {"do": "open link", "interface": interface, "address": address, "mesh": mesh}
+            )
+            if fds:
+                (self.link_fds[name],) = fds
 
     def switch_off(self, link: str = "") -> None:
         """Take the interface of a further link down, or of the radio. Errors as `open_radio`."""
@@ -213,7 +217,7 @@ class EmulatedRobot(Node):
 
     @property
     def _interfaces(self) -> list[str]:
-        return [self.spec.interface, *(interface for interface, _ in self.spec.links.values())]
+        return [self.spec.interface, *(self.spec.links[name][0] for name in self.link_fds)]
 
     def kill(self, process: str) -> None:
         """Kill every process of this name. Errors as `open_radio`; it is also an error if there is none."""
@@ -329,7 +333,7 @@ def running_robots(
             medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
         used = {name for robot in robots.values() for name in robot.profile.further_links}
         links = {
-            name: stack.enter_context(MediumClient(link_options, world, seed=seed))
+            name: stack.enter_context(MediumClient(link_options, world, seed=seed, framing=framing))
             for name, link_options in options.links.items()
             if name in used
         }
@@ -352,8 +356,8 @@ def running_robots(
         for key, robot in running.items():
             radio, fd = robots[key].profile.radio, robot.radio_fd if robot.has_device else None
             medium.attach(robot.name, robot.address, radio, fd, physics_fds=robot.physics_fds)
-            for name, (_, address) in robot.spec.links.items():
-                links[name].attach(robot.name, address, radio, robot.link_fds[name])
+            for name, link_fd in robot.link_fds.items():
+                links[name].attach(robot.name, robot.spec.links[name][1], radio, link_fd)
         if any(robot.spec.waits_for_another for robot in running.values()):
             media.place(placement.side_by_side_m(robot.name for robot in running.values()))
         list(started)

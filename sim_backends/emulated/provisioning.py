@@ -15,6 +15,7 @@ from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.emulated_options import HOST_TOOLS, EmulatedOptions, RosChoice, uses_debian_ros
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
+from sim_backends.emulated.robot import network
 from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros import static_frames
 from sim_backends.emulated.ros.sensor_specs import (
@@ -197,15 +198,27 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
         ConfigurationError: The lab does not emulate a link of the profile.
     """
     last_byte = int(IPv4Address(address)) - int(NETWORK.network_address)
-    for name in profile.further_links:
-        if name not in options.links:
+    networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
+    for name, interface in profile.further_links.items():
+        if interface == network.LOOPBACK and options.mesh is not None:
+            networks[name] = network.SHARED_NETWORK.network_address
+        if name not in networks:
+            has_address_only = interface == network.LOOPBACK
+            example = (
+                "mesh: {daemon: babeld, hello: 0.5s}"
+                if has_address_only
+                else f"links: {{{name}: {{rate: 20Mbit/s, delay: 40ms}}}}"
+            )
             raise ConfigurationError(
                 f"profile {profile.name} has the link {name!r}, which the lab does not emulate",
-                where="emulated.links",
-                remedy=f"write for example emulated: {{links: {{{name}: {{rate: 20Mbit/s, delay: 40ms}}}}}}",
+                where="emulated",
+                remedy=f"write for example emulated: {{{example}}}",
             )
-    networks = {name: number for number, name in enumerate(sorted(options.links), start=1)}
-    return {name: str(NETWORK.network_address + 256 * networks[name] + last_byte) for name in profile.further_links}
+    return {name: str(networks[name] + last_byte) for name in profile.further_links}
+
+
+def _prefix_length(interface: str) -> int:
+    return 32 if interface == network.LOOPBACK else NETWORK.prefixlen
 
 
 def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:
@@ -308,7 +321,7 @@ def robot_spec(
         ros2=ros2_over_radio,
         bridge=_bridge(robot),
         links={
-            name: (robot.profile.further_links[name], f"{address}/{NETWORK.prefixlen}")
+            name: (interface := robot.profile.further_links[name], f"{address}/{_prefix_length(interface)}")
             for name, address in link_addresses(robot.profile, robot.address, options).items()
         },
         routes_zenoh=options.ros2.router == robot.name,

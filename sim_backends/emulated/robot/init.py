@@ -196,7 +196,7 @@ class Init:
                 self._neighbourhood = Neighbourhood(received_fds[0], len(spec.hosts)) if received_fds else None
                 return _motion_files(spec)
             case "open radio" | "open link":
-                return [_open_device(request)]
+                return _open_devices(request)
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
             case "open wifi" | "switch off" | "switch on" | "switch link on":
@@ -260,15 +260,18 @@ class Init:
         return started
 
 
-def _open_device(request: Message) -> int:
-    """Bring up a link, and the routing daemon of a mesh guest; return the descriptor of its device."""
+def _open_devices(request: Message) -> list[int]:
+    """Bring up a link, and the routing daemon of a mesh guest; return the descriptor of its device, if it has one."""
+    interface, address = request["interface"], request["address"]
     if request["do"] == "open link":
-        return network.add_link(request["interface"], request["address"])
-    interface, address, hello_s = request["interface"], request["address"], request["guest_hello_s"]
-    fd = network.bring_up(interface, address, mesh=request["mesh"])
+        if interface == network.LOOPBACK:
+            network.add_loopback_address(address)
+            return []
+        return [network.add_link(interface, address, mesh=request["mesh"])]
+    fd, hello_s = network.bring_up(interface, address, mesh=request["mesh"]), request["guest_hello_s"]
     if hello_s is not None:
         services.spawn(network.guest_command(interface, address, hello_s), {}, Path(os.devnull))
-    return fd
+    return [fd]
 
 
 def _build(spec: RobotSpec) -> None:
