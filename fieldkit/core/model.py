@@ -176,12 +176,14 @@ class Fault:
         role: Role of the affected robot.
         duration_s: Duration in seconds; 0 for a reboot or a kill, whose duration is not controlled.
         process: Name of the process that is killed; empty for the other kinds.
+        link: Name of the link that is down; empty for the radio under test and the other kinds.
     """
 
     kind: FaultKind
     role: Role
     duration_s: float = 0.0
     process: str = ""
+    link: str = ""
 
 
 @dataclass(frozen=True)
