@@ -113,11 +113,12 @@ class Wifi(Generic[Payload]):
     def counters(self) -> dict[Pair, LinkCounters]:
         """Return the counters of each hop so far; a broadcast counts as one frame per station in range."""
         names = self._channel.names
-        zeros = dict.fromkeys(permutations(self._linked_names, 2), LinkCounters(0, 0, 0, 0))
-        return zeros | {
-            (names[transmitter], names[receiver]): peer.counters
-            for (transmitter, receiver), peer in self._delivery.peers.items()
-        }
+        pairs = dict.fromkeys(permutations(self._linked_names, 2), LinkCounters(0, 0, 0, 0))
+        for (transmitter, receiver), peer in self._delivery.peers.items():
+            pair = names[transmitter], names[receiver]
+            if pair in pairs:
+                pairs[pair] = peer.counters
+        return pairs
 
     def send(
         self,

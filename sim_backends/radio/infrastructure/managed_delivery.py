@@ -109,13 +109,15 @@ class ManagedDelivery(PacketDelivery[Payload]):
         return sum(_is_management(frame) for queue in _queues(self._stations[transmitter]) for frame in queue)
 
     def _put_first(self, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Move the last frame of a queue before all that are not in the current exchange."""
+        """Move the last frame of a queue before all that were not sent yet.
+
+        A frame that was sent is finished first, so that its receiver recognizes a repetition.
+        """
         queue = station.queue if station.categories is None else station.categories.queue_of(frame)
         if not queue or queue[-1] is not frame:
             return  # dropped
         queue.pop()
-        current = _in_exchange(station)
-        position = max((number + 1 for number, other in enumerate(queue) if other in current), default=0)
+        position = max((number + 1 for number, other in enumerate(queue) if other.attempts), default=0)
         queue.insert(position, frame)
 
     @override
@@ -247,10 +249,11 @@ class ManagedDelivery(PacketDelivery[Payload]):
         station = self._stations[robot]
         own = []
         for transmitter, frame in self._held[robot]:
-            if transmitter is not station:
-                self._discard_unacknowledged(now_ns, transmitter, frame)
-            elif not self._end_session(now_ns, station, frame):
+            self._end_session(now_ns, transmitter, frame)
+            if transmitter is station:
                 own.append((station, frame))
+            else:
+                self.lose(now_ns, transmitter.index, frame, NOT_ASSOCIATED)
         self._held[robot] = own
         if self.power_save is not None:
             for transmitter, frame in self.power_save.withdraw(robot):
@@ -273,7 +276,10 @@ class ManagedDelivery(PacketDelivery[Payload]):
                 super().enqueue(now_ns, transmitter, frame)
 
     def _withdraw(self, now_ns: int, station: Station[Payload], receiver: int | None) -> list[Frame[Payload]]:
-        """Remove the packets of a station to a receiver from its queues, without those in its current exchange."""
+        """Remove the packets of a station to a receiver from its queues, without those in its current exchange.
+
+        Packets that the receiver has already decoded are removed and not returned.
+        """
         current = _in_exchange(station)
         withdrawn: list[Frame[Payload]] = []
         for queue in _queues(station):
@@ -290,26 +296,21 @@ class ManagedDelivery(PacketDelivery[Payload]):
                 self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
             else:
                 self._events.cancel_start(station.index)
-        return withdrawn
+        return [frame for frame in withdrawn if not self._is_received(station, frame)]
 
-    def _discard_unacknowledged(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Lose a packet to a robot that has left, unless the robot has received it."""
-        if not self._end_session(now_ns, station, frame):
-            self.lose(now_ns, station.index, frame, NOT_ASSOCIATED)
-
-    def _end_session(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> bool:
-        """Remove a frame from the Block Ack session with its receiver; return True if the receiver has it."""
+    def _is_received(self, station: Station[Payload], frame: Frame[Payload]) -> bool:
         receiver = frame.receiver
-        if receiver is None:
-            return False
-        peer = self.peer(station.index, receiver, frame.category)
-        if peer.has_received(frame):
-            return True
-        if peer.session is not None and frame.sequence >= 0:
-            self.pass_up(now_ns, station.index, peer, peer.session.skip([frame]))
+        return receiver is not None and self.peer(station.index, receiver, frame.category).has_received(frame)
+
+    def _end_session(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        """Remove a frame from the Block Ack session with its receiver."""
+        receiver = frame.receiver
+        if receiver is not None and frame.sequence >= 0:
+            peer = self.peer(station.index, receiver, frame.category)
+            if peer.session is not None:
+                self.pass_up(now_ns, station.index, peer, peer.session.skip([frame]))
             frame.sequence = -1
         frame.attempts = 0
-        return False
 
 
 def _is_management(frame: Frame[Payload]) -> bool:
