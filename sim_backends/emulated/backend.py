@@ -263,7 +263,11 @@ class EmulatedBackend:
         return members
 
     def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
-        if problem := self._options.radio.infrastructure_problem([*names], has_relay=has_relay):
+        if not self._options.radio.has_infrastructure:
+            return
+        from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other labs need none of it)
+
+        if problem := infrastructure.conflict(self._options.radio, [*names], has_relay=has_relay):
             raise ConfigurationError(
                 problem,
                 where=self._document.where(("emulated", "radio")) if self._document else "",

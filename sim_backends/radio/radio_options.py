@@ -1,6 +1,5 @@
 """Options of the radio in a site file; an empty mapping gives Wi-Fi on open ground."""
 
-from collections.abc import Collection
 from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
@@ -140,16 +139,6 @@ class RadioOptions(Strict):
             key = next(key for key in INFRASTRUCTURE if getattr(self, key))
             raise schema.validation_error(f"fixed links (loss, delay, rate or jitter) have no {key}", key)
         return self
-
-    def infrastructure_problem(self, robots: Collection[str], *, has_relay: bool) -> str | None:
-        """Return the reason why access points and neighbours cannot be combined with these robots, or None."""
-        names = [*robots, *self.access_points, *self.neighbours]
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            return f"two of the robots, radio.access_points and radio.neighbours have the name {twice}"
-        if self.access_points and has_relay:
-            return "with radio.access_points no robot can be an access point: use the topology masterless"
-        return None
 
     def link(self) -> LinkParameters:
         """Return the parameters of every fixed link."""

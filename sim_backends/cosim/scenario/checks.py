@@ -206,9 +206,14 @@ def _radios(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
     radio = scenario.radio
-    if problem := radio.infrastructure_problem(antennas(scenario), has_relay=scenario.topology is Topology.MASTER):
+    if not radio.has_infrastructure:
+        return
+    from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other scenarios need none of it)
+
+    has_relay = scenario.topology is Topology.MASTER
+    if problem := infrastructure.conflict(radio, antennas(scenario), has_relay=has_relay):
         yield ScenarioProblem(("radio",), problem, "change radio or the agents of the scenario")
-    if radio.has_infrastructure and scenario.network.federate is not None:
+    if scenario.network.federate is not None:
         key = next(key for key in INFRASTRUCTURE if getattr(radio, key))
         yield ScenarioProblem(
             ("radio", key), f"an external network has no {key}", "remove it, or the external network"

@@ -1,6 +1,6 @@
 """Access points, neighbouring networks and microwave ovens around robots, in one object."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -26,6 +26,17 @@ _JAMMER: Final = "jammer "
 _OVEN: Final = "oven "
 
 
+def conflict(options: RadioOptions, robots: Collection[str], *, has_relay: bool) -> str | None:
+    """Return the reason why access points and neighbours cannot be combined with these robots, or None."""
+    names = [*robots, *options.access_points, *options.neighbours]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        return f"two of the robots, radio.access_points and radio.neighbours have the name {twice}"
+    if options.access_points and has_relay:
+        return "with radio.access_points no robot can be an access point: use the topology masterless"
+    return None
+
+
 class Infrastructure:
     """Stations and sources of noise besides the robots.
 
@@ -46,7 +57,7 @@ class Infrastructure:
     """
 
     def __init__(self, seed: int, options: RadioOptions, robots: Mapping[str, Antenna], world: World | None) -> None:
-        if problem := options.infrastructure_problem(robots, has_relay=False):
+        if problem := conflict(options, robots, has_relay=False):
             raise ConfigurationError(problem, remedy="rename one of them")
         self._seed = seed
         self._options = options
