@@ -21,9 +21,9 @@ COLUMNS: Final = columns(
     (
         "roam_ap_before",
         "text",
-        "Access point of the robot at its first link sample: its BSSID, or its name in a lab.",
+        "Access point of the robot at the start of the ping: its BSSID, or its name in a lab.",
     ),
-    ("roam_ap_after", "text", "Access point of the robot at its last link sample."),
+    ("roam_ap_after", "text", "Access point of the robot at the end of the ping."),
     (
         "roam_handovers",
         "count",
