@@ -14,6 +14,7 @@ from typing import Final
 
 from fieldkit.core.columns import Figure, Kind, Measured, Value, columns
 from fieldkit.core.model import LinkSample
+from fieldkit.measure.evidence import link
 from fieldkit.measure.evidence.ping import Ping, stamped_answers
 
 COLUMNS: Final = columns(
@@ -102,10 +103,9 @@ def find_handovers(samples: Sequence[LinkSample]) -> list[Handover]:
 
     A new association with the same access point is not a handover.
     """
-    associated = [(sample.cell, sample.utc_ns) for sample in samples if sample.cell]
     return [
         Handover(before, after, left_ns, joined_ns)
-        for (before, left_ns), (after, joined_ns) in pairwise(associated)
+        for (left_ns, before), (joined_ns, after) in pairwise(link.access_points(samples))
         if before != after
     ]
 
@@ -156,7 +156,7 @@ def measure(samples: Sequence[LinkSample], output: Ping | None, interval_s: floa
     """
     start_ns, end_ns = _window_ns(output, interval_s)
     samples = [sample for sample in samples if start_ns <= sample.utc_ns <= end_ns]
-    cells = [sample.cell for sample in samples if sample.cell]
+    cells = [access_point for _, access_point in link.access_points(samples)]
     if not cells:
         return Measured.all_missing(COLUMNS, _NO_ACCESS_POINT)
     handovers = find_handovers(samples)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from fieldkit.core.columns import Measured
 from fieldkit.core.model import LinkSample
-from fieldkit.measure.evidence import handovers, ping
+from fieldkit.measure.evidence import handovers, ping, robot_link_samples
 from fieldkit.measure.evidence.handovers import Handover
 
 START_NS = 1_700_000_000 * 10**9
@@ -115,3 +115,18 @@ def test_each_column_has_a_value_or_a_reason() -> None:
             assert names == {*result.values, *result.missing}
     result = measured(samples([None] * 9, 200_000_000), output(40, 100_000_000, set()), 100_000_000)
     assert "no access point" in result.missing["roam_ap_before"]
+
+
+def test_a_station_dump_narrows_the_time_of_a_handover() -> None:
+    """On a robot `iw link` is called every 5 s, and again when `iw station get` of the access point fails."""
+    old, new = "04:f0:21:00:00:01", "04:f0:21:00:00:02"
+    link_text = "Connected to {} (on wlan0)\n\tSSID: lab\n\tsignal: -61 dBm\n"
+    station_text = "Station {} (on wlan0)\n\tsignal:  \t-61 dBm\n"
+    text = f"==> 100.00 link <==\n{link_text.format(old)}"
+    text += "".join(
+        f"==> 10{tenths // 10}.{tenths % 10}0 station <==\n{station_text.format(old)}" for tenths in (2, 12, 24)
+    )
+    text += f"==> 102.60 station <==\n==> 102.80 link <==\n{link_text.format(new)}"
+    (handover,) = handovers.find_handovers(robot_link_samples.parse(text))
+    assert (handover.before, handover.after) == (old, new)
+    assert (handover.left_ns, handover.joined_ns) == (102_400_000_000, 102_800_000_000)
