@@ -218,16 +218,22 @@ def _increment(counts: Iterable[int | None]) -> int | None:
     return sum(after - before if after >= before else after for before, after in pairwise(present))
 
 
-def _roams(samples: Sequence[LinkSample]) -> int | None:
+def access_points(samples: Sequence[LinkSample]) -> list[tuple[int, str]]:
+    """Return the times in ns at which a station was associated, each with its access point; empty if it is none."""
     if not any(sample.cell for sample in samples):
-        return None
+        return []
     # A station dump also lists the access point, and may be the only sample of an association.
     names = [{station.station for station in sample.stations if station.station} for sample in samples]
     cells = [
         sample.cell or ("".join(peers) if len(peers) == 1 else "")
         for sample, peers in zip(samples, names, strict=True)
     ]
-    return sum(before != after for before, after in pairwise(filter(None, cells)))
+    return [(sample.utc_ns, cell) for sample, cell in zip(samples, cells, strict=True) if cell]
+
+
+def _roams(samples: Sequence[LinkSample]) -> int | None:
+    associated = access_points(samples)
+    return sum(before != after for (_, before), (_, after) in pairwise(associated)) if associated else None
 
 
 def _median(values: Iterable[float | None]) -> float | None:

@@ -47,7 +47,7 @@ SAMPLES = st.lists(
         LinkSample,
         st.integers(0, 2**62),
         st.lists(STATIONS, max_size=2, unique_by=lambda item: item.station).map(tuple),
-        st.none(),
+        st.sampled_from((None, "west", "02:00:00:00:00:01")),
         POWERS,
         COUNTS,
         COUNTS,
