@@ -75,6 +75,21 @@ class MeshOptions(Strict):
     hello: Annotated[Duration, Field(ge=0.1, le=60)] = HELLO_S
 
 
+class LinuxWifiOptions(Strict):
+    """Settings of [Linux's Wi-Fi](linux-wifi.md); they have no effect without `wifi: linux`.
+
+    Attributes:
+        security: Security of the access point: `wpa2` (pre-shared key) or `wpa3` (SAE with protected management
+            frames).
+        mesh: True for an 802.11s mesh of all robots, in every topology: the kernels forward frames for each other.
+        monitor: True to give each robot a monitor interface `mon0`, on which tcpdump captures frames with radiotap.
+    """
+
+    security: Literal["wpa2", "wpa3"] = "wpa2"
+    mesh: Bool = False
+    monitor: Bool = False
+
+
 class Ros2Options(Strict):
     """Discovery between the ROS 2 nodes of different robots over the radio.
 
@@ -159,6 +174,7 @@ class EmulatedOptions(Strict):
             exchange at every event of ns-3 takes too long for real time.
         wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [the Wi-Fi of Linux](linux-wifi.md), over the same
             radio, in a virtual machine if this kernel has no mac80211_hwsim.
+        linux_wifi: Settings of the Wi-Fi of Linux.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -174,6 +190,7 @@ class EmulatedOptions(Strict):
     network: Literal["builtin", "ns3"] | None = None
     sync: SyncOptions | None = None
     wifi: Literal["model", "linux"] = "model"
+    linux_wifi: LinuxWifiOptions = LinuxWifiOptions.defaults()
 
     @property
     def has_linux_wifi(self) -> bool:

@@ -2,11 +2,13 @@
 
 import secrets
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
+from sim_backends.emulated.emulated_options import LinuxWifiOptions
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
@@ -18,12 +20,18 @@ Key = TypeVar("Key")
 _PASSPHRASE_BYTES = 12
 
 
-def parts(robots: Mapping[Key, Robot | LabRobot]) -> dict[Key, WifiSpec]:
-    """Return the part of each robot: the relay of a trial runs the access point; without a relay, all are ad hoc."""
-    if Role.RELAY not in robots:
-        return dict.fromkeys(robots, WifiSpec("ad hoc"))
-    passphrase = secrets.token_hex(_PASSPHRASE_BYTES)
-    return {key: WifiSpec("access point" if key == Role.RELAY else "station", passphrase) for key in robots}
+def parts(robots: Mapping[Key, Robot | LabRobot], options: LinuxWifiOptions) -> dict[Key, WifiSpec]:
+    """Return the part of each robot.
+
+    In a mesh, all are mesh points. Otherwise the relay of a trial runs the access point; without a relay, all are ad
+    hoc.
+    """
+    if options.mesh or Role.RELAY not in robots:
+        return dict.fromkeys(
+            robots, WifiSpec("mesh point" if options.mesh else "ad hoc", has_monitor=options.monitor)
+        )
+    station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), options.security, options.monitor)
+    return {key: replace(station, part="access point") if key == Role.RELAY else station for key in robots}
 
 
 def radios_of(robots: Iterable[Robot | LabRobot]) -> dict[str, HwsimRadio]:

@@ -86,12 +86,16 @@ class WifiSpec:
     """The Wi-Fi of Linux on a robot.
 
     Attributes:
-        part: `ad hoc`, `access point` or `station`.
-        passphrase: Passphrase of the access point; empty if `ad hoc`.
+        part: `ad hoc`, `mesh point`, `access point` or `station`.
+        passphrase: Passphrase of the access point; empty without one.
+        security: Security of the access point.
+        has_monitor: True if the robot has a monitor interface.
     """
 
-    part: Literal["ad hoc", "access point", "station"]
+    part: Literal["ad hoc", "mesh point", "access point", "station"]
     passphrase: str = ""
+    security: Literal["wpa2", "wpa3"] = "wpa2"
+    has_monitor: bool = False
 
 
 @dataclass(frozen=True)
