@@ -1,6 +1,6 @@
 """Counters of the radio drivers, as real drivers report them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,13 +43,9 @@ class RadioMeter:
 
     def on_start(self, transmission: Transmission, receiver: int | None) -> None:
         """Record a frame that starts now; `receiver` is None for broadcasts, ACKs and aggregates."""
-        start_ns, end_ns = transmission.start_ns, transmission.end_ns
-        busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
-        for index in (transmission.transmitter, *transmission.detected_by):
-            until_ns = busy_until_ns[index]
-            if end_ns > until_ns:
-                busy_ns[index] += end_ns - max(start_ns, until_ns)
-                busy_until_ns[index] = end_ns
+        self.on_busy(
+            transmission.start_ns, transmission.end_ns, (transmission.transmitter, *transmission.detected_by)
+        )
         if receiver is not None:
             link = self.link(transmission.transmitter, receiver)
             if transmission.attempt == 1:
@@ -57,6 +53,15 @@ class RadioMeter:
             else:
                 link.retries += 1
             link.rate_bit_s = transmission.mode.rate_bit_s
+
+    def on_busy(self, start_ns: int, end_ns: int, stations: Iterable[int]) -> None:
+        """Record that stations find their channel busy from now until a time."""
+        busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
+        for index in stations:
+            until_ns = busy_until_ns[index]
+            if end_ns > until_ns:
+                busy_ns[index] += end_ns - max(start_ns, until_ns)
+                busy_until_ns[index] = end_ns
 
     def on_aggregate(self, transmission: Transmission, receiver: int, frames: Sequence[Frame[Any]]) -> None:
         """Record the frames of an aggregate that starts now, after `on_start`."""
@@ -87,9 +92,17 @@ class RadioMeter:
 
 
 def link_samples(
-    now_ns: int, utc_ns: int, channel: RadioChannel, meter: RadioMeter, peers: _Peers, *, relay: int | None
+    now_ns: int,
+    utc_ns: int,
+    channel: RadioChannel,
+    meter: RadioMeter,
+    peers: _Peers,
+    *,
+    robots: Sequence[int],
+    relay: int | None,
+    cells: Mapping[int, int | None] | None = None,
 ) -> dict[str, LinkSample]:
-    """Return the driver statistics of each station, with the timestamp `utc_ns`.
+    """Return the driver statistics of each robot, with the timestamp `utc_ns`.
 
     Args:
         now_ns: Current time.
@@ -97,24 +110,33 @@ def link_samples(
         channel: The channel.
         meter: The counters.
         peers: The links, by indices of transmitter and receiver.
+        robots: Indices of the robots.
         relay: Index of the access point; None for direct links.
+        cells: Access point of each robot, if the robots roam between access points.
     """
     busy_ns = meter.busy_ns(now_ns)
-    indices = range(len(channel.names))
 
     def associated(index: int) -> Sequence[int]:
         """Return the stations to which a station sends frames: all others, or its access point."""
-        return [other for other in (indices if relay in {None, index} else (relay,)) if other not in {None, index}]
+        if cells is not None:
+            access_point = cells[index]
+            return [] if access_point is None else [access_point]
+        return [other for other in (robots if relay in {None, index} else (relay,)) if other not in {None, index}]
+
+    def cell(index: int) -> str | None:
+        access_point = None if cells is None else cells[index]
+        return None if access_point is None else channel.names[access_point]
 
     return {
-        name: LinkSample(
+        channel.names[index]: LinkSample(
             utc_ns,
             tuple(_station_sample(now_ns, channel, meter, peers, (index, other)) for other in associated(index)),
+            cell=cell(index),
             noise_dbm=decibel(channel.noise_mw[index]),
             active_ns=now_ns,
             busy_ns=busy_ns[index],
         )
-        for index, name in enumerate(channel.names)
+        for index in robots
     }
 
 

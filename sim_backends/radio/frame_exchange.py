@@ -53,6 +53,7 @@ class FrameExchange(Generic[Payload]):
         channel: Received powers between the stations.
         seed: Seed of all random draws.
         queue_packets: Maximum number of queued packets per station.
+        make_delivery: Class of the delivery.
 
     Attributes:
         stations: Stations by index.
@@ -64,7 +65,13 @@ class FrameExchange(Generic[Payload]):
         meter: Counters of the radio drivers; None without counters.
     """
 
-    def __init__(self, channel: RadioChannel, seed: int, queue_packets: int) -> None:
+    def __init__(
+        self,
+        channel: RadioChannel,
+        seed: int,
+        queue_packets: int,
+        make_delivery: type[PacketDelivery[Payload]] = PacketDelivery,
+    ) -> None:
         self._names = channel.names
         band = channel.band
         self._basic = basic_mode(band)
@@ -79,7 +86,7 @@ class FrameExchange(Generic[Payload]):
             if mapping is not None:
                 station.use_categories(mapping, band)
         self.events = EventQueue(self._start)
-        self.delivery: PacketDelivery[Payload] = PacketDelivery(channel, self.stations, self.events, queue_packets)
+        self.delivery: PacketDelivery[Payload] = make_delivery(channel, self.stations, self.events, queue_packets)
         self.reception = Reception(channel, seed, self.stations, self.events)
         self.rts_cts = RtsCts(self._names, band, self.stations, self.events, self.reception)
         self.log: Callable[[TransmissionAttempt], None] | None = None

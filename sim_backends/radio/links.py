@@ -65,6 +65,7 @@ For each packet passed to a model, each addressed station is reported exactly on
 """
 
 OUT_OF_RANGE: Final = "out of range"
+NOT_ASSOCIATED: Final = "not associated"
 QUEUE_FULL: Final = "queue full"
 RETRIES_EXHAUSTED: Final = "retries exhausted"
 NOT_DECODED: Final = "broadcast not decoded"

@@ -1,19 +1,26 @@
 """Radio models behind one interface."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
+from functools import partial
 from itertools import product
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
+
+from typing_extensions import override
 
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.channel import Emitter
 from sim_backends.radio.frames import Emission, TransmissionAttempt
 from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
+from sim_backends.radio.packet_delivery import PacketDelivery
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.radio.wifi import Wifi
 from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.world import World
+
+if TYPE_CHECKING:
+    from sim_backends.radio.infrastructure.infrastructure import Infrastructure
 
 PathLosses = Callable[[], Mapping[Pair, float]]
 """Returns path losses in dB, by transmitter and receiver."""
@@ -137,10 +144,22 @@ class WifiInWorld(Wifi[Payload]):
         *,
         path_losses_db: PathLosses | None = None,
     ) -> None:
+        self._infrastructure: Infrastructure | None = None
+        make_delivery: type[PacketDelivery[Payload]] = PacketDelivery
+        if options.has_infrastructure and antennas:
+            # Other radios import none of it.
+            from sim_backends.radio.infrastructure import infrastructure, managed_delivery  # noqa: PLC0415
+
+            make_delivery = managed_delivery.ManagedDelivery
+            self._infrastructure = infrastructure.Infrastructure(seed, options, antennas, world)
+            antennas = self._infrastructure.antennas
         self._world_channel = WorldChannel(seed, antennas, options, world)
         self._names = tuple(antennas)
         self._path_losses_db = path_losses_db
-        super().__init__(self._world_channel, seed, queue_packets=options.queue_packets)
+        super().__init__(self._world_channel, seed, queue_packets=options.queue_packets, make_delivery=make_delivery)
+        if self._infrastructure is not None:
+            self._infrastructure.start(self._world_channel, self._exchange)
+            self._robots, self._linked_names = self._infrastructure.robots, self._infrastructure.linked_names
 
     def place(
         self,
@@ -153,8 +172,32 @@ class WifiInWorld(Wifi[Payload]):
         self.advance(now_ns)
         if self._path_losses_db is not None:
             self._world_channel.use_path_losses(self._path_losses_db())
+        infrastructure = self._infrastructure
+        if infrastructure is not None and infrastructure.places_m:
+            places_m = {**places_m, **infrastructure.places_m}
         self._world_channel.move(now_ns, places_m, velocities_m_s)
         self.set_relay(relay)
+        if infrastructure is not None and infrastructure.roaming is not None:
+            infrastructure.roaming.start(now_ns)
+
+    @override
+    def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
+        """Implement `RadioModel.log_attempts`; frames of stations themselves are omitted."""
+        infrastructure = self._infrastructure
+        super().log_attempts(
+            log if log is None or infrastructure is None else partial(infrastructure.log_packet, log)
+        )
+
+    @override
+    def set_relay(self, name: str | None) -> None:
+        super().set_relay(name)
+        if self._infrastructure is not None:
+            self._infrastructure.use_power_save()
+
+    @override
+    def _cells(self) -> Mapping[int, int | None] | None:
+        roaming = None if self._infrastructure is None else self._infrastructure.roaming
+        return None if roaming is None else roaming.cells
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
         """Implement `RadioModel.disturb`."""
@@ -163,6 +206,10 @@ class WifiInWorld(Wifi[Payload]):
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
         """Implement `RadioModel.jam`."""
+        if self._infrastructure is not None:
+            self.advance(now_ns)
+            self._infrastructure.jam(now_ns, emitters)
+            return
         received_mw = self._world_channel.received_mw
         self.set_emissions(
             now_ns,

@@ -119,7 +119,19 @@ class PacketDelivery(Generic[Payload]):
 
     def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
         """Count a broadcast on the link to each station, and log for which stations it was lost."""
-        for index, name in enumerate(self._channel.names):
+        self.count_receptions(now_ns, transmitter, frame, received, range(len(self._channel.names)))
+
+    def count_receptions(
+        self,
+        now_ns: int,
+        transmitter: int,
+        frame: Frame[Payload],
+        received: Sequence[int],
+        addressed: Iterable[int],
+    ) -> None:
+        """Count a broadcast on the link to each addressed station, and log for which of them it was lost."""
+        for index in addressed:
+            name = self._channel.names[index]
             linked, missed = self._channel.linked(transmitter, index), index not in received
             if linked:
                 self.peer(transmitter, index).count(delivered=not missed)

@@ -7,7 +7,7 @@ DTIM as long as any station uses power save. Beacons, null frames and PS-Polls t
 received, and waking takes no time.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final, Generic
 
 from sim_backends.radio.contention import EventQueue
@@ -32,6 +32,9 @@ class PowerSave(Generic[Payload]):
         beacon_phase_ns: Time of the first beacon, which has a DTIM.
         events: Scheduled events.
         release: Queues a frame at its transmitter.
+
+    Attributes:
+        access_points: Indices of the stations that buffer frames; none if stations send directly to each other.
     """
 
     def __init__(
@@ -47,13 +50,13 @@ class PowerSave(Generic[Payload]):
         self._release = release
         self._awake_until_ns = dict.fromkeys(timeouts_ns, 0)
         self._buffers: dict[int | None, list[tuple[Station[Payload], Frame[Payload]]]] = {}
-        self.access_point: int | None = None
+        self.access_points: Collection[int] = ()
 
     def buffer(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> bool:
         """Buffer a frame that its transmitter must not send yet; return False if it may be sent."""
-        if self.access_point is None:
+        if not self.access_points:
             return False
-        if station.index != self.access_point:
+        if station.index not in self.access_points:
             self._wake(now_ns, station.index)
             return False
         receiver = frame.receiver
@@ -74,6 +77,10 @@ class PowerSave(Generic[Payload]):
         for receiver, waiting in self._buffers.items():
             self._buffers[receiver] = [entry for entry in waiting if entry[0] is not station]
         return frames
+
+    def withdraw(self, receiver: int) -> Sequence[tuple[Station[Payload], Frame[Payload]]]:
+        """Remove and return the frames that are buffered for a station, each with its transmitter."""
+        return self._buffers.pop(receiver, [])
 
     def _beacon_ns(self, now_ns: int, period: int) -> int:
         interval_ns = period * BEACON_INTERVAL_NS

@@ -17,10 +17,19 @@ from fieldkit.config.schema import (
 from fieldkit.core import units
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from sim_backends.radio.high_throughput import mode_names
+from sim_backends.radio.infrastructure.infrastructure_options import (
+    AccessPointOptions,
+    MicrowaveOvenOptions,
+    NeighbourNetworkOptions,
+    RoamingOptions,
+)
 from sim_backends.radio.links import LinkParameters
 from sim_backends.radio.modes import G_MODES, N_MODES
 
 UNLIMITED: Final = "unlimited"
+
+INFRASTRUCTURE: Final = ("access_points", "neighbours", "microwave_ovens")
+"""Keys of stations and sources of noise besides the robots."""
 
 _RATE: Final = "54Mbit/s"
 _HOP_S: Final = 0.0002
@@ -48,6 +57,9 @@ def _checked_rate(text: str) -> str:
             f"bit rate {text!r} is below 1bit/s; write for example 20Mbit/s, or {UNLIMITED}"
         )
     return text
+
+
+StationName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,30}$")]
 
 
 class RadioOptions(Strict):
@@ -78,6 +90,11 @@ class RadioOptions(Strict):
             omitted, stations adapt the rate to acknowledgements.
         queue_packets: Queue length per station, or per fixed link, in packets, without the packet on the air; 1000 is
             Linux's default.
+        access_points: Access points that are not robots, by name: a robot is a station of one of them and
+            [roams](method-radio.md#roaming). The topology must be masterless.
+        roaming: When and how robots roam between them.
+        neighbours: Transmitters of other networks in the channel, by name.
+        microwave_ovens: Microwave ovens, by name.
         loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted
             and one of the next three is given.
         delay: Fixed links: delay of a link in addition to queuing and serialization. The default is 0.2 ms, about
@@ -97,6 +114,10 @@ class RadioOptions(Strict):
     noise_floor_dbm: Annotated[Number | Int, Field(ge=-150, le=50)] = -95.0
     mode: Annotated[str, AfterValidator(_checked_mode)] | None = None
     queue_packets: Annotated[Int, Field(ge=0, le=1_000_000)] = 1000
+    access_points: dict[StationName, AccessPointOptions] = Field(default_factory=dict)
+    roaming: RoamingOptions = RoamingOptions.defaults()
+    neighbours: dict[StationName, NeighbourNetworkOptions] = Field(default_factory=dict)
+    microwave_ovens: dict[StationName, MicrowaveOvenOptions] = Field(default_factory=dict)
     loss: Fraction | None = None
     delay: Annotated[Duration, Field(le=60)] | None = None
     rate: Annotated[str, AfterValidator(_checked_rate)] | None = None
@@ -106,6 +127,18 @@ class RadioOptions(Strict):
     def fixed(self) -> bool:
         """True if every link is fixed."""
         return any(option is not None for option in (self.loss, self.delay, self.rate, self.jitter))
+
+    @property
+    def has_infrastructure(self) -> bool:
+        """True if access points, neighbours or ovens are on the air."""
+        return bool(self.access_points or self.neighbours or self.microwave_ovens)
+
+    @schema.model_validator(mode="after")
+    def _check_infrastructure(self) -> "RadioOptions":
+        if self.fixed and self.has_infrastructure:
+            key = next(key for key in INFRASTRUCTURE if getattr(self, key))
+            raise schema.validation_error(f"fixed links (loss, delay, rate or jitter) have no {key}", key)
+        return self
 
     def link(self) -> LinkParameters:
         """Return the parameters of every fixed link."""

@@ -2,10 +2,10 @@
 
 An event-driven engine on integer nanoseconds that uses no clock and no socket; its interface is `model.RadioModel`.
 Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories. Power save delays
-frames to stations of an access point. Beacons have no airtime; fragmentation is not modelled.
+frames to stations of an access point. Only beacons of `access_points` have airtime; fragmentation is not modelled.
 """
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from itertools import permutations
 from typing import Generic
 
@@ -16,6 +16,7 @@ from sim_backends.radio.frame_exchange import FrameExchange
 from sim_backends.radio.frames import Emission, Frame, TransmissionAttempt
 from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
 from sim_backends.radio.modes import SHORT_RETRY_LIMIT
+from sim_backends.radio.packet_delivery import PacketDelivery
 from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD, PowerSave
 from sim_backends.radio.random_streams import PacketIdentity, RandomStream
 
@@ -27,14 +28,24 @@ class Wifi(Generic[Payload]):
         channel: Received powers between the stations.
         seed: Seed of all random draws.
         queue_packets: Maximum number of queued packets per station.
+        make_delivery: Class of the delivery.
     """
 
-    def __init__(self, channel: RadioChannel, seed: int, *, queue_packets: int = 1000) -> None:
+    def __init__(
+        self,
+        channel: RadioChannel,
+        seed: int,
+        *,
+        queue_packets: int = 1000,
+        make_delivery: type[PacketDelivery[Payload]] = PacketDelivery,
+    ) -> None:
         self._channel = channel
         self._index = {name: index for index, name in enumerate(channel.names)}
         self._off: Set[str] = frozenset()
+        self._robots: Sequence[int] = range(len(channel.names))
+        self._linked_names: Sequence[str] = channel.names
         self._relay: int | None = None
-        self._exchange: FrameExchange[Payload] = FrameExchange(channel, seed, queue_packets)
+        self._exchange: FrameExchange[Payload] = FrameExchange(channel, seed, queue_packets, make_delivery)
         self._stations, self._events = self._exchange.stations, self._exchange.events
         self._delivery = self._exchange.delivery
         timeouts_ns = {
@@ -64,7 +75,14 @@ class Wifi(Generic[Payload]):
         meter = self._exchange.meter
         if meter is None:
             return {}
-        return link_samples(now_ns, utc_ns, self._channel, meter, self._delivery.peers, relay=self._relay)
+        peers, robots = self._delivery.peers, self._robots
+        return link_samples(
+            now_ns, utc_ns, self._channel, meter, peers, robots=robots, relay=self._relay, cells=self._cells()
+        )
+
+    def _cells(self) -> Mapping[int, int | None] | None:
+        """Return the access point of each robot, by index; None if they do not roam."""
+        return None
 
     def switch_off(self, now_ns: int, names: Set[str]) -> None:
         """Set the stations whose radios are off; the caller must also put them out of range of all others.
@@ -90,16 +108,17 @@ class Wifi(Generic[Payload]):
         """Set the station that is the access point from now on; None for direct links."""
         self._relay = None if name is None else self._index[name]
         if self._delivery.power_save is not None:
-            self._delivery.power_save.access_point = self._relay
+            self._delivery.power_save.access_points = () if self._relay is None else (self._relay,)
 
     def counters(self) -> dict[Pair, LinkCounters]:
         """Return the counters of each hop so far; a broadcast counts as one frame per station in range."""
         names = self._channel.names
-        zeros = dict.fromkeys(permutations(names, 2), LinkCounters(0, 0, 0, 0))
-        return zeros | {
-            (names[transmitter], names[receiver]): peer.counters
-            for (transmitter, receiver), peer in self._delivery.peers.items()
-        }
+        pairs = dict.fromkeys(permutations(self._linked_names, 2), LinkCounters(0, 0, 0, 0))
+        for (transmitter, receiver), peer in self._delivery.peers.items():
+            pair = names[transmitter], names[receiver]
+            if pair in pairs:
+                pairs[pair] = peer.counters
+        return pairs
 
     def send(
         self,

@@ -1,7 +1,7 @@
 """Samples of the radios' links during an attempt: names of their files, and the file of a testbed.
 
 The samples are written by a robot's sampler (`robot_link_samples`) or by its testbed (`Oracle.links`). A testbed's
-`link.csv` has a line per time and peer station.
+`link.csv` has a line per time and peer station. If the testbed has access points, lines end with a column `cell`.
 """
 
 import re
@@ -21,12 +21,14 @@ _HEADER: Final = (
     "utc_ns,role,noise_dbm,active_ns,busy_ns,station,signal_dbm,tx_bit_s,rx_bit_s,"
     "tx_packets,rx_packets,tx_retries,tx_failures"
 )
+_CELL_HEADER: Final = f"{_HEADER},cell"
 _DBM: Final = r"(-?[0-9]{1,4}\.[0-9]{2})?"
 _COUNT: Final = r"([0-9]{1,18})?"
 _STATION: Final = r"([A-Za-z0-9:._-]{1,40})?"
 _ROW: Final = re.compile(
     rf"([0-9]{{1,19}}),({Role.PATTERN}),{_DBM},{_COUNT},{_COUNT},{_STATION},{_DBM}" + rf",{_COUNT}" * 6, re.ASCII
 )
+_CELL_ROW: Final = re.compile(f"{_ROW.pattern},{_STATION}", re.ASCII)
 
 
 def robot_file(role: Role) -> str:
@@ -36,16 +38,19 @@ def robot_file(role: Role) -> str:
 
 def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:
     """Return the file text for samples of a testbed."""
-    return reading.counted_csv_text(_HEADER, (line for role in samples for line in _rows(role, samples)))
+    has_cells = any(sample.cell for of_role in samples.values() for sample in of_role)
+    lines = (line for role, of_role in samples.items() for line in _rows(role, of_role, has_cells=has_cells))
+    return reading.counted_csv_text(_CELL_HEADER if has_cells else _HEADER, lines)
 
 
-def _rows(role: Role, samples: Mapping[Role, Sequence[LinkSample]]) -> Iterator[str]:
-    for sample in samples[role]:
+def _rows(role: Role, samples: Sequence[LinkSample], *, has_cells: bool) -> Iterator[str]:
+    for sample in samples:
         radio = (sample.utc_ns, role, _dbm(sample.noise_dbm), sample.active_ns, sample.busy_ns)
         for station in sample.stations or (StationSample(""),):
             rates = (None if rate is None else round(rate) for rate in (station.tx_rate_bit_s, station.rx_rate_bit_s))
             counts = (station.tx_packets, station.rx_packets, station.tx_retries, station.tx_failures)
-            values = (*radio, station.station, _dbm(station.signal_dbm), *rates, *counts)
+            cell = (sample.cell,) if has_cells else ()
+            values = (*radio, station.station, _dbm(station.signal_dbm), *rates, *counts, *cell)
             yield ",".join("" if value is None else str(value) for value in values)
 
 
@@ -59,7 +64,9 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
     Raises:
         EvidenceError: The file is missing, truncated, or has other contents.
     """
-    rows = map(_parse_row, reading.read_counted_csv(path, _HEADER, _ROW, "is not a file of link samples"))
+    has_cells = f"{_CELL_HEADER}\n" in reading.text(path)
+    header, pattern = (_CELL_HEADER, _CELL_ROW) if has_cells else (_HEADER, _ROW)
+    rows = map(_parse_row, reading.read_counted_csv(path, header, pattern, "is not a file of link samples"))
     samples: dict[Role, list[LinkSample]] = {}
     for (role, _), group in groupby(rows, key=lambda row: (row[0], row[1].utc_ns)):
         samples.setdefault(role, []).append(merge(sample for _, sample in group))
@@ -67,11 +74,12 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
 
 
 def _parse_row(match: re.Match[str]) -> tuple[Role, LinkSample]:
-    utc_ns, role, noise, active, busy, station, signal, *counts = match.groups()
-    numbers = [None if count is None else int(count) for count in counts]
+    utc_ns, role, noise, active, busy, station, signal, *others = match.groups()
+    numbers = [None if count is None else int(count) for count in others[:6]]
     peer = StationSample(station, _parse_dbm(signal), *numbers) if station else None
     radio = LinkSample(
         int(utc_ns),
+        cell=others[6] if len(others) > 6 else None,
         noise_dbm=_parse_dbm(noise),
         active_ns=None if active is None else int(active),
         busy_ns=None if busy is None else int(busy),

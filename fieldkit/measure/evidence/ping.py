@@ -275,7 +275,7 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
         interval_s: Time between two requests. The length of an open gap is this interval times the number of
             unanswered requests.
     """
-    stamped = sorted(_stamped_answers(output))
+    stamped = sorted(stamped_answers(output))
     if not stamped and (output.answers or not output.transmitted):
         return None
     closed = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
@@ -287,7 +287,7 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
     return AnswerGap(gap_ns / 1e9, lost, is_open=False) if closed else None
 
 
-def _stamped_answers(output: Ping) -> Iterator[tuple[int, int]]:
+def stamped_answers(output: Ping) -> Iterator[tuple[int, int]]:
     """Yield the unwrapped sequence number and the time stamp of each answer that has a time stamp."""
     last: int | None = None
     for answer in output.answers:

@@ -22,6 +22,7 @@ _OWN: Final = MappingProxyType(
         "iperf3": "Iperf3Step",
         "soak": "SoakStep",
         "send": "SendStep",
+        "roam": "RoamStep",
     }
 )
 """Class of each built-in kind. The kind is also the name of its module in this package. Messages list the kinds in

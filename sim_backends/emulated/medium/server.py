@@ -206,7 +206,8 @@ class MediumServer(ABC):
         """Record transmissions to a new pair of files, or stop recording if there are no descriptors."""
         if self._air_log is not None:
             self._air_log.close()
-        self._air_log = AirLog(descriptors, tuple(self._ports), framing=self._framing) if descriptors else None
+        names = (*self._ports, *self._options.access_points, *self._options.neighbours)
+        self._air_log = AirLog(descriptors, names, framing=self._framing) if descriptors else None
         self._log_attempts(None if self._air_log is None else self._air_log.write)
 
     def _sample(self) -> None:

@@ -1,0 +1,161 @@
+"""Access points, neighbouring networks and microwave ovens around robots, in one object."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Vector
+from sim_backends.radio.antennas import Antenna
+from sim_backends.radio.channel import Emitter
+from sim_backends.radio.frame_exchange import FrameExchange
+from sim_backends.radio.frames import Emission, TransmissionAttempt
+from sim_backends.radio.infrastructure.infrastructure_options import AccessPointOptions, NeighbourNetworkOptions
+from sim_backends.radio.infrastructure.interference import MicrowaveOven, NeighbourTraffic
+from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
+from sim_backends.radio.infrastructure.roaming import Roaming
+from sim_backends.radio.modes import BAND_2_4, ENERGY_DETECTION_DBM
+from sim_backends.radio.power_save import BEACON_INTERVAL_NS
+from sim_backends.radio.radio_options import RadioOptions
+from sim_backends.radio.random_streams import RandomStream
+from sim_backends.radio.world_channel import WorldChannel, milliwatt
+from sim_backends.world.obstacles import Place
+from sim_backends.world.world import World
+
+_JAMMER: Final = "jammer "
+_OVEN: Final = "oven "
+
+
+def check_names(options: RadioOptions, robots: Collection[str], *, has_relay: bool) -> None:
+    """Check that access points and neighbours can be combined with these robots.
+
+    Raises:
+        ConfigurationError: A name is used twice, or a robot is an access point too.
+    """
+    names = [*robots, *options.access_points, *options.neighbours]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigurationError(
+            f"two of the robots, radio.access_points and radio.neighbours have the name {twice}",
+            remedy="rename one of them",
+        )
+    if options.access_points and has_relay:
+        raise ConfigurationError(
+            "with radio.access_points no robot can be an access point, but the topology is master",
+            remedy="use the topology masterless, or remove radio.access_points",
+        )
+
+
+class Infrastructure:
+    """Stations and sources of noise besides the robots.
+
+    Args:
+        seed: Seed of all random draws.
+        options: Radio options.
+        robots: Radios of the robots.
+        world: The ground below the stations; None for flat ground.
+
+    Attributes:
+        antennas: All stations: robots, access points, neighbours.
+        places_m: Positions of the stations that are not robots.
+        robots: Indices of the robots.
+        roaming: The association of the robots; None without access points.
+    """
+
+    def __init__(self, seed: int, options: RadioOptions, robots: Mapping[str, Antenna], world: World | None) -> None:
+        check_names(options, robots, has_relay=False)
+        self._seed = seed
+        self._options = options
+        self._world = world
+        first = next(iter(robots.values()))
+        phy = None if first.phy is None else replace(first.phy, power_save_timeout_ns=None)
+        fixed: dict[str, AccessPointOptions | NeighbourNetworkOptions] = {
+            **options.access_points,
+            **options.neighbours,
+        }
+        self.antennas: dict[str, Antenna] = dict(robots) | {
+            name: replace(first, tx_power_dbm=float(station.tx_power_dbm), phy=phy) for name, station in fixed.items()
+        }
+        self.places_m = {name: self._place_m(station.at_m, station.height) for name, station in fixed.items()}
+        self.robots: Sequence[int] = range(len(robots))
+        self.roaming: Roaming | None = None
+        self._access_points: Sequence[int] = ()
+        self._ovens: list[MicrowaveOven] = []
+        self._jammers: Mapping[str, Emission] = {}
+        self._channel: WorldChannel
+        self._exchange: FrameExchange[Any]
+
+    def start(self, channel: WorldChannel, exchange: FrameExchange[Any]) -> None:
+        """Start beacons, neighbours and ovens on a channel with all `antennas`."""
+        options, delivery = self._options, exchange.delivery
+        assert isinstance(delivery, ManagedDelivery)
+        self._channel, self._exchange = channel, exchange
+        index = {name: number for number, name in enumerate(channel.names)}
+        delivery.robots = self.robots
+        delivery.access_points = self._access_points = [index[name] for name in options.access_points]
+        if options.access_points:
+            phases_ns = {
+                index[name]: int(RandomStream(self._seed, name, "beacon").draw(0) * BEACON_INTERVAL_NS)
+                for name in options.access_points
+            }
+            delivery.handler = self.roaming = Roaming(channel, exchange.events, delivery, options.roaming, phases_ns)
+        if options.neighbours:
+            duties = {index[name]: neighbour.duty for name, neighbour in options.neighbours.items()}
+            NeighbourTraffic(self._seed, channel.band, exchange.events, delivery, duties=duties, names=channel.names)
+        if channel.band is BAND_2_4:
+            self._ovens = [
+                MicrowaveOven(
+                    self._seed,
+                    Emitter(_OVEN + name, self._place_m(oven.at_m, oven.height), float(oven.power_dbm)),
+                    float(oven.mains_hz),
+                    exchange.events,
+                    self._on_oven,
+                )
+                for name, oven in options.microwave_ovens.items()
+            ]
+
+    def jam(self, now_ns: int, emitters: Iterable[Emitter]) -> None:
+        """Set the jammers that send noise from now on."""
+        self._jammers = {_JAMMER + emitter.name: self._emission(now_ns, emitter) for emitter in emitters}
+        self._set_emissions(now_ns)
+
+    @staticmethod
+    def log_packet(log: Callable[[TransmissionAttempt], None], attempt: TransmissionAttempt) -> None:
+        """Pass an attempt to `log`, unless it is of a frame of a station itself."""
+        if not isinstance(attempt.payload, ManagementFrame):
+            log(attempt)
+
+    def use_power_save(self) -> None:
+        """Let the access points buffer packets for robots with power save."""
+        power_save = self._exchange.delivery.power_save
+        if power_save is not None and self.roaming is not None:
+            power_save.access_points = self._access_points
+
+    @property
+    def linked_names(self) -> Sequence[str]:
+        """Names of robots and access points, which have links."""
+        neighbours = self._options.neighbours
+        return [name for name in self.antennas if name not in neighbours]
+
+    def _on_oven(self, now_ns: int, oven: MicrowaveOven, until_ns: int | None) -> None:
+        self._set_emissions(now_ns)
+        meter = self._exchange.meter
+        if meter is not None and until_ns is not None:
+            powers_mw = self._channel.received_mw(oven.emitter.place_m, oven.emitter.power_dbm)
+            threshold_mw = milliwatt(ENERGY_DETECTION_DBM)
+            meter.on_busy(now_ns, until_ns, [index for index in self.robots if powers_mw[index] >= threshold_mw])
+
+    def _set_emissions(self, now_ns: int) -> None:
+        ovens = {oven.emitter.name: self._emission(now_ns, oven.emitter) for oven in self._ovens if oven.is_on}
+        self._exchange.reception.set_emissions(now_ns, {**self._jammers, **ovens})
+        if not self._jammers and not ovens:
+            for station in self._exchange.stations:
+                self._exchange.retry_when_idle(now_ns, station)
+
+    def _emission(self, now_ns: int, emitter: Emitter) -> Emission:
+        return Emission(now_ns, self._channel.received_mw(emitter.place_m, emitter.power_dbm))
+
+    def _place_m(self, at_m: Place, height_m: float) -> Vector:
+        east_m, north_m = (float(metres) for metres in at_m)
+        ground_m = 0.0 if self._world is None else self._world.ground_m((east_m, north_m))
+        return east_m, north_m, ground_m + height_m

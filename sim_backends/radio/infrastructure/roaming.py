@@ -1,0 +1,269 @@
+"""Access points, and the robots that roam between them: beacons, scans, association and its loss.
+
+All access points and robots share one channel here; a robot that scans another channel neither sends nor receives.
+Probe frames would be on the other channels, so they are omitted: a scan finds each access point whose signal reaches
+the sensitivity at that time. Beacons and the frames of an association are sent on the air with their retries.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from sim_backends.radio.channel import RadioChannel
+from sim_backends.radio.contention import EventQueue
+from sim_backends.radio.frames import decibel
+from sim_backends.radio.infrastructure.background_scan import BackgroundScan, required_difference_db
+from sim_backends.radio.infrastructure.infrastructure_options import RoamingOptions
+from sim_backends.radio.infrastructure.managed_delivery import ManagedDelivery, ManagementFrame
+from sim_backends.radio.power_save import BEACON_INTERVAL_NS
+
+BEACON: Final = "beacon"
+
+_BEACON_BYTES: Final = 250
+"""Size of a beacon of hostapd with 802.11n and WPA2. Our estimate from its elements."""
+
+# Kind, size with MAC header and FCS, and True if the station sends it. 802.11-2020: 9.3.3.6 to 9.3.3.12 with the
+# elements of 802.11n and WPA2; 12.7.6 (an EAPOL-Key frame has 99 bytes and key data, and 8 bytes of LLC and SNAP).
+_ASSOCIATION: Final = (
+    ("authentication", 34, True),
+    ("authentication", 34, False),
+    ("reassociation request", 130, True),
+    ("reassociation response", 140, False),
+)
+_HANDSHAKE: Final = (
+    ("EAPOL-Key 1", 135, False),
+    ("EAPOL-Key 2", 157, True),
+    ("EAPOL-Key 3", 191, False),
+    ("EAPOL-Key 4", 135, True),
+)
+_STEP_TIMEOUT_NS: Final = 200_000_000
+_MAX_TRIES: Final = 3
+"""IEEE80211_AUTH_TIMEOUT, IEEE80211_ASSOC_TIMEOUT and their MAX_TRIES: mlme.c."""
+
+LINK_LOSS_NS: Final = 7 * BEACON_INTERVAL_NS + 2 * 500_000_000
+"""Time without beacons after which a link is lost: 7 beacons and 2 null frames, each after 500 ms, as in mlme.c."""
+
+_RESCAN_NS: Final = 5_000_000_000
+"""Interval of scans without an association: the default of wpa_supplicant."""
+
+
+@dataclass(slots=True)
+class _Client:
+    """A robot's association.
+
+    Attributes:
+        index: Index of the robot.
+        access_point: The access point with which it is associated, or associates; None without one.
+        scan: Schedule of its scans; None without an association.
+        beacon_ns: Time of the last beacon.
+        is_busy: True during a scan or an association.
+        exchange: Number that identifies the current step of an association, and outdates earlier events.
+        step: Index of the frame that is sent next.
+        tries: Number of attempts at that step.
+        levels_dbm: Signals that the current scan has found, by access point.
+    """
+
+    index: int
+    access_point: int | None = None
+    scan: BackgroundScan | None = None
+    beacon_ns: int = 0
+    is_busy: bool = False
+    exchange: int = 0
+    step: int = 0
+    tries: int = 0
+    levels_dbm: dict[int, float] = field(default_factory=dict)
+
+
+class Roaming:
+    """The association of each robot with an access point.
+
+    Args:
+        channel: Received powers.
+        events: Scheduled events.
+        delivery: The packets, with robots and access points.
+        options: Options of roaming.
+        phases_ns: Time of the first beacon of each access point, by index.
+    """
+
+    def __init__(
+        self,
+        channel: RadioChannel,
+        events: EventQueue,
+        delivery: ManagedDelivery[Any],
+        options: RoamingOptions,
+        phases_ns: Mapping[int, int],
+    ) -> None:
+        self._channel = channel
+        self._events = events
+        self._delivery = delivery
+        self._options = options
+        self._steps = _ASSOCIATION + (_HANDSHAKE if options.handshake else ())
+        self._clients = {robot: _Client(robot) for robot in delivery.robots}
+        self._dwell_ns, self._home_ns = round(options.dwell * 1e9), round(options.home * 1e9)
+        self._processing_ns = round(options.processing * 1e9)
+        self._has_started = False
+        delivery.serving = dict.fromkeys(delivery.robots)
+        for access_point, phase_ns in phases_ns.items():
+            events.at(phase_ns, self._send_beacon, access_point)
+
+    @property
+    def cells(self) -> Mapping[int, int | None]:
+        """Access point with which each robot is associated, by index; None during an association or without one."""
+        return {
+            robot: None if client.scan is None else client.access_point for robot, client in self._clients.items()
+        }
+
+    def start(self, now_ns: int) -> None:
+        """Associate each robot with the strongest access point; a second call does nothing.
+
+        Robots that cannot receive any access point yet scan until they find one.
+        """
+        if self._has_started:
+            return
+        self._has_started = True
+        for client in self._clients.values():
+            client.levels_dbm = self._levels_dbm(now_ns, client)
+            best = self._best(client)
+            if best is None:
+                self._events.at(now_ns, self._scan, client)
+            else:
+                client.access_point = best
+                self._complete(now_ns, client)
+            self._events.at(now_ns + LINK_LOSS_NS, self._check_link, client)
+
+    def on_management(self, now_ns: int, transmitter: int, receiver: int, frame: ManagementFrame) -> None:
+        """Implement `ManagementHandler`."""
+        if frame.kind == BEACON:
+            client = self._clients.get(receiver)
+            if client is not None and client.scan is not None and client.access_point == transmitter:
+                self._on_beacon(now_ns, client, client.scan)
+            return
+        client = self._clients.get(receiver) or self._clients.get(transmitter)
+        if client is not None and frame.number == client.exchange and client.scan is None:
+            client.exchange += 1
+            client.step += 1
+            client.tries = 0
+            self._events.at(now_ns + self._processing_ns, self._continue, client, client.exchange)
+
+    def _send_beacon(self, now_ns: int, access_point: int) -> None:
+        self._events.at(now_ns + BEACON_INTERVAL_NS, self._send_beacon, access_point)
+        if not self._delivery.waiting_management(access_point):
+            self._delivery.send_management(now_ns, access_point, None, ManagementFrame(BEACON), _BEACON_BYTES)
+
+    def _on_beacon(self, now_ns: int, client: _Client, scan: BackgroundScan) -> None:
+        client.beacon_ns = now_ns
+        scan.on_beacon(now_ns, self._level_dbm(now_ns, client, client.access_point))
+        if not client.is_busy and scan.next_ns <= now_ns:
+            self._scan(now_ns, client)
+
+    def _check_link(self, now_ns: int, client: _Client) -> None:
+        """Lose the association without beacons; a scan, during which beacons are missed, does not count."""
+        if client.scan is not None and not client.is_busy and now_ns >= client.beacon_ns + LINK_LOSS_NS:
+            self._lose_link(now_ns, client)
+        next_ns = max(client.beacon_ns + LINK_LOSS_NS, now_ns + BEACON_INTERVAL_NS)
+        self._events.at(next_ns, self._check_link, client)
+
+    def _lose_link(self, now_ns: int, client: _Client) -> None:
+        client.access_point = client.scan = None
+        self._delivery.start_handover(now_ns, client.index)
+        self._delivery.associate(now_ns, client.index, None)
+        self._scan(now_ns, client)
+
+    def _scan(self, now_ns: int, client: _Client) -> None:
+        client.is_busy = True
+        client.levels_dbm = {}
+        if client.scan is not None:
+            client.scan.on_scan(now_ns)
+        self._visit(now_ns, client, 0 if client.scan is None else 1)
+
+    def _visit(self, now_ns: int, client: _Client, channel: int) -> None:
+        """Scan another channel."""
+        if channel >= self._options.channels:
+            self._finish_scan(now_ns, client)
+            return
+        if client.scan is not None:
+            self._delivery.hold(now_ns, client.index)
+        self._events.at(now_ns + self._dwell_ns, self._leave_channel, client, channel)
+
+    def _leave_channel(self, now_ns: int, client: _Client, channel: int) -> None:
+        pause_ns = 0
+        if client.scan is not None:
+            self._delivery.release(now_ns, client.index)
+            client.beacon_ns = now_ns
+            pause_ns = self._home_ns if channel + 1 < self._options.channels else 0
+        self._events.at(now_ns + pause_ns, self._visit, client, channel + 1)
+
+    def _finish_scan(self, now_ns: int, client: _Client) -> None:
+        client.levels_dbm = self._levels_dbm(now_ns, client)
+        best = self._best(client)
+        if client.scan is None:
+            if best is None:
+                self._events.at(now_ns + _RESCAN_NS, self._scan, client)
+            else:
+                self._associate(now_ns, client, best)
+            return
+        current_dbm = client.scan.average_dbm
+        if (
+            best is not None
+            and best != client.access_point
+            and client.levels_dbm[best] >= current_dbm + required_difference_db(current_dbm)
+        ):
+            self._associate(now_ns, client, best)
+        else:
+            client.is_busy = False
+
+    def _associate(self, now_ns: int, client: _Client, access_point: int) -> None:
+        client.access_point, client.scan = access_point, None
+        client.step = client.tries = 0
+        client.exchange += 1
+        self._delivery.start_handover(now_ns, client.index)
+        self._continue(now_ns, client, client.exchange)
+
+    def _continue(self, now_ns: int, client: _Client, exchange: int) -> None:
+        """Send the next frame of an association, or complete it."""
+        if exchange != client.exchange or client.access_point is None:
+            return
+        if client.step == len(self._steps):
+            self._complete(now_ns, client)
+            return
+        if client.tries == _MAX_TRIES:
+            client.access_point = None
+            self._delivery.associate(now_ns, client.index, None)
+            self._scan(now_ns, client)
+            return
+        client.tries += 1
+        kind, size_bytes, is_from_robot = self._steps[client.step]
+        ends = client.index, client.access_point
+        transmitter, receiver = ends if is_from_robot else ends[::-1]
+        content = ManagementFrame(kind, exchange)
+        self._delivery.send_management(now_ns, transmitter, receiver, content, size_bytes)
+        self._events.at(now_ns + _STEP_TIMEOUT_NS, self._continue, client, exchange)
+
+    def _complete(self, now_ns: int, client: _Client) -> None:
+        options = self._options
+        client.is_busy = False
+        client.exchange += 1
+        client.beacon_ns = now_ns
+        client.scan = BackgroundScan.start(
+            now_ns,
+            self._level_dbm(now_ns, client, client.access_point),
+            threshold_dbm=options.threshold_dbm,
+            short_ns=round(options.short * 1e9),
+            long_ns=round(options.long * 1e9),
+        )
+        self._delivery.associate(now_ns, client.index, client.access_point)
+
+    def _best(self, client: _Client) -> int | None:
+        return max(client.levels_dbm, key=client.levels_dbm.__getitem__, default=None)
+
+    def _levels_dbm(self, now_ns: int, client: _Client) -> dict[int, float]:
+        """Return the signal of each access point that the robot receives."""
+        return {
+            access_point: self._level_dbm(now_ns, client, access_point)
+            for access_point in self._delivery.access_points
+            if self._channel.linked(access_point, client.index)
+        }
+
+    def _level_dbm(self, now_ns: int, client: _Client, access_point: int | None) -> float:
+        assert access_point is not None
+        return decibel(self._channel.powers_mw(access_point, now_ns)[client.index])

@@ -1,0 +1,163 @@
+"""Roaming between two access points: route of packets, gap of a handover against its closed form, losses."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Vector
+from sim_backends.radio.antennas import Antenna
+from sim_backends.radio.high_throughput import PhyCapability
+from sim_backends.radio.infrastructure.roaming import LINK_LOSS_NS
+from sim_backends.radio.links import NOT_ASSOCIATED
+from sim_backends.radio.model import WifiInWorld
+from sim_backends.radio.modes import BAND_2_4, CW_MIN, SLOT_NS, ack_ns, basic_mode
+from sim_backends.radio.radio_options import RadioOptions
+
+MS, S = 10**6, 10**9
+ANTENNA = Antenna("802.11n", 15.0, -88.0)
+ACCESS_POINTS = {"west": {"at_m": [0, 3]}, "east": {"at_m": [100, 3]}}
+AT_WEST, AT_EAST, FAR = (0.0, 0.0, 0.2), (100.0, 0.0, 0.2), (9e4, 0.0, 0.2)
+QUICK: dict[str, Any] = {"short": "1s", "long": "1s", "threshold_dbm": -40}
+"""A scan each second."""
+
+Packet = tuple[str, int]
+
+
+class Lab:
+    """A robot `base` at the western access point, and a robot `walker` that sends and receives pings."""
+
+    def __init__(self, *, interval_ns: int = 20 * MS, antenna: Antenna = ANTENNA, **roaming: object) -> None:
+        options = {"fading": False, "access_points": ACCESS_POINTS, "roaming": roaming}
+        self.model: WifiInWorld[Packet] = WifiInWorld(
+            1, RadioOptions.model_validate(options), dict.fromkeys(("base", "walker"), antenna), None
+        )
+        self.model.use_meter()
+        self.lost: list[tuple[Packet, str, str]] = []
+        self.model.log_losses(lambda _, packet, receiver, reason: self.lost.append((packet, receiver, reason)))
+        self.interval_ns = interval_ns
+        self.sent: list[tuple[Packet, int]] = []
+        self.arrived_ns: dict[tuple[Packet, str], int] = {}
+        self.cells: list[tuple[int, str | None]] = []
+        self.now_ns = 0
+
+    def run(self, until_ns: int, walker_m: Vector) -> None:
+        while self.now_ns < until_ns:
+            now_ns = self.now_ns
+            self.model.place(now_ns, {"base": AT_WEST, "walker": walker_m}, None)
+            for source, destination in (("walker", "base"), ("base", "walker")):
+                packet = source, len(self.sent)
+                self.sent.append((packet, now_ns))
+                self.model.send(now_ns, source, packet, 84, destination)
+            self._receive(now_ns)
+            cell = self.model.sample(now_ns, now_ns)["walker"].cell
+            if not self.cells or self.cells[-1][1] != cell:
+                self.cells.append((now_ns, cell))
+            self.now_ns += self.interval_ns
+
+    def finish(self) -> None:
+        self._receive(self.now_ns + S)
+
+    def _receive(self, now_ns: int) -> None:
+        for at_ns, receiver, packet, _, _ in self.model.deliveries(now_ns):
+            key = packet, receiver
+            assert key not in self.arrived_ns, "delivered twice"
+            self.arrived_ns[key] = at_ns
+
+    @property
+    def access_points(self) -> list[str]:
+        return [cell for _, cell in self.cells if cell is not None]
+
+
+def test_a_robot_roams_to_the_stronger_access_point_and_packets_follow_it() -> None:
+    lab = Lab(**QUICK)
+    lab.run(2 * S, AT_WEST)
+    lab.run(9 * S, AT_EAST)
+    lab.finish()
+    assert lab.access_points == ["west", "east"]
+    last = lab.sent[-1][0][1]
+    assert {(("walker", last - 1), "base"), (("base", last), "walker")} <= lab.arrived_ns.keys()
+    assert lab.model.counters()["west", "base"].delivered > 400
+    assert lab.model.counters()["east", "walker"].delivered > 150
+
+
+PHY = PhyCapability("n", "2.4 GHz", 20, 1, 800, "minstrel_ht")
+VARIANTS = {
+    "802.11g": None,
+    "A-MPDU": PHY,
+    "EDCA": replace(PHY, access_categories="linux"),
+    "power save": replace(PHY, power_save_timeout_ns=5 * MS),
+    "RTS": replace(PHY, rts_threshold_bytes=0),
+}
+
+
+@pytest.mark.parametrize("phy", VARIANTS.values(), ids=VARIANTS.keys())
+def test_each_packet_is_delivered_or_lost_once(phy: PhyCapability | None) -> None:
+    lab = Lab(interval_ns=40 * MS, antenna=Antenna("802.11n", 15.0, -88.0, phy), **QUICK)
+    for second in range(2, 20, 3):
+        lab.run(second * S, AT_WEST if second % 2 else AT_EAST)
+    lab.model.send(lab.now_ns, "walker", ("walker", -1), 84, None)
+    lab.sent.append((("walker", -1), lab.now_ns))
+    lab.finish()
+    lost = [packet for packet, _, _ in lab.lost]
+    delivered = [packet for packet, _ in lab.arrived_ns]
+    assert Counter(lost + delivered) == Counter(packet for packet, _ in lab.sent)
+    assert {receiver for _, receiver, _ in lab.lost} <= {"base", "walker"}
+    assert NOT_ASSOCIATED in {reason for _, _, reason in lab.lost}
+
+
+@pytest.mark.parametrize("handshake", [True, False])
+def test_the_gap_of_a_handover_is_the_sum_of_its_frames_and_processing_times(handshake: bool) -> None:
+    """Without other traffic: sum of (DIFS + backoff + frame + SIFS + ACK) and of the processing times."""
+    processing_ns = 3 * MS
+    lab = Lab(handshake=handshake, processing="3ms", channels=1, **QUICK)
+    lab.run(S, AT_WEST)
+    lab.interval_ns = MS
+    lab.run(2 * S + 300 * MS, AT_EAST)
+    (lost_ns, joined_ns) = next(
+        (start_ns, end_ns)
+        for (start_ns, start), (end_ns, end) in pairwise(lab.cells)
+        if start is None and end == "east"
+    )
+    sizes = [34, 34, 130, 140, *([135, 157, 191, 135] if handshake else [])]
+    mode = basic_mode(BAND_2_4)
+    shortest_ns = sum(BAND_2_4.difs_ns + mode.airtime_ns(size) + BAND_2_4.sifs_ns + ack_ns(mode) for size in sizes)
+    shortest_ns += len(sizes) * processing_ns
+    # Each frame is sent at a rate of at least 6 Mbit/s; at the highest rate its airtime is about 0.1 ms.
+    airtimes_ns = sum(mode.airtime_ns(size) for size in sizes)
+    waits_ns = len(sizes) * (CW_MIN * SLOT_NS + MS)
+    assert shortest_ns - airtimes_ns - MS <= joined_ns - lost_ns <= shortest_ns + waits_ns + MS
+
+
+def test_a_scan_delays_packets_and_loses_none() -> None:
+    lab = Lab(dwell="61ms", home="200ms", channels=4, **QUICK)
+    lab.run(6 * S, AT_WEST)
+    lab.finish()
+    assert lab.access_points == ["west"]
+    assert not lab.lost
+    delays_ms = [(lab.arrived_ns[packet, receiver] - sent_ns) / MS for packet, sent_ns in lab.sent
+                 for receiver in ("base", "walker") if (packet, receiver) in lab.arrived_ns]  # fmt: skip
+    assert 40 < max(delays_ms) < 63
+    # Five scans (4 visited channels without the current one) in six seconds, of packets in two directions.
+    held = sum(delay_ms > 10 for delay_ms in delays_ms)
+    assert held == pytest.approx(5 * 3 * 2 * 50 / 20, rel=0.3)
+
+
+def test_a_robot_that_leaves_loses_its_association_and_gets_one_again_when_it_returns() -> None:
+    lab = Lab(interval_ns=100 * MS)
+    lab.run(2 * S, AT_WEST)
+    lab.run(8 * S, FAR)
+    lost_ns = lab.cells[-1][0]
+    assert lab.cells[-1][1] is None
+    assert 2 * S + LINK_LOSS_NS - 200 * MS <= lost_ns <= 2 * S + LINK_LOSS_NS + 300 * MS
+    lab.run(16 * S, AT_EAST)
+    assert lab.access_points == ["west", "east"]
+
+
+def test_a_robot_and_an_access_point_have_different_names() -> None:
+    options = RadioOptions.model_validate({"access_points": {"base": {"at_m": [0, 0]}}})
+    with pytest.raises(ConfigurationError, match="have the name base"):
+        WifiInWorld(1, options, {"base": ANTENNA}, None)
