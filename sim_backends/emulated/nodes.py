@@ -300,9 +300,12 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
 
-            wifi = lab.parts(robots, options.linux_wifi)
-            radios = lab.radios_of(robots.values())
+            wifi = lab.parts(robots, options)
+            radios = lab.radios_of(robots.values(), options.radio)
             medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios))
+            access_points = lab.access_points(options.radio, radios, wifi.values())
+            if access_points is not None:
+                stack.enter_context(access_points)
         elif options.is_cosimulated:
             medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
         else:
@@ -326,7 +329,8 @@ def running_robots(
             radio, fd = robots[key].profile.radio, robot.radio_fd if robot.has_device else None
             medium.attach(robot.name, robot.address, radio, fd, physics_fds=robot.physics_fds)
         if any(robot.spec.waits_for_another for robot in running.values()):
-            medium.place(placement.side_by_side_m(robot.name for robot in running.values()))
+            names = [*(robot.name for robot in running.values()), *(options.radio.access_points if wifi else ())]
+            medium.place(placement.side_by_side_m(names))
         list(started)
         yield RunningRobots(
             running, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private

@@ -8,10 +8,12 @@ from typing import TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
-from sim_backends.emulated.emulated_options import LinuxWifiOptions
+from sim_backends.emulated.emulated_options import EmulatedOptions
+from sim_backends.emulated.linux_wifi.access_points import AccessPoints
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
+from sim_backends.radio.infrastructure.infrastructure import check_names
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 
@@ -20,24 +22,43 @@ Key = TypeVar("Key")
 _PASSPHRASE_BYTES = 12
 
 
-def parts(robots: Mapping[Key, Robot | LabRobot], options: LinuxWifiOptions) -> dict[Key, WifiSpec]:
+def parts(robots: Mapping[Key, Robot | LabRobot], options: EmulatedOptions) -> dict[Key, WifiSpec]:
     """Return the part of each robot.
 
-    In a mesh, all are mesh points. Otherwise the relay of a trial runs the access point; without a relay, all are ad
-    hoc.
+    In a mesh, all are mesh points. With access points that are not robots, all are their stations. Otherwise the
+    relay of a trial runs the access point; without a relay, all are ad hoc.
+
+    Raises:
+        ConfigurationError: A robot and `radio.access_points` would be access points, or have the same name.
     """
-    if options.mesh or Role.RELAY not in robots:
-        return dict.fromkeys(
-            robots, WifiSpec("mesh point" if options.mesh else "ad hoc", has_monitor=options.monitor)
-        )
-    station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), options.security, options.monitor)
+    settings, radio = options.linux_wifi, options.radio
+    if settings.mesh:
+        return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))
+    station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), settings.security, settings.monitor)
+    if radio.access_points:
+        names = [robot.name for robot in robots.values()]
+        check_names(radio, names, has_relay=Role.RELAY in robots)
+        roaming = radio.roaming
+        scan = f"simple:{roaming.short:.0f}:{roaming.threshold_dbm:.0f}:{roaming.long:.0f}"
+        return dict.fromkeys(robots, replace(station, background_scan=scan, channels=roaming.channels))
+    if Role.RELAY not in robots:
+        return dict.fromkeys(robots, WifiSpec("ad hoc", has_monitor=settings.monitor))
     return {key: replace(station, part="access point") if key == Role.RELAY else station for key in robots}
 
 
-def radios_of(robots: Iterable[Robot | LabRobot]) -> dict[str, HwsimRadio]:
-    """Return the radio of each robot by its name; errors as `require_radios`."""
-    names = [robot.name for robot in robots]
+def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict[str, HwsimRadio]:
+    """Return the radio of each robot and access point by its name; errors as `require_radios`."""
+    names = [*(robot.name for robot in robots), *options.access_points]
     return dict(zip(names, require_radios(len(names)), strict=True))
+
+
+def access_points(
+    options: RadioOptions, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
+) -> AccessPoints | None:
+    """Return the running access points that are not robots, or None if there are none; errors as `AccessPoints`."""
+    if not options.access_points:
+        return None
+    return AccessPoints({name: radios[name] for name in options.access_points}, next(iter(wifi)))
 
 
 def medium(options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio]) -> WifiClient:

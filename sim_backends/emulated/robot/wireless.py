@@ -16,6 +16,9 @@ SSID: Final = "fieldkit"
 
 _CHANNEL: Final = 1
 _FREQUENCY_MHZ: Final = 2412
+_CHANNEL_STEP_MHZ: Final = 5
+_MAX_CHANNELS: Final = 11
+"""Channels on which every regulatory domain permits to send probe requests."""
 # Two radios that search for a cell at the same time would create two cells, so all of them join a fixed one.
 _CELL: Final = "02:66:69:65:6c:64"
 _JOIN: Final = {
@@ -56,8 +59,8 @@ network={{
     psk="{passphrase}"
     key_mgmt={key_management}
     ieee80211w={protection}
-    scan_freq={frequency_mhz}
-}}
+    scan_freq={frequencies_mhz}
+{background_scan}}}
 """
 _KEY_MANAGEMENT: Final = {"wpa2": "WPA-PSK", "wpa3": "SAE"}
 _PROTECTION: Final = {"wpa2": 0, "wpa3": 2}
@@ -124,7 +127,10 @@ def configuration(interface: str, wifi: WifiSpec) -> str:
         interface=interface,
         ssid=SSID,
         channel=_CHANNEL,
-        frequency_mhz=_FREQUENCY_MHZ,
+        frequencies_mhz=" ".join(
+            str(_FREQUENCY_MHZ + _CHANNEL_STEP_MHZ * number) for number in range(min(wifi.channels, _MAX_CHANNELS))
+        ),
+        background_scan=f'    bgscan="{wifi.background_scan}"\n' if wifi.background_scan else "",
         passphrase=wifi.passphrase,
         key_management=_KEY_MANAGEMENT[wifi.security],
         protection=_PROTECTION[wifi.security],

@@ -1,4 +1,4 @@
-"""WPA3, monitor interfaces and an 802.11s mesh of Linux's Wi-Fi on our medium: one boot."""
+"""WPA3, monitor interfaces, an 802.11s mesh, and roaming of Linux's Wi-Fi on our medium: one boot."""
 
 import json
 import re
@@ -67,3 +67,13 @@ def test_the_mesh_has_no_path_without_the_relay_and_heals(results: dict[str, Any
     assert results["mesh without relay"] == 0
     assert results["mesh again"], results
     assert results["mesh after switching"], results
+
+
+def test_a_station_roams_to_the_other_access_point_and_keeps_its_connections(results: dict[str, Any]) -> None:
+    before, after = results["access point before"], results["access point after"]
+    assert before
+    assert after
+    assert before != after
+    assert re.search(rf"connected to {after}|roamed.* {after}", results["events"]), results["events"]
+    assert results["link over the bridge"], results
+    assert results["ping over the bridge"] >= 8

@@ -1,13 +1,17 @@
 """Parts of robots in Linux's Wi-Fi, and the configurations of hostapd and wpa_supplicant."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 import pytest
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import load_profile
 from fieldkit.config.schema import ValidationError
+from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role
 from sim_backends.emulated.emulated_options import EmulatedOptions
-from sim_backends.emulated.linux_wifi import lab
+from sim_backends.emulated.linux_wifi import access_points, lab
 from sim_backends.emulated.robot import wireless
 from sim_backends.emulated.robot.spec import WifiSpec
 
@@ -19,9 +23,17 @@ TRIO = {
 PAIR = {role: TRIO[role] for role in (Role.SENDER, Role.RECEIVER)}
 
 
-def parts(robots: dict[Role, Robot], **settings: object) -> dict[Role, WifiSpec]:
-    options = EmulatedOptions.model_validate({"wifi": "linux", "linux_wifi": settings})
-    return lab.parts(robots, options.linux_wifi)
+RADIO = {
+    "access_points": {"left": {"at_m": (0, 0)}, "right": {"at_m": (80, 0)}},
+    "roaming": {"short": "5s", "threshold_dbm": -70, "long": "60s", "channels": 3},
+}
+
+
+def parts(
+    robots: dict[Role, Robot], *, radio: Mapping[str, object] = MappingProxyType({}), **settings: object
+) -> dict[Role, WifiSpec]:
+    options = EmulatedOptions.model_validate({"wifi": "linux", "linux_wifi": settings, "radio": dict(radio)})
+    return lab.parts(robots, options)
 
 
 def settings_of(text: str) -> dict[str, str]:
@@ -63,6 +75,24 @@ def test_access_point_and_station_have_the_same_security(security: str, key_mana
     assert station["psk"] == f'"{access_point["wpa_passphrase"]}"'
     assert station["ssid"] == f'"{access_point["ssid"]}"'
     assert (access_point["interface"], access_point["channel"], station["scan_freq"]) == ("wlan0", "1", "2412")
+
+
+def test_with_access_points_that_are_not_robots_all_robots_roam_between_them() -> None:
+    specs = parts(PAIR, radio=RADIO)
+    assert len(set(specs.values())) == 1
+    station = specs[Role.SENDER]
+    text = wireless.configuration("wlan0", station)
+    assert 'bgscan="simple:5:-70:60"' in text
+    assert settings_of(text)["scan_freq"] == "2412 2417 2422"
+    access_point = settings_of(access_points.configuration("wlan7", station))
+    assert (access_point["interface"], access_point["bridge"]) == ("wlan7", access_points.BRIDGE)
+    assert access_point["wpa_passphrase"] == station.passphrase
+    assert "bgscan" not in wireless.configuration("wlan0", parts(TRIO)[Role.SENDER])
+
+
+def test_a_robot_and_radio_access_points_cannot_both_be_access_points() -> None:
+    with pytest.raises(ConfigurationError, match="no robot can be an access point"):
+        parts(TRIO, radio=RADIO)
 
 
 def test_unknown_security_is_refused() -> None:

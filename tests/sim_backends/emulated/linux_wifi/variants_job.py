@@ -1,13 +1,14 @@
-"""Runs in the virtual machine of `test_wifi_variants.py`: WPA3 with monitor interfaces, and an 802.11s mesh.
+"""Runs in the virtual machine of `test_wifi_variants.py`: WPA3 with monitor interfaces, an 802.11s mesh, roaming.
 
-Prints results as JSON. The labs have the three robots of a trial in topology `master`.
+Prints results as JSON. The labs have three robots of a trial in topology `master`, or two and two access points.
 """
 
 import json
+import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 from fieldkit.backends.protocols import Robot
@@ -28,8 +29,14 @@ TRIANGLE: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (10.0, 0.0, 1.0), "r
 # The range of these radios is 91 m in the open.
 ROW: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (140.0, 0.0, 1.0), "r2": (70.0, 0.0, 1.0)}
 GAP: dict[str, Vector] = {**ROW, "r2": (9000.0, 0.0, 1.0)}
+ACCESS_POINTS = {"left": {"at_m": (0, 0), "height": 1}, "right": {"at_m": (120, 0), "height": 1}}
+ROAMING = {"short": "2s", "threshold_dbm": -65, "long": "60s", "channels": 3}
+START: dict[str, Vector] = {"r0": (5.0, 0.0, 1.0), "r1": (5.0, 5.0, 1.0)}
+END: dict[str, Vector] = {**START, "r0": (80.0, 0.0, 1.0)}
 JOIN_S = 60.0
 CAPTURE = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-c", "20", "-e", "-n", "--immediate-mode")
+
+HANDOVER = ("tcpdump", "-i", "mon0", "-y", "IEEE802_11_RADIO", "-U", "-w", "-", "--immediate-mode")
 
 Running = RunningRobots[Role]
 
@@ -54,13 +61,40 @@ def wait_for_link(running: Running) -> bool:
     return False
 
 
+def frames(capture: bytes) -> list[tuple[str, int, str]]:
+    """Return frame control (hexadecimal), bytes without FCS, and receiver of each frame in a capture (radiotap)."""
+    found, offset = [], 24
+    while offset + 16 <= len(capture):
+        (size_bytes,) = struct.unpack_from("<I", capture, offset + 8)
+        packet = capture[offset + 16 : offset + 16 + size_bytes]
+        frame = packet[int.from_bytes(packet[2:4], "little") :]
+        found.append((frame[:2].hex(), len(frame), frame[4:10].hex(":")))
+        offset += 16 + size_bytes
+    return found
+
+
+def access_point(running: Running) -> str:
+    """Return the address of the sender's access point; empty without one."""
+    words = within(running, Role.SENDER, "iw", "dev", "wlan0", "link").split()
+    return words[2] if words[:2] == ["Connected", "to"] else ""
+
+
+def wait_for_handover(running: Running, left: str) -> str:
+    """Return the address of the sender's next access point."""
+    end_s = time.monotonic() + JOIN_S
+    while (present := access_point(running)) in {left, ""} and time.monotonic() < end_s:
+        time.sleep(0.2)
+    return present
+
+
 @contextmanager
-def lab(settings: dict[str, object]) -> Iterator[Running]:
+def lab(settings: dict[str, object], *, roles: Collection[Role] = tuple(CAST), **radio: object) -> Iterator[Running]:
     options = EmulatedOptions.model_validate(
-        {"wifi": "linux", "ros": "builtin", "radio": RADIO, "linux_wifi": settings}
+        {"wifi": "linux", "ros": "builtin", "radio": {**RADIO, **radio}, "linux_wifi": settings}
     )
     world = load_world("open")
-    with running_robots(CAST, options=options, world=world, ros=RosChoice.BUILTIN, seed=1) as running:
+    cast = {role: robot for role, robot in CAST.items() if role in roles}
+    with running_robots(cast, options=options, world=world, ros=RosChoice.BUILTIN, seed=1) as running:
         yield running
 
 
@@ -98,6 +132,30 @@ def main() -> None:
         running.robots[Role.SENDER].switch_off()
         running.robots[Role.SENDER].switch_on()
         note("mesh after switching", wait_for_link(running))
+    pair = (Role.SENDER, Role.RECEIVER)
+    with lab({"monitor": True}, roles=pair, access_points=ACCESS_POINTS, roaming=ROAMING) as running:
+        running.medium.place(START)
+        note("roam link", wait_for_link(running))
+        note("access point before", wait_for_handover(running, ""))
+        events = subprocess.Popen(
+            ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", "iw", "event", "-t"),
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        capture = subprocess.Popen(
+            ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *HANDOVER),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        running.medium.place(END)
+        note("access point after", wait_for_handover(running, str(results["access point before"])))
+        note("link over the bridge", wait_for_link(running))
+        note("ping over the bridge", ping(running, 10))
+        capture.terminate()
+        note("handover", frames(capture.communicate()[0]))
+        events.terminate()
+        note("events", events.communicate()[0])
+        note("scan", within(running, Role.SENDER, "iw", "dev", "wlan0", "scan", "dump"))
     sys.stdout.write(f"RESULTS {json.dumps(results)}\n")
 
 
