@@ -302,10 +302,7 @@ def running_robots(
 
             wifi = lab.parts(robots, options)
             radios = lab.radios_of(robots.values(), options.radio)
-            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios))
-            access_points = lab.access_points(options.radio, radios, wifi.values())
-            if access_points is not None:
-                stack.enter_context(access_points)
+            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:
             medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
         else:

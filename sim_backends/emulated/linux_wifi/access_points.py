@@ -9,7 +9,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError, TestbedLostError
@@ -34,6 +34,8 @@ table netdev fieldkit {{
 }}
 """
 """As on robots (`wireless`), but for frames that the bridge forwards, which have no hook `output`."""
+_BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
+"""hwsim derives the times of beacons from one clock, so beacons of equal intervals would always collide."""
 _ENABLED: Final = "AP-ENABLED"
 _START_S: Final = 60.0
 _EXIT_S: Final = 5.0
@@ -41,7 +43,7 @@ _POLL_S: Final = 0.1
 
 
 class AccessPoints:
-    """Running access points of one network; use as a context manager.
+    """Running access points of one network, until `close`.
 
     The process starts when the object is created. The kernel kills it when the thread that created the object ends.
 
@@ -59,7 +61,7 @@ class AccessPoints:
         files = []
         for number, radio in enumerate(radios.values()):
             files.append(f"{number}.conf")
-            (folder / files[-1]).write_text(configuration(radio.interface, wifi), encoding="ascii")
+            (folder / files[-1]).write_text(configuration(radio.interface, wifi, number), encoding="ascii")
         (folder / "rules").write_text(_RULES.format(interfaces=", ".join(r.interface for r in radios.values())))
         self._log = folder / "hostapd.log"
         argv = ("setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--", "sh", "-c")
@@ -78,12 +80,6 @@ class AccessPoints:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def check_alive(self) -> None:
         """Raise TestbedLostError if hostapd has ended."""
@@ -125,6 +121,7 @@ class AccessPoints:
         return self._log.read_text(encoding="utf-8", errors="replace").strip().rpartition("\n")[2]
 
 
-def configuration(interface: str, wifi: WifiSpec) -> str:
-    """Return the configuration of hostapd for one access point of a network with a bridge."""
-    return f"{wireless.configuration(interface, replace(wifi, part='access point'))}bridge={BRIDGE}\n"
+def configuration(interface: str, wifi: WifiSpec, number: int) -> str:
+    """Return the configuration of hostapd for the access point of this number in a network with a bridge."""
+    interval_tu = _BEACON_INTERVALS_TU[number % len(_BEACON_INTERVALS_TU)]
+    return f"{wireless.configuration(interface, replace(wifi, part='access point'))}bridge={BRIDGE}\nbeacon_int={interval_tu}\n"

@@ -9,7 +9,6 @@ from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
 from sim_backends.emulated.emulated_options import EmulatedOptions
-from sim_backends.emulated.linux_wifi.access_points import AccessPoints
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
@@ -52,15 +51,8 @@ def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict
     return dict(zip(names, require_radios(len(names)), strict=True))
 
 
-def access_points(
-    options: RadioOptions, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
-) -> AccessPoints | None:
-    """Return the running access points that are not robots, or None if there are none; errors as `AccessPoints`."""
-    if not options.access_points:
-        return None
-    return AccessPoints({name: radios[name] for name in options.access_points}, next(iter(wifi)))
-
-
-def medium(options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio]) -> WifiClient:
-    """Return the medium of the robots' radios; errors as `WifiClient`."""
-    return WifiClient(options, world, seed=seed, radios=radios)
+def medium(
+    options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
+) -> WifiClient:
+    """Return the medium of the robots' radios, with the parts of the robots; errors as `WifiClient`."""
+    return WifiClient(options, world, seed=seed, radios=radios, station=next(iter(wifi)))

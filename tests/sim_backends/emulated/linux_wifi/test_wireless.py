@@ -84,7 +84,10 @@ def test_with_access_points_that_are_not_robots_all_robots_roam_between_them() -
     text = wireless.configuration("wlan0", station)
     assert 'bgscan="simple:5:-70:60"' in text
     assert settings_of(text)["scan_freq"] == "2412 2417 2422"
-    access_point = settings_of(access_points.configuration("wlan7", station))
+    access_point, other = (
+        settings_of(access_points.configuration(f"wlan{number}", station, number)) for number in (7, 8)
+    )
+    assert access_point["beacon_int"] != other["beacon_int"], "beacons of hwsim would always collide"
     assert (access_point["interface"], access_point["bridge"]) == ("wlan7", access_points.BRIDGE)
     assert access_point["wpa_passphrase"] == station.passphrase
     assert "bgscan" not in wireless.configuration("wlan0", parts(TRIO)[Role.SENDER])

@@ -29,7 +29,7 @@ TRIANGLE: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (10.0, 0.0, 1.0), "r
 # The range of these radios is 91 m in the open.
 ROW: dict[str, Vector] = {"r0": (0.0, 0.0, 1.0), "r1": (140.0, 0.0, 1.0), "r2": (70.0, 0.0, 1.0)}
 GAP: dict[str, Vector] = {**ROW, "r2": (9000.0, 0.0, 1.0)}
-ACCESS_POINTS = {"left": {"at_m": (0, 0), "height": 1}, "right": {"at_m": (120, 0), "height": 1}}
+ACCESS_POINTS = {"left": {"at_m": (0, 0), "height": "1m"}, "right": {"at_m": (120, 0), "height": "1m"}}
 ROAMING = {"short": "2s", "threshold_dbm": -65, "long": "60s", "channels": 3}
 START: dict[str, Vector] = {"r0": (5.0, 0.0, 1.0), "r1": (5.0, 5.0, 1.0)}
 END: dict[str, Vector] = {**START, "r0": (80.0, 0.0, 1.0)}
@@ -142,7 +142,7 @@ def main() -> None:
             stdout=subprocess.PIPE,
             text=True,
         )
-        capture = subprocess.Popen(
+        handover = subprocess.Popen(
             ("nsenter", "-t", str(running.robots[Role.SENDER].pid), "-n", *HANDOVER),
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
@@ -151,8 +151,8 @@ def main() -> None:
         note("access point after", wait_for_handover(running, str(results["access point before"])))
         note("link over the bridge", wait_for_link(running))
         note("ping over the bridge", ping(running, 10))
-        capture.terminate()
-        note("handover", frames(capture.communicate()[0]))
+        handover.terminate()
+        note("handover", frames(handover.communicate()[0]))
         events.terminate()
         note("events", events.communicate()[0])
         note("scan", within(running, Role.SENDER, "iw", "dev", "wlan0", "scan", "dump"))
