@@ -300,7 +300,7 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
 
-            wifi = lab.parts(robots, options)
+            wifi = lab.parts(robots, options.linux_wifi, options.radio)
             radios = lab.radios_of(robots.values(), options.radio)
             medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:

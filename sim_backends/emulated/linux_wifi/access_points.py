@@ -23,6 +23,7 @@ _START: Final = """\
 read -r _
 for name in all default; do echo 1 >/proc/sys/net/ipv6/conf/$name/disable_ipv6; done
 nft -f rules || exit
+ip link add name {bridge} type bridge && ip link set {bridge} up || exit
 exec hostapd {files}
 """
 _RULES: Final = """\
@@ -67,7 +68,7 @@ class AccessPoints:
         argv = ("setpriv", "--pdeathsig", "KILL", "--", "unshare", "--net", "--", "sh", "-c")
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                (*argv, _START.format(files=" ".join(files))),
+                (*argv, _START.format(files=" ".join(files), bridge=BRIDGE)),
                 cwd=folder,
                 stdin=subprocess.PIPE,
                 stdout=log,

@@ -8,7 +8,7 @@ from typing import TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
-from sim_backends.emulated.emulated_options import EmulatedOptions
+from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
@@ -21,7 +21,9 @@ Key = TypeVar("Key")
 _PASSPHRASE_BYTES = 12
 
 
-def parts(robots: Mapping[Key, Robot | LabRobot], options: EmulatedOptions) -> dict[Key, WifiSpec]:
+def parts(
+    robots: Mapping[Key, Robot | LabRobot], settings: LinuxWifiOptions, radio: RadioOptions
+) -> dict[Key, WifiSpec]:
     """Return the part of each robot.
 
     In a mesh, all are mesh points. With access points that are not robots, all are their stations. Otherwise the
@@ -30,7 +32,6 @@ def parts(robots: Mapping[Key, Robot | LabRobot], options: EmulatedOptions) -> d
     Raises:
         ConfigurationError: A robot and `radio.access_points` would be access points, or have the same name.
     """
-    settings, radio = options.linux_wifi, options.radio
     if settings.mesh:
         return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))
     station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), settings.security, settings.monitor)
