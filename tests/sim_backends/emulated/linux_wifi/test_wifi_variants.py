@@ -57,8 +57,8 @@ def test_the_monitor_interface_captures_frames_with_radiotap(results: dict[str, 
 def test_frames_are_forwarded_in_the_mesh_by_the_robot_in_between(results: dict[str, Any]) -> None:
     assert results["mesh link"], results
     assert results["mesh ping"] >= 16
-    assert "type mesh point" in results["mesh type"]
-    macs = {role: mac.strip() for role, mac in results["macs"].items()}
+    assert all("type mesh point" in text for text in results["interfaces"].values())
+    macs = {role: text.split("addr ")[1].split()[0] for role, text in results["interfaces"].items()}
     paths = [line.split()[:2] for line in results["paths"].splitlines()]
     assert [macs["receiver"], macs["relay"]] in paths, "destination and next hop"
 
