@@ -7,6 +7,7 @@ from typing import Annotated, Final, Literal
 from fieldkit.config import schema
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
 from fieldkit.core.errors import ConfigurationError
+from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
 from sim_backends.radio.radio_options import RadioOptions
 
@@ -73,21 +74,6 @@ class MeshOptions(Strict):
 
     daemon: Literal["babeld"]
     hello: Annotated[Duration, Field(ge=0.1, le=60)] = HELLO_S
-
-
-class LinuxWifiOptions(Strict):
-    """Settings of [Linux's Wi-Fi](linux-wifi.md); they have no effect without `wifi: linux`.
-
-    Attributes:
-        security: Security of the access point: `wpa2` (pre-shared key) or `wpa3` (SAE with protected management
-            frames).
-        mesh: True for an 802.11s mesh of all robots, in every topology: the kernels forward frames for each other.
-        monitor: True to give each robot a monitor interface `mon0`, on which tcpdump captures frames with radiotap.
-    """
-
-    security: Literal["wpa2", "wpa3"] = "wpa2"
-    mesh: Bool = False
-    monitor: Bool = False
 
 
 class Ros2Options(Strict):

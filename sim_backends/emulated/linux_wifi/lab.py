@@ -8,7 +8,7 @@ from typing import TypeVar
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
-from sim_backends.emulated.emulated_options import LinuxWifiOptions
+from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
