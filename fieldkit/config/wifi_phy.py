@@ -50,6 +50,8 @@ class WifiPhy(Strict):
             effort.
         power_save: True if it uses power save as a station of an access point (topology `master`), as Linux does by
             default, also on a Raspberry Pi (`iw dev wlan0 get power_save`).
+        packet_time: Time that its bus (SDIO) and driver need for each packet that it sends, one after another, before
+            the packet is in the queue of the radio.
         power_save_timeout: Time from its last frame until it dozes, 1 ms to 10 s; 100 ms in mac80211.
     """
 
@@ -61,6 +63,7 @@ class WifiPhy(Strict):
     firmware_interval: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
     rts_threshold_bytes: Annotated[Int, Field(ge=0, le=10_000_000)] | None = None
     access_categories: DscpMapping | None = None
+    packet_time: Annotated[Duration, Field(ge=0, le=0.1)] = 0.0
     power_save: Bool = False
     power_save_timeout: Annotated[Duration, Field(ge=0.001, le=10)] = 0.1
 

@@ -158,6 +158,7 @@ class EmulatedBackend:
         """Implement `Backend.cast`; robots get addresses in their order in the site file."""
         cast = cast_of(self._site, self._document, topology, self._addresses)
         self._check_profiles(cast)
+        self._check_infrastructure((robot.name for robot in cast.values()), has_relay=topology is Topology.MASTER)
         return {
             role: robot.model_copy(update={"abilities": self._abilities(robot, cast)}) for role, robot in cast.items()
         }
@@ -263,7 +264,20 @@ class EmulatedBackend:
 
         members = interactive_lab.members_of(self._site, self._document, self._addresses)
         self._check_profiles(members)
+        self._check_infrastructure(members, has_relay=False)
         return members
+
+    def _check_infrastructure(self, names: Iterable[str], *, has_relay: bool) -> None:
+        if not self._options.radio.has_infrastructure:
+            return
+        from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other labs need none of it)
+
+        if problem := infrastructure.conflict(self._options.radio, [*names], has_relay=has_relay):
+            raise ConfigurationError(
+                problem,
+                where=self._document.where(("emulated", "radio")) if self._document else "",
+                remedy="change emulated.radio in the site file",
+            )
 
     def _check_profiles(self, robots: "Mapping[RobotKey, Robot | LabRobot]") -> None:
         for robot in robots.values():

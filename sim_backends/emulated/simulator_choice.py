@@ -25,6 +25,7 @@ from sim_backends.federates.named import (
 )
 from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.physics.robot_limits import BODIES, quadrotor
+from sim_backends.radio.radio_options import INFRASTRUCTURE
 
 _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
 """Default for a network in another process: an exchange at each of its events would take too long for real time.
@@ -98,6 +99,7 @@ def _network(options: EmulatedOptions) -> str:
         return name
     for is_set, key in (
         (options.radio.fixed, "fixed links under radio"),
+        (options.radio.has_infrastructure, f"{', '.join(INFRASTRUCTURE)} under radio"),
         (options.record_air, "record_air"),
         (options.mesh is not None, "mesh"),
     ):

@@ -58,6 +58,10 @@ class RadioChannel(Protocol):
         """Return the time from a station's last frame until it dozes; None if it never dozes."""
         return None
 
+    def packet_time_ns(self, station: int) -> int:  # noqa: ARG002 (a default)
+        """Return the time that a station needs per packet before the queue of its radio."""
+        return 0
+
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:  # noqa: ARG002 (a default)
         """Return the limits of aggregates on a link; None if its frames are not aggregated."""
         return None

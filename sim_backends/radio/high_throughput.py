@@ -80,6 +80,7 @@ class PhyCapability:
         rts_threshold_bytes: Largest size of a frame or aggregate that it sends without RTS; None for any size.
         access_categories: How it maps packets to its access categories; None if it sends all as best effort.
         power_save_timeout_ns: Time from its last frame until it dozes; None if it never dozes.
+        packet_time_ns: Time that its bus and driver need per packet before the queue of the radio.
     """
 
     amendment: WifiAmendment
@@ -93,6 +94,7 @@ class PhyCapability:
     rts_threshold_bytes: int | None = None
     access_categories: DscpMapping | None = None
     power_save_timeout_ns: int | None = None
+    packet_time_ns: int = 0
 
     @property
     def band(self) -> Band:
@@ -128,6 +130,7 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
         phy.rts_threshold_bytes,
         phy.access_categories,
         round(phy.power_save_timeout * 1e9) if phy.power_save else None,
+        round(phy.packet_time * 1e9),
     )
 
 

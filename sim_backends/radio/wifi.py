@@ -14,11 +14,22 @@ from sim_backends.radio.channel import RadioChannel
 from sim_backends.radio.driver_statistics import RadioMeter, link_samples
 from sim_backends.radio.frame_exchange import FrameExchange
 from sim_backends.radio.frames import Emission, Frame, TransmissionAttempt
-from sim_backends.radio.links import Delay, Delivery, LinkCounters, LossLog, Pair, Payload
+from sim_backends.radio.links import (
+    PACKET,
+    PROCESSING_NS,
+    QUEUE_FULL,
+    Delay,
+    Delivery,
+    LinkCounters,
+    LossLog,
+    Pair,
+    Payload,
+)
 from sim_backends.radio.modes import SHORT_RETRY_LIMIT
 from sim_backends.radio.packet_delivery import PacketDelivery
 from sim_backends.radio.power_save import BEACON_INTERVAL_NS, DTIM_PERIOD, PowerSave
 from sim_backends.radio.random_streams import PacketIdentity, RandomStream
+from sim_backends.radio.stations import Station
 
 
 class Wifi(Generic[Payload]):
@@ -48,6 +59,11 @@ class Wifi(Generic[Payload]):
         self._exchange: FrameExchange[Payload] = FrameExchange(channel, seed, queue_packets, make_delivery)
         self._stations, self._events = self._exchange.stations, self._exchange.events
         self._delivery = self._exchange.delivery
+        self._queue_packets = queue_packets
+        # Time per packet, and the end of the last packet's time, of stations with a slow bus.
+        indices = range(len(channel.names))
+        self._packet_times_ns = {index: time_ns for index in indices if (time_ns := channel.packet_time_ns(index))}
+        self._bus_free_ns: dict[int, int] = {}
         timeouts_ns = {
             index: timeout_ns
             for index in range(len(channel.names))
@@ -148,7 +164,21 @@ class Wifi(Generic[Payload]):
         frame.max_attempts = max_attempts
         if dscp:
             frame.dscp = dscp
+        if station.index in self._packet_times_ns:
+            self._cross_bus(now_ns, station, frame)
+            return
         self._delivery.enqueue(now_ns, station, frame)
+
+    def _cross_bus(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
+        """Queue a packet after the bus and driver of its sender have processed it and the packets before it."""
+        time_ns = self._packet_times_ns[station.index]
+        ready_ns = max(now_ns, self._bus_free_ns.get(station.index, 0)) + time_ns
+        if ready_ns - now_ns > (self._queue_packets + 1) * time_ns:
+            self._delivery.lose(now_ns, station.index, frame, QUEUE_FULL)
+            return
+        self._bus_free_ns[station.index] = frame.queued_ns = ready_ns
+        frame.before = (frame.before or PACKET) + PROCESSING_NS * (ready_ns - now_ns)
+        self._events.at(ready_ns, self._delivery.enqueue, station, frame)
 
     def next_event_ns(self) -> int | None:
         """Return the time of the next event for `deliveries`, or None if no packet is in flight."""

@@ -369,6 +369,11 @@ class WorldChannel(RadioChannel):
         return None if phy is None else phy.power_save_timeout_ns
 
     @override
+    def packet_time_ns(self, station: int) -> int:
+        phy = self._antennas[station].phy
+        return 0 if phy is None else phy.packet_time_ns
+
+    @override
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:
         first, second = self._antennas[transmitter], self._antennas[receiver]
         if first.phy is None or second.phy is None or (self._fixed_mode is not None and not self._fixed_mode.ht):

@@ -95,6 +95,7 @@ EXAMPLES: Mapping[str, Example] = {
     "soak": Example(
         f"[capture: {{during: [soak: {{from: receiver, to: sender, rate: 200kbit/s, during: [{PING}]}}]}}]"
     ),
+    "roam": Example(f"[roam: {{robot: sender, during: [{PING}]}}]"),
     "send": Example(
         f"[{SEND}]",
         spare=frozenset({"medium.txt"}),

@@ -15,7 +15,7 @@ from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.trial.columns import installed
 from tests.helpers.outside_packages import write_package
 
-BUILTIN = ["capture", "transfer", "ping", "fault", "wait", "ask", "together", "run", "iperf3", "soak", "send"]
+BUILTIN = ["capture", "transfer", "ping", "fault", "wait", "ask", "together", "run", "iperf3", "soak", "send", "roam"]
 MOTION = ["fly", "mavlink", "move"]
 ROS = ["record", "topics", "track"]
 

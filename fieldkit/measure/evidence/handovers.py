@@ -1,8 +1,9 @@
 """Handovers of a station between access points, from samples of its link, and the gaps that they cause in a ping.
 
 Only samples during the ping count, because a robot may roam again while it is brought back to its place. A handover
-happens between the last sample with the old access point and the first one with the new. The gap of a handover is the longest time between two consecutive answers that overlaps this interval, so that its resolution is
-the interval of the ping, not of the samples. Both must have the clock of the robot that roams.
+happens between the last sample with the old access point and the first one with the new. The gap of a handover is the
+longest time between two consecutive answers that overlaps this interval, so its resolution is the interval of the
+ping, not of the samples. Both must have the clock of the robot that roams.
 """
 
 import math

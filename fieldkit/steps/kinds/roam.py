@@ -11,6 +11,7 @@ from fieldkit.config.schema import Duration, Field
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.model import Protocol, Role
+from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import handovers, ping
 from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import DescribesActions, Summarizes
@@ -90,7 +91,7 @@ class RoamStep(Nest, DescribesActions, Summarizes):
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if isinstance(count := values.get("roam_handovers"), int):
-            yield f"{count} handovers"
+            yield format_count(count, "handover")
         if isinstance(gap_s := values.get("roam_gap_s"), float):
             yield f"gap {1e3 * gap_s:.0f} ms"
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from fieldkit.config.schema import Location
 from fieldkit.core.errors import ConfigurationError, did_you_mean
-from fieldkit.core.model import Vector
+from fieldkit.core.model import Topology, Vector
 from fieldkit.core.units import format_bytes
 from sim_backends.cosim.scenario.agent_plans import (
     FollowPlan,
@@ -22,6 +22,7 @@ from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.differential_drive import DriveLimits
 from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.radio.radio_options import INFRASTRUCTURE
 from sim_backends.world.world import World
 
 PACKET_BYTES: Final = 1200
@@ -149,6 +150,7 @@ def problems(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]
     yield from _lines(scenario, world)
     yield from _robots(scenario)
     yield from _radios(scenario)
+    yield from _infrastructure(scenario)
     yield from _starts(scenario, world)
     yield from _speeds(scenario, world)
 
@@ -200,6 +202,22 @@ def _radios(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
                 f"{plan.robot} is a body only: add radio: {{standard: 802.11n, tx_power_dbm: 17}} to {name}, "
                 f"or choose a robot that has a profile",
             )
+
+
+def _infrastructure(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
+    radio = scenario.radio
+    if not radio.has_infrastructure:
+        return
+    from sim_backends.radio.infrastructure import infrastructure  # noqa: PLC0415 (other scenarios need none of it)
+
+    has_relay = scenario.topology is Topology.MASTER
+    if problem := infrastructure.conflict(radio, antennas(scenario), has_relay=has_relay):
+        yield ScenarioProblem(("radio",), problem, "change radio or the agents of the scenario")
+    if scenario.network.federate is not None:
+        key = next(key for key in INFRASTRUCTURE if getattr(radio, key))
+        yield ScenarioProblem(
+            ("radio", key), f"an external network has no {key}", "remove it, or the external network"
+        )
 
 
 def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:

@@ -26,24 +26,15 @@ _JAMMER: Final = "jammer "
 _OVEN: Final = "oven "
 
 
-def check_names(options: RadioOptions, robots: Collection[str], *, has_relay: bool) -> None:
-    """Check that access points and neighbours can be combined with these robots.
-
-    Raises:
-        ConfigurationError: A name is used twice, or a robot is an access point too.
-    """
+def conflict(options: RadioOptions, robots: Collection[str], *, has_relay: bool) -> str | None:
+    """Return the reason why access points and neighbours cannot be combined with these robots, or None."""
     names = [*robots, *options.access_points, *options.neighbours]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
-        raise ConfigurationError(
-            f"two of the robots, radio.access_points and radio.neighbours have the name {twice}",
-            remedy="rename one of them",
-        )
+        return f"two of the robots, radio.access_points and radio.neighbours have the name {twice}"
     if options.access_points and has_relay:
-        raise ConfigurationError(
-            "with radio.access_points no robot can be an access point, but the topology is master",
-            remedy="use the topology masterless, or remove radio.access_points",
-        )
+        return "with radio.access_points no robot can be an access point: use the topology masterless"
+    return None
 
 
 def station_place_m(at_m: Place, height_m: float, world: World | None) -> Vector:
@@ -67,10 +58,14 @@ class Infrastructure:
         places_m: Positions of the stations that are not robots.
         robots: Indices of the robots.
         roaming: The association of the robots; None without access points.
+
+    Raises:
+        ConfigurationError: Two stations have the same name.
     """
 
     def __init__(self, seed: int, options: RadioOptions, robots: Mapping[str, Antenna], world: World | None) -> None:
-        check_names(options, robots, has_relay=False)
+        if problem := conflict(options, robots, has_relay=False):
+            raise ConfigurationError(problem, remedy="rename one of them")
         self._seed = seed
         self._options = options
         self._world = world

@@ -48,7 +48,7 @@ _RESCAN_NS: Final = 5_000_000_000
 
 
 @dataclass(slots=True)
-class _Client:
+class _Association:
     """A robot's association.
 
     Attributes:
@@ -98,7 +98,7 @@ class Roaming:
         self._delivery = delivery
         self._options = options
         self._steps = _ASSOCIATION + (_HANDSHAKE if options.handshake else ())
-        self._clients = {robot: _Client(robot) for robot in delivery.robots}
+        self._clients = {robot: _Association(robot) for robot in delivery.robots}
         self._dwell_ns, self._home_ns = round(options.dwell * 1e9), round(options.home * 1e9)
         self._processing_ns = round(options.processing * 1e9)
         self._has_started = False
@@ -150,33 +150,33 @@ class Roaming:
         if not self._delivery.waiting_management(access_point):
             self._delivery.send_management(now_ns, access_point, None, ManagementFrame(BEACON), _BEACON_BYTES)
 
-    def _on_beacon(self, now_ns: int, client: _Client, scan: BackgroundScan) -> None:
+    def _on_beacon(self, now_ns: int, client: _Association, scan: BackgroundScan) -> None:
         client.beacon_ns = now_ns
         scan.on_beacon(now_ns, self._level_dbm(now_ns, client, client.access_point))
         if not client.is_busy and scan.next_ns <= now_ns:
             self._scan(now_ns, client)
 
-    def _check_link(self, now_ns: int, client: _Client) -> None:
+    def _check_link(self, now_ns: int, client: _Association) -> None:
         """Lose the association without beacons; a scan, during which beacons are missed, does not count."""
         if client.scan is not None and not client.is_busy and now_ns >= client.beacon_ns + LINK_LOSS_NS:
             self._lose_link(now_ns, client)
         next_ns = max(client.beacon_ns + LINK_LOSS_NS, now_ns + BEACON_INTERVAL_NS)
         self._events.at(next_ns, self._check_link, client)
 
-    def _lose_link(self, now_ns: int, client: _Client) -> None:
+    def _lose_link(self, now_ns: int, client: _Association) -> None:
         client.access_point = client.scan = None
         self._delivery.start_handover(now_ns, client.index)
         self._delivery.associate(now_ns, client.index, None)
         self._scan(now_ns, client)
 
-    def _scan(self, now_ns: int, client: _Client) -> None:
+    def _scan(self, now_ns: int, client: _Association) -> None:
         client.is_busy = True
         client.levels_dbm = {}
         if client.scan is not None:
             client.scan.on_scan(now_ns)
         self._visit(now_ns, client, 0 if client.scan is None else 1)
 
-    def _visit(self, now_ns: int, client: _Client, channel: int) -> None:
+    def _visit(self, now_ns: int, client: _Association, channel: int) -> None:
         """Scan another channel."""
         if channel >= self._options.channels:
             self._finish_scan(now_ns, client)
@@ -185,7 +185,7 @@ class Roaming:
             self._delivery.hold(now_ns, client.index)
         self._events.at(now_ns + self._dwell_ns, self._leave_channel, client, channel)
 
-    def _leave_channel(self, now_ns: int, client: _Client, channel: int) -> None:
+    def _leave_channel(self, now_ns: int, client: _Association, channel: int) -> None:
         pause_ns = 0
         if client.scan is not None:
             self._delivery.release(now_ns, client.index)
@@ -193,7 +193,7 @@ class Roaming:
             pause_ns = self._home_ns if channel + 1 < self._options.channels else 0
         self._events.at(now_ns + pause_ns, self._visit, client, channel + 1)
 
-    def _finish_scan(self, now_ns: int, client: _Client) -> None:
+    def _finish_scan(self, now_ns: int, client: _Association) -> None:
         client.levels_dbm = self._levels_dbm(now_ns, client)
         best = self._best(client)
         if client.scan is None:
@@ -212,14 +212,14 @@ class Roaming:
         else:
             client.is_busy = False
 
-    def _associate(self, now_ns: int, client: _Client, access_point: int) -> None:
+    def _associate(self, now_ns: int, client: _Association, access_point: int) -> None:
         client.access_point, client.scan = access_point, None
         client.step = client.tries = 0
         client.exchange += 1
         self._delivery.start_handover(now_ns, client.index)
         self._continue(now_ns, client, client.exchange)
 
-    def _continue(self, now_ns: int, client: _Client, exchange: int) -> None:
+    def _continue(self, now_ns: int, client: _Association, exchange: int) -> None:
         """Send the next frame of an association, or complete it."""
         if exchange != client.exchange or client.access_point is None:
             return
@@ -239,7 +239,7 @@ class Roaming:
         self._delivery.send_management(now_ns, transmitter, receiver, content, size_bytes)
         self._events.at(now_ns + _STEP_TIMEOUT_NS, self._continue, client, exchange)
 
-    def _complete(self, now_ns: int, client: _Client) -> None:
+    def _complete(self, now_ns: int, client: _Association) -> None:
         options = self._options
         client.is_busy = False
         client.exchange += 1
@@ -253,10 +253,10 @@ class Roaming:
         )
         self._delivery.associate(now_ns, client.index, client.access_point)
 
-    def _best(self, client: _Client) -> int | None:
+    def _best(self, client: _Association) -> int | None:
         return max(client.levels_dbm, key=client.levels_dbm.__getitem__, default=None)
 
-    def _levels_dbm(self, now_ns: int, client: _Client) -> dict[int, float]:
+    def _levels_dbm(self, now_ns: int, client: _Association) -> dict[int, float]:
         """Return the signal of each access point that the robot receives."""
         return {
             access_point: self._level_dbm(now_ns, client, access_point)
@@ -264,6 +264,6 @@ class Roaming:
             if self._channel.linked(access_point, client.index)
         }
 
-    def _level_dbm(self, now_ns: int, client: _Client, access_point: int | None) -> float:
+    def _level_dbm(self, now_ns: int, client: _Association, access_point: int | None) -> float:
         assert access_point is not None
         return decibel(self._channel.powers_mw(access_point, now_ns)[client.index])

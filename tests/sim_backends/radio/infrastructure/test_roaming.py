@@ -1,6 +1,7 @@
 """Roaming between two access points: route of packets, gap of a handover against its closed form, losses."""
 
 from collections import Counter
+from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -161,3 +162,29 @@ def test_a_robot_and_an_access_point_have_different_names() -> None:
     options = RadioOptions.model_validate({"access_points": {"base": {"at_m": [0, 0]}}})
     with pytest.raises(ConfigurationError, match="have the name base"):
         WifiInWorld(1, options, {"base": ANTENNA}, None)
+
+
+def test_a_copy_during_a_scan_continues_like_its_original() -> None:
+    options = {
+        "access_points": ACCESS_POINTS,
+        "roaming": QUICK,
+        "neighbours": {"office": {"at_m": [50, 0], "duty": "20%"}},
+        "microwave_ovens": {"kitchen": {"at_m": [20, 0]}},
+    }
+    model: WifiInWorld[Packet] = WifiInWorld(
+        1, RadioOptions.model_validate(options), dict.fromkeys(("base", "walker"), ANTENNA), None
+    )
+    model.place(0, {"base": AT_WEST, "walker": AT_WEST}, None)
+    model.place(S, {"base": AT_WEST, "walker": AT_EAST}, None)
+    model.advance(1100 * MS)
+    twin = deepcopy(model)
+    results = []
+    for radio in (model, twin):
+        radio.use_meter()
+        for number in range(100):
+            radio.send(1100 * MS + number * 50 * MS, "walker", ("walker", number), 84, "base")
+        arrived = [(at_ns, packet) for at_ns, _, packet, _, _ in radio.deliveries(8 * S)]
+        sample = radio.sample(8 * S, 0)["walker"]
+        results.append((arrived, sample.cell, sample.busy_ns))
+    assert results[0] == results[1]
+    assert (len(results[0][0]) > 50, results[0][1]) == (True, "east")
