@@ -9,10 +9,9 @@ from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Stri
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
-from sim_backends.radio.radio_options import INFRASTRUCTURE, RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 
 BOOT_S: Final = 2.0
-_INFRASTRUCTURE: Final = " or ".join(f"`radio.{key}`" for key in INFRASTRUCTURE)
 LATE_BOUND_S: Final = 0.1
 
 
@@ -222,8 +221,12 @@ class EmulatedOptions(Strict):
             if self.has_linux_wifi and value:
                 name = "a fixed link (loss, delay, rate or jitter)" if key == "radio" else f"`{key}`"
                 raise schema.validation_error(f"`wifi: linux` cannot be combined with {name}", key)
-        if self.has_linux_wifi and self.radio.has_infrastructure:
-            raise schema.validation_error(f"`wifi: linux` cannot be combined with {_INFRASTRUCTURE}", "radio")
+        if self.has_linux_wifi and (self.radio.neighbours or self.radio.microwave_ovens):
+            cause = "`wifi: linux` cannot be combined with `radio.neighbours` or `radio.microwave_ovens`"
+            raise schema.validation_error(cause, "radio")
+        if self.has_linux_wifi and self.linux_wifi.mesh and self.radio.access_points:
+            cause = "`linux_wifi: {mesh: true}` cannot be combined with `radio.access_points`"
+            raise schema.validation_error(cause, "linux_wifi")
         if self.mesh is not None and self.radio.access_points:
             raise schema.validation_error("`mesh` cannot be combined with `radio.access_points`", "mesh")
         return self

@@ -12,7 +12,6 @@ from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
-from sim_backends.radio.infrastructure.infrastructure import check_names
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 
@@ -28,16 +27,11 @@ def parts(
 
     In a mesh, all are mesh points. With access points that are not robots, all are their stations. Otherwise the
     relay of a trial runs the access point; without a relay, all are ad hoc.
-
-    Raises:
-        ConfigurationError: A robot and `radio.access_points` would be access points, or have the same name.
     """
     if settings.mesh:
         return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))
     station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), settings.security, settings.monitor)
     if radio.access_points:
-        names = [robot.name for robot in robots.values()]
-        check_names(radio, names, has_relay=Role.RELAY in robots)
         roaming = radio.roaming
         scan = f"simple:{roaming.short:.0f}:{roaming.threshold_dbm:.0f}:{roaming.long:.0f}"
         return dict.fromkeys(robots, replace(station, background_scan=scan, channels=roaming.channels))

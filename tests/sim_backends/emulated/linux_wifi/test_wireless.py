@@ -8,7 +8,6 @@ import pytest
 from fieldkit.backends.protocols import Robot
 from fieldkit.config.profiles import load_profile
 from fieldkit.config.schema import ValidationError
-from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Role
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.linux_wifi import access_points, lab
@@ -93,9 +92,9 @@ def test_with_access_points_that_are_not_robots_all_robots_roam_between_them() -
     assert "bgscan" not in wireless.configuration("wlan0", parts(TRIO)[Role.SENDER])
 
 
-def test_a_robot_and_radio_access_points_cannot_both_be_access_points() -> None:
-    with pytest.raises(ConfigurationError, match="no robot can be an access point"):
-        parts(TRIO, radio=RADIO)
+def test_a_mesh_and_access_points_cannot_be_combined() -> None:
+    with pytest.raises(ValidationError, match=r"radio\.access_points"):
+        parts(PAIR, radio=RADIO, mesh=True)
 
 
 def test_unknown_security_is_refused() -> None:
