@@ -127,7 +127,12 @@ class EmulatedBackend:
         """Implement `Relocating.run_elsewhere` by a virtual machine."""
         from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
-        return guest.run_command(argv, results, radios=len(self._site.robots))
+        return guest.run_command(argv, results, radios=self._radios)
+
+    @property
+    def _radios(self) -> int:
+        """Number of radios of robots and access points."""
+        return len(self._site.robots) + len(self._options.radio.access_points)
 
     def use_wifi(self, kind: str) -> None:
         """Implement `ChoosesWifi.use_wifi`."""
@@ -231,7 +236,7 @@ class EmulatedBackend:
 
             sink(Note("starting a virtual machine, because this kernel has no mac80211_hwsim"))
             draw = partial(interactive_lab.overview, members, options=self._options, world=self._world)
-            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, draw=draw) as lab:
+            with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, radios=self._radios, draw=draw) as lab:
                 yield lab
             return
         ros = self._checked_ros(members)

@@ -8,11 +8,11 @@ from fieldkit.config import schema
 from fieldkit.config.profiles import LinkName
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
 from fieldkit.core.errors import ConfigurationError
+from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
-from sim_backends.radio.radio_options import INFRASTRUCTURE, RadioOptions
+from sim_backends.radio.radio_options import RadioOptions
 
 BOOT_S: Final = 2.0
-_INFRASTRUCTURE: Final = " or ".join(f"`radio.{key}`" for key in INFRASTRUCTURE)
 LATE_BOUND_S: Final = 0.1
 
 
@@ -163,6 +163,7 @@ class EmulatedOptions(Strict):
             exchange at every event of ns-3 takes too long for real time.
         wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [the Wi-Fi of Linux](linux-wifi.md), over the same
             radio, in a virtual machine if this kernel has no mac80211_hwsim.
+        linux_wifi: Settings of the Wi-Fi of Linux.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -179,6 +180,7 @@ class EmulatedOptions(Strict):
     network: Literal["builtin", "ns3"] | None = None
     sync: SyncOptions | None = None
     wifi: Literal["model", "linux"] = "model"
+    linux_wifi: LinuxWifiOptions = LinuxWifiOptions.defaults()
 
     @property
     def has_linux_wifi(self) -> bool:
@@ -226,8 +228,12 @@ class EmulatedOptions(Strict):
             if self.has_linux_wifi and value:
                 name = "a fixed link (loss, delay, rate or jitter)" if key == "radio" else f"`{key}`"
                 raise schema.validation_error(f"`wifi: linux` cannot be combined with {name}", key)
-        if self.has_linux_wifi and self.radio.has_infrastructure:
-            raise schema.validation_error(f"`wifi: linux` cannot be combined with {_INFRASTRUCTURE}", "radio")
+        if self.has_linux_wifi and (self.radio.neighbours or self.radio.microwave_ovens):
+            cause = "`wifi: linux` cannot be combined with `radio.neighbours` or `radio.microwave_ovens`"
+            raise schema.validation_error(cause, "radio")
+        if self.has_linux_wifi and self.linux_wifi.mesh and self.radio.access_points:
+            cause = "`linux_wifi: {mesh: true}` cannot be combined with `radio.access_points`"
+            raise schema.validation_error(cause, "linux_wifi")
         if self.mesh is not None and self.radio.access_points:
             raise schema.validation_error("`mesh` cannot be combined with `radio.access_points`", "mesh")
         return self

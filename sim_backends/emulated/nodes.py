@@ -324,9 +324,9 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
 
-            wifi = lab.parts(robots)
-            radios = lab.radios_of(robots.values())
-            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios))
+            wifi = lab.parts(robots, options.linux_wifi, options.radio)
+            radios = lab.radios_of(robots.values(), options.radio)
+            medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:
             medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
         else:
@@ -359,7 +359,8 @@ def running_robots(
             for name, link_fd in robot.link_fds.items():
                 links[name].attach(robot.name, robot.spec.links[name][1], radio, link_fd)
         if any(robot.spec.waits_for_another for robot in running.values()):
-            media.place(placement.side_by_side_m(robot.name for robot in running.values()))
+            names = [*(robot.name for robot in running.values()), *(options.radio.access_points if wifi else ())]
+            media.place(placement.side_by_side_m(names))
         list(started)
         yield RunningRobots(
             running, medium, media, places, {key: pair.public for key, pair in host_keys.items()}, login.private

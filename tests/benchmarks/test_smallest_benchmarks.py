@@ -21,6 +21,7 @@ PARTS = {
     "bash_peer",
     "cosim_peers",
     "footprint",
+    "kernel_minstrel",
     "lifetimes",
     "mujoco_fleet",
     "namespaces",

@@ -296,6 +296,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "studies.middleware": MinimalRun(
         "--out FOLDER/lab --only dds --repeats 1 --table FOLDER/table.csv", shrink=_one_stream, emulated=True
     ),
+    "minstrel_vs_kernel": MinimalRun("", {"SEEDS": 1}),
     "moves": MinimalRun("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
     "pcap": MinimalRun("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
     "radio_vs_ns3": MinimalRun("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}),

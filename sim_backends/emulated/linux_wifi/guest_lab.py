@@ -147,6 +147,7 @@ def bring_up(
     site: Mapping[str, object],
     *,
     seed: int,
+    radios: int,
     draw: Callable[[Mapping[str, Vector]], Overview],
 ) -> Iterator[GuestLab]:
     """Yield the lab in a new virtual machine.
@@ -155,6 +156,7 @@ def bring_up(
         members: The robots by name.
         site: Content of its site file.
         seed: Seed of all random numbers of the lab.
+        radios: Number of radios.
         draw: As for `GuestLab`.
 
     Raises:
@@ -165,7 +167,7 @@ def bring_up(
     ours, of_machine = socket.socketpair()
     with ours, of_machine:
         script = _script(site, Path.cwd(), seed)
-        with started_machine(kernel, script, radios=len(members), channel=of_machine) as machine:
+        with started_machine(kernel, script, radios=radios, channel=of_machine) as machine:
             streams = ChannelStreams(ours.fileno())
             reader = threading.Thread(target=streams.run, name="machine", daemon=True)
             reader.start()

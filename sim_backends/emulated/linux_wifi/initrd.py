@@ -26,6 +26,7 @@ MODULES: Final = (
         "mac80211_hwsim",
         "crc32c_generic",
         "nf_tables",
+        "bridge",
     ),
     *("ccm", "ctr", "cmac", "gcm"),
 )

@@ -2,11 +2,13 @@
 
 import secrets
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TypeVar
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.model import Role
 from fieldkit.lab.robots import LabRobot
+from sim_backends.emulated.linux_wifi.linux_wifi_options import LinuxWifiOptions
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, require_radios
 from sim_backends.emulated.linux_wifi.wifi_client import WifiClient
 from sim_backends.emulated.robot.spec import WifiSpec
@@ -18,20 +20,34 @@ Key = TypeVar("Key")
 _PASSPHRASE_BYTES = 12
 
 
-def parts(robots: Mapping[Key, Robot | LabRobot]) -> dict[Key, WifiSpec]:
-    """Return the part of each robot: the relay of a trial runs the access point; without a relay, all are ad hoc."""
+def parts(
+    robots: Mapping[Key, Robot | LabRobot], settings: LinuxWifiOptions, radio: RadioOptions
+) -> dict[Key, WifiSpec]:
+    """Return the part of each robot.
+
+    In a mesh, all are mesh points. With access points that are not robots, all are their stations. Otherwise the
+    relay of a trial runs the access point; without a relay, all are ad hoc.
+    """
+    if settings.mesh:
+        return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))
+    station = WifiSpec("station", secrets.token_hex(_PASSPHRASE_BYTES), settings.security, settings.monitor)
+    if radio.access_points:
+        roaming = radio.roaming
+        scan = f"simple:{roaming.short:.0f}:{roaming.threshold_dbm:.0f}:{roaming.long:.0f}"
+        return dict.fromkeys(robots, replace(station, background_scan=scan, channels=roaming.channels))
     if Role.RELAY not in robots:
-        return dict.fromkeys(robots, WifiSpec("ad hoc"))
-    passphrase = secrets.token_hex(_PASSPHRASE_BYTES)
-    return {key: WifiSpec("access point" if key == Role.RELAY else "station", passphrase) for key in robots}
+        return dict.fromkeys(robots, WifiSpec("ad hoc", has_monitor=settings.monitor))
+    return {key: replace(station, part="access point") if key == Role.RELAY else station for key in robots}
 
 
-def radios_of(robots: Iterable[Robot | LabRobot]) -> dict[str, HwsimRadio]:
-    """Return the radio of each robot by its name; errors as `require_radios`."""
-    names = [robot.name for robot in robots]
+def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict[str, HwsimRadio]:
+    """Return the radio of each robot and access point by its name; errors as `require_radios`."""
+    names = [*(robot.name for robot in robots), *options.access_points]
     return dict(zip(names, require_radios(len(names)), strict=True))
 
 
-def medium(options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio]) -> WifiClient:
-    """Return the medium of the robots' radios; errors as `WifiClient`."""
-    return WifiClient(options, world, seed=seed, radios=radios)
+def medium(
+    options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
+) -> WifiClient:
+    """Return the medium of the robots' radios, with the parts of the robots; errors as `WifiClient`."""
+    return WifiClient(options, world, seed=seed, radios=radios, station=next(iter(wifi)))

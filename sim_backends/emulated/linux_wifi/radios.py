@@ -16,6 +16,8 @@ _FOLDER: Final = Path("/sys/class/ieee80211")
 _CLASS: Final = "mac80211_hwsim"
 _MODULE: Final = Path("/sys/module/mac80211_hwsim")
 _RADIO_BIT: Final = 0x40
+_ARPHRD_IEEE80211_RADIOTAP: Final = "803"
+"""Type of a monitor interface: linux/if_arp.h."""
 _RETURN_S: Final = 5.0
 """The kernel returns the radios of a network namespace some time after its last process has exited."""
 _POLL_S: Final = 0.05
@@ -30,11 +32,13 @@ class HwsimRadio:
         phy: Name of its device, `phy0`.
         interface: Name of its network interface, `wlan0`.
         address: Address that identifies it in hwsim; it differs in one bit from the address of the interface.
+        monitors: Names of monitor interfaces that an earlier lab has left.
     """
 
     phy: str
     interface: str
     address: str
+    monitors: tuple[str, ...] = ()
 
     def move_to_namespace(self, pid: int) -> None:
         """Move the radio into the network namespace of a process; it returns when the namespace ends.
@@ -42,7 +46,12 @@ class HwsimRadio:
         Raises:
             RobotError: The kernel refused it.
         """
-        argv = (shutil.which("iw", path=PATH) or "iw", "phy", self.phy, "set", "netns", str(pid))
+        for monitor in self.monitors:
+            self._run("dev", monitor, "del")
+        self._run("phy", self.phy, "set", "netns", str(pid))
+
+    def _run(self, *words: str) -> None:
+        argv = (shutil.which("iw", path=PATH) or "iw", *words)
         ended = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
         if ended.returncode:
             cause = ended.stderr.strip()
@@ -57,11 +66,15 @@ def find_radios(folder: Path = _FOLDER) -> list[HwsimRadio]:
     """
     radios = []
     for entry in sorted(folder.glob("phy*"), key=lambda entry: int(entry.name.removeprefix("phy"))):
-        interfaces = sorted(path.name for path in (entry / "device" / "net").glob("*"))
+        monitors: list[str] = []
+        interfaces: list[str] = []
+        for path in sorted((entry / "device" / "net").glob("*")):
+            is_monitor = (path / "type").read_text(encoding="ascii").strip() == _ARPHRD_IEEE80211_RADIOTAP
+            (monitors if is_monitor else interfaces).append(path.name)
         if interfaces and _CLASS in (entry / "device" / "subsystem").resolve().parts:
             first, *others = (entry / "macaddress").read_text(encoding="ascii").strip().split(":")
             address = ":".join((f"{int(first, 16) | _RADIO_BIT:02x}", *others))
-            radios.append(HwsimRadio(entry.name, interfaces[0], address))
+            radios.append(HwsimRadio(entry.name, interfaces[0], address, tuple(monitors)))
     return radios
 
 

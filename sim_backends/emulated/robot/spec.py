@@ -86,12 +86,20 @@ class WifiSpec:
     """The Wi-Fi of Linux on a robot.
 
     Attributes:
-        part: `ad hoc`, `access point` or `station`.
-        passphrase: Passphrase of the access point; empty if `ad hoc`.
+        part: `ad hoc`, `mesh point`, `access point` or `station`.
+        passphrase: Passphrase of the access point; empty without one.
+        security: Security of the access point.
+        has_monitor: True if the robot has a monitor interface.
+        background_scan: `bgscan` of wpa_supplicant by which a station finds other access points; empty for none.
+        channels: Number of channels of the 2.4 GHz band, from the first, that a station scans.
     """
 
-    part: Literal["ad hoc", "access point", "station"]
+    part: Literal["ad hoc", "mesh point", "access point", "station"]
     passphrase: str = ""
+    security: Literal["wpa2", "wpa3"] = "wpa2"
+    has_monitor: bool = False
+    background_scan: str = ""
+    channels: int = 1
 
 
 @dataclass(frozen=True)

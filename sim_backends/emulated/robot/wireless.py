@@ -1,4 +1,7 @@
-"""Wi-Fi of Linux on an emulated robot: an ad hoc cell, an access point of hostapd, or a station of wpa_supplicant."""
+"""Wi-Fi of Linux on an emulated robot.
+
+It is in an ad hoc cell or an 802.11s mesh, has an access point of hostapd, or is a station of wpa_supplicant.
+"""
 
 import shutil
 import subprocess
@@ -13,8 +16,15 @@ SSID: Final = "fieldkit"
 
 _CHANNEL: Final = 1
 _FREQUENCY_MHZ: Final = 2412
+_CHANNEL_STEP_MHZ: Final = 5
+_MAX_CHANNELS: Final = 11
+"""Channels on which every regulatory domain permits to send probe requests."""
 # Two radios that search for a cell at the same time would create two cells, so all of them join a fixed one.
 _CELL: Final = "02:66:69:65:6c:64"
+_JOIN: Final = {
+    "ad hoc": ("ibss", "join", SSID, str(_FREQUENCY_MHZ), "HT20", "fixed-freq", _CELL),
+    "mesh point": ("mesh", "join", SSID, "freq", str(_FREQUENCY_MHZ), "HT20"),
+}
 _TIMEOUT_S: Final = 15.0
 _PRIORITY_RULE: Final = """\
 table inet fieldkit {
@@ -38,7 +48,8 @@ channel={channel}
 ieee80211n=1
 wmm_enabled=1
 wpa=2
-wpa_key_mgmt=WPA-PSK
+wpa_key_mgmt={key_management}
+ieee80211w={protection}
 rsn_pairwise=CCMP
 wpa_passphrase={passphrase}
 """
@@ -46,9 +57,19 @@ _STATION: Final = """\
 network={{
     ssid="{ssid}"
     psk="{passphrase}"
-    scan_freq={frequency_mhz}
-}}
+    key_mgmt={key_management}
+    ieee80211w={protection}
+    scan_freq={frequencies_mhz}
+{background_scan}}}
 """
+_KEY_MANAGEMENT: Final = {"wpa2": "WPA-PSK", "wpa3": "SAE"}
+_PROTECTION: Final = {"wpa2": 0, "wpa3": 2}
+"""Protected management frames, 802.11w: none, or required as in WPA3."""
+
+MONITOR: Final = "mon0"
+"""Monitor interface: all frames that the radio sends, with their tries, and all that it receives."""
+_INTERFACE_TYPES: Final = {"ad hoc": "ibss", "mesh point": "mp"}
+
 _CONFIGURATION: Final = Path(STATE, "wifi.conf")
 PROGRAMS: Final = {"access point": "hostapd", "station": "wpa_supplicant"}
 """Program of each part that needs one."""
@@ -71,40 +92,49 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
     if device != interface:
         network.run_ip(f"link set {device} name {interface}")
     _run("nft", "-f", "-", text=_PRIORITY_RULE)
-    if wifi.part == "ad hoc":
-        _run("iw", "dev", interface, "set", "type", "ibss")
+    if wifi.part in _INTERFACE_TYPES:
+        _run("iw", "dev", interface, "set", "type", _INTERFACE_TYPES[wifi.part])
     network.configure(interface, address)
     rejoin(interface, wifi)
+    if wifi.has_monitor:
+        _run("iw", "dev", interface, "interface", "add", MONITOR, "type", "monitor")
+        network.run_ip(f"link set {MONITOR} up")
 
 
 def rejoin(interface: str, wifi: WifiSpec) -> None:
-    """Join the ad hoc cell again after the interface was down; hostapd and wpa_supplicant do this themselves.
+    """Join the ad hoc cell or the mesh after the interface was down; hostapd and wpa_supplicant do this themselves.
 
     Raises:
         RobotError: The kernel rejected it.
     """
-    if wifi.part == "ad hoc":
-        join = ("ibss", "join", SSID, str(_FREQUENCY_MHZ), "HT20", "fixed-freq", _CELL)
-        _run("iw", "dev", interface, *join)
+    if wifi.part in _JOIN:
+        _run("iw", "dev", interface, *_JOIN[wifi.part])
 
 
 def command(interface: str, wifi: WifiSpec) -> tuple[str, ...]:
     """Write the configuration of the robot's hostapd or wpa_supplicant, and return its command line."""
     _CONFIGURATION.touch(mode=0o600)
-    template = _ACCESS_POINT if wifi.part == "access point" else _STATION
-    _CONFIGURATION.write_text(
-        template.format(
-            interface=interface,
-            ssid=SSID,
-            channel=_CHANNEL,
-            frequency_mhz=_FREQUENCY_MHZ,
-            passphrase=wifi.passphrase,
-        ),
-        encoding="ascii",
-    )
+    _CONFIGURATION.write_text(configuration(interface, wifi), encoding="ascii")
     program = PROGRAMS[wifi.part]
     options = () if wifi.part == "access point" else ("-i", interface, "-c")
     return (shutil.which(program) or program, *options, str(_CONFIGURATION))
+
+
+def configuration(interface: str, wifi: WifiSpec) -> str:
+    """Return the configuration of hostapd for an access point, and of wpa_supplicant for a station."""
+    template = _ACCESS_POINT if wifi.part == "access point" else _STATION
+    return template.format(
+        interface=interface,
+        ssid=SSID,
+        channel=_CHANNEL,
+        frequencies_mhz=" ".join(
+            str(_FREQUENCY_MHZ + _CHANNEL_STEP_MHZ * number) for number in range(min(wifi.channels, _MAX_CHANNELS))
+        ),
+        background_scan=f'    bgscan="{wifi.background_scan}"\n' if wifi.background_scan else "",
+        passphrase=wifi.passphrase,
+        key_management=_KEY_MANAGEMENT[wifi.security],
+        protection=_PROTECTION[wifi.security],
+    )
 
 
 def is_connected(wifi: WifiSpec) -> bool:

@@ -37,6 +37,13 @@ def conflict(options: RadioOptions, robots: Collection[str], *, has_relay: bool)
     return None
 
 
+def station_place_m(at_m: Place, height_m: float, world: World | None) -> Vector:
+    """Return the position of a station at a height above the ground, which is flat without a world."""
+    east_m, north_m = (float(metres) for metres in at_m)
+    ground_m = 0.0 if world is None else world.ground_m((east_m, north_m))
+    return east_m, north_m, ground_m + height_m
+
+
 class Infrastructure:
     """Stations and sources of noise besides the robots.
 
@@ -151,6 +158,4 @@ class Infrastructure:
         return Emission(now_ns, self._channel.received_mw(emitter.place_m, emitter.power_dbm))
 
     def _place_m(self, at_m: Place, height_m: float) -> Vector:
-        east_m, north_m = (float(metres) for metres in at_m)
-        ground_m = 0.0 if self._world is None else self._world.ground_m((east_m, north_m))
-        return east_m, north_m, ground_m + height_m
+        return station_place_m(at_m, height_m, self._world)

@@ -9,11 +9,13 @@ from sim_backends.emulated.linux_wifi import radios
 from sim_backends.emulated.linux_wifi.radios import HwsimRadio, find_radios
 
 
-def add_device(root: Path, number: int, driver: str, interface: str | None) -> None:
+def add_device(root: Path, number: int, driver: str, *interfaces: str) -> None:
+    """Add a device; the names of monitor interfaces begin with `mon`."""
     device = root / "devices" / f"device{number}"
     (device / "net").mkdir(parents=True)
-    if interface is not None:
+    for interface in interfaces:
         (device / "net" / interface).mkdir()
+        (device / "net" / interface / "type").write_text("803\n" if interface.startswith("mon") else "1\n")
     (root / "class" / driver).mkdir(parents=True, exist_ok=True)
     (device / "subsystem").symlink_to(root / "class" / driver)
     phy = root / "ieee80211" / f"phy{number}"
@@ -26,9 +28,11 @@ def test_only_radios_of_hwsim_with_an_interface_are_used_in_the_order_of_their_n
     add_device(tmp_path, 0, "pci", "wlp1s0")
     add_device(tmp_path, 10, "mac80211_hwsim", "wlan2")
     add_device(tmp_path, 2, "mac80211_hwsim", "wlan1")
-    add_device(tmp_path, 3, "mac80211_hwsim", None)
+    add_device(tmp_path, 3, "mac80211_hwsim")
+    add_device(tmp_path, 4, "mac80211_hwsim", "mon0", "wlan3")
     assert find_radios(tmp_path / "ieee80211") == [
         HwsimRadio("phy2", "wlan1", "42:00:00:00:02:00"),
+        HwsimRadio("phy4", "wlan3", "42:00:00:00:04:00", ("mon0",)),
         HwsimRadio("phy10", "wlan2", "42:00:00:00:0a:00"),
     ]
     assert find_radios(tmp_path / "missing") == []
