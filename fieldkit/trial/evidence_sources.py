@@ -23,6 +23,14 @@ OF_EVERY_ATTEMPT: Final = (
         "the error of the readings, 10 ms",
     ),
     CrossCheck(
+        "clocks and their time sources",
+        ("*_time_*", "*_laptop_offset_*", "marks*"),
+        "`ROLE-sources-before.txt`, `ROLE-sources-after.txt`; `exchanges.txt` with `ROLE-before.txt`: clock",
+        ("both captures: the clock offset",),
+        "the errors of all, and 1 ms; a contradiction is a mark: `clocks disagree`",
+        CheckOutcome.UNCHECKED,
+    ),
+    CrossCheck(
         "that jobs ended as they should",
         (),
         "`ROLE-after.txt`: jobs",

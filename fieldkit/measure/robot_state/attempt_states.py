@@ -1,0 +1,42 @@
+"""Measure the robots' reports on their clocks and computers in an attempt, and mark it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from fieldkit.core.columns import Measured, plain_name
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.robot_state import clocks, marks
+from fieldkit.measure.robot_state.marks import RepeatMark
+
+_ONE_WAY: Final = "one_way_withheld"
+_OFFSET: Final = "clock_offset_s"
+
+
+def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Measured) -> Measured:
+    """Return the columns of an attempt, with those of the robots' reports.
+
+    If a one-way delay is withheld because no offset of the clocks is known, its reason also names wrong clocks and
+    missing time sources.
+
+    Args:
+        evidence: The attempt.
+        names: Name of the robot in each role.
+        measured: The columns of its steps.
+    """
+    robot_clocks = clocks.read(evidence, names)
+    all_marks = list(clocks.marks(robot_clocks, measured))
+    is_known = any(clock.report is not None for clock in robot_clocks.values())
+    for role, clock in robot_clocks.items():
+        measured |= clocks.measure(role, clock)
+    return _with_clock_reasons(measured, all_marks) | marks.measure(all_marks, is_known=is_known)
+
+
+def _with_clock_reasons(measured: Measured, all_marks: Sequence[RepeatMark]) -> Measured:
+    reasons = "; ".join(mark.reason for mark in all_marks)
+    values = dict(measured.values)
+    for name, value in measured.values.items():
+        offset_name = name.removesuffix(_ONE_WAY) + _OFFSET
+        if reasons and plain_name(name) == _ONE_WAY and offset_name not in measured.values:
+            values[name] = f"{value}; {reasons}"
+    return Measured(values, measured.missing)

@@ -1,0 +1,67 @@
+"""Columns of the robots' reports on their state, and the marks of a repeat.
+
+A mark names a condition that can explain a difference between repeats. A marked repeat is valid.
+"""
+
+from typing import Final
+
+from fieldkit.core.columns import BACKGROUND, CLOCK_DIFFERENCE_BOUNDS_S, Column, Figure, Kind, columns
+
+MARKS: Final = "marks"
+MARK_SEPARATOR: Final = " and "
+NO_MARKS: Final = "none"
+"""Value of the column `marks` if sources of the robots answered and report nothing that needs a mark."""
+
+MARK_COLUMNS: Final = columns(
+    160,
+    (
+        MARKS,
+        "text",
+        (
+            "Conditions of the robots that can explain a difference between repeats, joined by `and`: wrong "
+            "clock, no time source, clocks disagree. `none` if the robots report none; empty if no robot has a "
+            "program that reports any."
+        ),
+        Figure("marks", Kind.WORDS, rank=BACKGROUND + 10),
+    ),
+    ("marks_reason", "text", "Reasons of the marks, with the names of the robots; empty without a mark."),
+)
+
+
+def declare_columns(role: str) -> tuple[Column, ...]:
+    """Return the columns of the robot in a role."""
+    return columns(
+        160,
+        (
+            f"{role}_time_source",
+            "text",
+            (
+                f"Program that sets the clock of the {role}, and its time source: `chrony 10.0.0.1`. Empty if it has "
+                "no source."
+            ),
+        ),
+        (
+            f"{role}_time_offset_s",
+            "s",
+            (
+                f"Clock of the {role} minus its time source, reported by that program before or after the repeat, "
+                "whichever may be larger. Empty if it has no source."
+            ),
+            CLOCK_DIFFERENCE_BOUNDS_S,
+        ),
+        (
+            f"{role}_time_error_s",
+            "s",
+            f"Maximum error of {role}_time_offset_s, reported by that program, if the time source is correct.",
+        ),
+        (
+            f"{role}_laptop_offset_s",
+            "s",
+            (
+                f"Clock of the {role} minus the laptop's at the start of the repeat, from one exchange over the "
+                "control connection."
+            ),
+            CLOCK_DIFFERENCE_BOUNDS_S,
+        ),
+        (f"{role}_laptop_offset_error_s", "s", f"Maximum error of {role}_laptop_offset_s."),
+    )

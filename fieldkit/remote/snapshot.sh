@@ -1,0 +1,49 @@
+# Snapshot of what the programs of a robot report on its state, before and after an attempt.
+#
+# All sources run at the same time, each with a time limit, so a program that hangs delays an attempt by SOURCE_S seconds
+# at most. They use local sockets only and send no packet over a network: chronyc without names (-n), pmc without
+# boundary hops (-b 0). The output has a line `==> NAME <==` per source, then its lines, each after a blank, so that no
+# output can contain such a line; the last one is `code CODE`.
+
+SOURCE_S=2
+SOURCE_BLOCKS=64 # limit of the output of a source, in blocks of 512 or 1,024 bytes
+
+source_of() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
+    [ -d "$folder" ] || mkdir "$folder" || return
+    name=$folder/$1
+    shift
+    {
+        # In another folder, because the timeout of busybox may run a second longer, and this folder is deleted.
+        (ulimit -f "$SOURCE_BLOCKS"; cd / && exec setsid timeout -s KILL "$SOURCE_S" "$@") 2>&1 &
+        wait "$!"
+        code=$?
+        kill -KILL "-$!" # processes that it left, which the timeout of busybox does not end
+        echo
+        echo "code $code"
+    } </dev/null >"$name" 2>/dev/null &
+}
+
+clock_sources() {
+    ! command -v chronyc >/dev/null || source_of chrony chronyc -n -c tracking
+    if [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; then
+        source_of timedatectl timedatectl show
+        source_of timesyncd timedatectl timesync-status
+    fi
+    if command -v pmc >/dev/null; then # its default socket is in a folder that only root can write
+        source_of ptp pmc -u -b 0 -i "/tmp/fieldkit-pmc-$$" \
+            'GET CURRENT_DATA_SET' 'GET TIME_STATUS_NP' 'GET PORT_DATA_SET'
+    fi
+}
+
+snapshot() { # $1 a new folder for temporary files: print the outputs of all sources; nothing if there is none
+    folder=$1
+    (
+        PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
+        export LC_ALL=C
+        clock_sources
+        [ -d "$folder" ] || exit 0
+        wait
+        cd "$folder" && awk 'FNR == 1 { print "==> " FILENAME " <==" } { print " " $0 }' *
+        rm -rf -- "../${folder##*/}" "/tmp/fieldkit-pmc-$$"
+    )
+}
