@@ -45,6 +45,7 @@
 #                                        `silent`, or `alarm` (a drone may be in the air)
 #   job.sh life_signs FILE               print FILE and the time since boot
 #   job.sh snapshot                      print the outputs of all sources of the robot's state, see `snapshot.sh`
+#   job.sh health                        print the load, temperatures, batteries and free disk space of this computer
 #   job.sh needs                         fail if a program is missing that this script calls
 #   job.sh command_loop                  print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as
 #                                        if the script was called with it. On both streams NONCE precedes the output, and

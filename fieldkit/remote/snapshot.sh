@@ -35,13 +35,33 @@ clock_sources() {
     fi
 }
 
+health() { # print values of the computer, one a line
+    read -r line </proc/stat && echo "$line"
+    for zone in /sys/class/thermal/thermal_zone*/temp; do
+        read -r value 2>/dev/null <"$zone" && echo "temperature $value"
+    done
+    for supply in /sys/class/power_supply/*; do # the battery of a mouse has the scope Device
+        read -r value 2>/dev/null <"$supply/type" && [ "$value" = Battery ] || continue
+        read -r value 2>/dev/null <"$supply/scope" && [ "$value" = Device ] && continue
+        read -r charge 2>/dev/null <"$supply/capacity" || charge=-
+        read -r voltage 2>/dev/null <"$supply/voltage_now" || voltage=-
+        echo "battery $charge $voltage"
+    done
+    for monitor in /sys/class/hwmon/*; do
+        read -r value 2>/dev/null <"$monitor/name" && [ "$value" = rpi_volt ] || continue
+        read -r value 2>/dev/null <"$monitor/in0_lcrit_alarm" && echo "undervoltage $value"
+    done
+    (free && echo "disk $free") || :
+}
+
 snapshot() { # $1 a new folder for temporary files: print the outputs of all sources; nothing if there is none
     folder=$1
     (
         PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
         export LC_ALL=C
         clock_sources
-        [ -d "$folder" ] || exit 0
+        source_of health sh "$self" health
+        ! command -v vcgencmd >/dev/null || source_of vcgencmd vcgencmd get_throttled
         wait
         cd "$folder" && awk 'FNR == 1 { print "==> " FILENAME " <==" } { print " " $0 }' *
         rm -rf -- "../${folder##*/}" "/tmp/fieldkit-pmc-$$"

@@ -4,6 +4,7 @@ The sources are scripts that print real outputs.
 """
 
 import shlex
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.measure.robot_state import chrony, clocks, snapshots
+from fieldkit.measure.robot_state import chrony, clocks, health, snapshots
 from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
@@ -74,8 +75,14 @@ def test_programs_that_hang_fail_or_flood_give_no_value_and_delay_little(shell: 
     assert all(report.offset_s is None for report in clocks.reports(taken))
 
 
-def test_a_robot_without_any_source_has_no_snapshot(shell: LocalShell, tmp_path: Path) -> None:
+def test_a_robot_without_these_programs_reports_its_computer(shell: LocalShell, tmp_path: Path) -> None:
     give(tmp_path, "chronyc", "exit 3")
     (tmp_path / "bin" / "chronyc").chmod(0o644)
-    assert "chrony" not in take(shell)
-    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    taken = take(shell)
+    assert "chrony" not in taken
+    state = health.parse(taken)
+    assert state.all_ticks is not None
+    assert state.busy_ticks is not None
+    assert 0 < state.busy_ticks < state.all_ticks
+    assert state.disk_free_bytes is not None
+    assert state.disk_free_bytes == pytest.approx(shutil.disk_usage(shell.home).free, rel=0.2)

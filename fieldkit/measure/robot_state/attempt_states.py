@@ -1,13 +1,12 @@
 """Measure the robots' reports on their clocks and computers in an attempt, and mark it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Final
 
 from fieldkit.core.columns import Measured, plain_name
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.robot_state import clocks, marks
-from fieldkit.measure.robot_state.marks import RepeatMark
+from fieldkit.measure.robot_state import clocks, health, marks
 
 _ONE_WAY: Final = "one_way_withheld"
 _OFFSET: Final = "clock_offset_s"
@@ -25,15 +24,22 @@ def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Meas
         measured: The columns of its steps.
     """
     robot_clocks = clocks.read(evidence, names)
+    computers = {role: health.read(evidence, role) for role in names}
+    flags = {role: health.flags_during(*states) for role, states in computers.items()}
     all_marks = list(clocks.marks(robot_clocks, measured))
-    is_known = any(clock.report is not None for clock in robot_clocks.values())
+    clock_reasons = "; ".join(mark.reason for mark in all_marks)
+    all_marks += health.marks(names, flags)
+    is_known = any(clock.report for clock in robot_clocks.values()) or any(map(_is_known, flags.values()))
     for role, clock in robot_clocks.items():
-        measured |= clocks.measure(role, clock)
-    return _with_clock_reasons(measured, all_marks) | marks.measure(all_marks, is_known=is_known)
+        measured |= clocks.measure(role, clock) | health.measure(role, *computers[role])
+    return _with_clock_reasons(measured, clock_reasons) | marks.measure(all_marks, is_known=is_known)
 
 
-def _with_clock_reasons(measured: Measured, all_marks: Sequence[RepeatMark]) -> Measured:
-    reasons = "; ".join(mark.reason for mark in all_marks)
+def _is_known(value: object) -> bool:
+    return value is not None
+
+
+def _with_clock_reasons(measured: Measured, reasons: str) -> Measured:
     values = dict(measured.values)
     for name, value in measured.values.items():
         offset_name = name.removesuffix(_ONE_WAY) + _OFFSET

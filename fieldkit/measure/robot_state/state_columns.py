@@ -18,9 +18,9 @@ MARK_COLUMNS: Final = columns(
         MARKS,
         "text",
         (
-            "Conditions of the robots that can explain a difference between repeats, joined by `and`: wrong "
-            "clock, no time source, clocks disagree. `none` if the robots report none; empty if no robot has a "
-            "program that reports any."
+            "Conditions of the robots that can explain a difference between repeats, joined by `and`: wrong clock, "
+            "no time source, clocks disagree, under-voltage, throttled. `none` if the robots report none; empty if "
+            "no robot has a program that reports any."
         ),
         Figure("marks", Kind.WORDS, rank=BACKGROUND + 10),
     ),
@@ -64,4 +64,26 @@ def declare_columns(role: str) -> tuple[Column, ...]:
             CLOCK_DIFFERENCE_BOUNDS_S,
         ),
         (f"{role}_laptop_offset_error_s", "s", f"Maximum error of {role}_laptop_offset_s."),
+        (
+            f"{role}_cpu_share",
+            "share",
+            f"Share of the processor time of the {role} that was in use during the repeat, by all programs.",
+        ),
+        (
+            f"{role}_temperature_c",
+            "degC",
+            f"Highest temperature of a sensor of the {role} before and after the repeat, in degrees Celsius.",
+            (-100.0, 300.0),
+        ),
+        (
+            f"{role}_power_state",
+            "text",
+            (
+                f"Limits of the processor of the {role} during the repeat: under-voltage, frequency capped, "
+                "throttled, soft temperature limit; `normal` without one. Empty if it is not a Raspberry Pi."
+            ),
+        ),
+        (f"{role}_battery_share", "share", f"Lowest charge of the batteries of the {role} after the repeat."),
+        (f"{role}_battery_v", "V", f"Lowest voltage of the batteries of the {role} after the repeat.", (0.0, 2000.0)),
+        (f"{role}_disk_free_bytes", "B", f"Free disk space in the home of the {role} after the repeat."),
     )
