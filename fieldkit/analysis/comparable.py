@@ -65,6 +65,14 @@ MARK_SEPARATOR: Final = " and "
 _HARMLESS_MARKS: Final = frozenset({"no time source"})
 """Marks that affect no figure, because fieldkit measures the offsets of clocks itself."""
 
+_RADIO_COLUMNS: Final = (
+    "sender_channel",
+    "receiver_channel",
+    "sender_regulatory_domain",
+    "receiver_regulatory_domain",
+)
+"""Settings of the radios whose difference is noted."""
+
 _MESSAGES: Final = 2
 """Acceptable difference of recorded sizes in messages, because a recorder starts and stops between two messages."""
 
@@ -159,6 +167,9 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
     yield from _datagram_sizes(a, b)
     yield from _offload_state(a, b)
     yield from _marks(a, b)
+    for name in _RADIO_COLUMNS:
+        if name in a.texts and name in b.texts:
+            yield from _compare_column(name, a, b, refuses=False)
 
 
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:

@@ -76,8 +76,8 @@ unwritten() { # fail with the reason why file $1 cannot be written
     fail "cannot write $1${why:+: ${why##*: }}"
 }
 
-reported() { # write file $1 with a snapshot of the sources of this robot, unless it exists
-    [ -e "$1" ] || snapshot ".sources-$$" >"$1" 2>/dev/null || unwritten "$1"
+reported() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
+    [ -e "$1" ] || snapshot ".sources-$$" "$2" >"$1" 2>/dev/null || unwritten "$1"
 }
 
 begin() {
@@ -92,7 +92,7 @@ begin() {
         lasting .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
-    reported "$role-sources-before.txt"
+    reported "$role-sources-before.txt" "$interface"
     watch "$role" "$interface"
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
@@ -104,7 +104,7 @@ pack() {
     gone
     [ -e "$role-after.txt" ] || { echo "==> jobs <==" && endings && state "$3"; } >"$role-after.txt" 2>&1 ||
         unwritten "$role-after.txt"
-    reported "$role-sources-after.txt"
+    reported "$role-sources-after.txt" "$3"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"

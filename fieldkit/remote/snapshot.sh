@@ -2,7 +2,7 @@
 #
 # All sources run at the same time, each with a time limit, so a program that hangs delays an attempt by SOURCE_S seconds
 # at most. They use local sockets only and send no packet over a network: chronyc without names (-n), pmc without
-# boundary hops (-b 0). The output has a line `==> NAME <==` per source, then its lines, each after a blank, so that no
+# boundary hops (-b 0), a passive scan. The output has a line `==> NAME <==` per source, then its lines, each after a blank, so that no
 # output can contain such a line; the last one is `code CODE`.
 
 SOURCE_S=2
@@ -54,12 +54,27 @@ health() { # print values of the computer, one a line
     (free && echo "disk $free") || :
 }
 
-snapshot() { # $1 a new folder for temporary files: print the outputs of all sources; nothing if there is none
+radio_sources() { # $1 interface
+    command -v iw >/dev/null && info=$(timeout -s KILL "$SOURCE_S" iw dev "$1" info 2>/dev/null) || return 0
+    source_of iw-info iw dev "$1" info
+    source_of iw-reg iw reg get
+    # The channel is read twice while the robots send nothing for an attempt, in which the scan only receives.
+    source_of iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
+    case $info in *"channel "*" ("*" MHz"*) ;; *) return 0 ;; esac
+    info=${info#*channel *" ("}
+    info=${info%%" MHz"*}
+    set -- iw dev "$1" scan freq "${info%.*}" passive
+    [ "$(id -u)" = 0 ] || set -- sudo -n "$@"
+    source_of iw-scan "$@"
+}
+
+snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -: print the outputs of all sources
     folder=$1
     (
         PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
         export LC_ALL=C
         clock_sources
+        [ "$2" = - ] || radio_sources "$2"
         source_of health sh "$self" health
         ! command -v vcgencmd >/dev/null || source_of vcgencmd vcgencmd get_throttled
         wait

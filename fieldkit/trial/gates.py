@@ -92,6 +92,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     names = {role: scene.robot(role).name for role in sort_roles(plan.procedure.roles())}
+    problems += attempt_states.problems(evidence, names)
     measured = attempt_states.measure(evidence, names, measured)
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks))
 

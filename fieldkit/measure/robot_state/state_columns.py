@@ -19,8 +19,8 @@ MARK_COLUMNS: Final = columns(
         "text",
         (
             "Conditions of the robots that can explain a difference between repeats, joined by `and`: wrong clock, "
-            "no time source, clocks disagree, under-voltage, throttled. `none` if the robots report none; empty if "
-            "no robot has a program that reports any."
+            "no time source, clocks disagree, under-voltage, throttled, busy channel. `none` if the robots report "
+            "none; empty if no robot has a program that reports any."
         ),
         Figure("marks", Kind.WORDS, rank=BACKGROUND + 10),
     ),
@@ -85,5 +85,34 @@ def declare_columns(role: str) -> tuple[Column, ...]:
         ),
         (f"{role}_battery_share", "share", f"Lowest charge of the batteries of the {role} after the repeat."),
         (f"{role}_battery_v", "V", f"Lowest voltage of the batteries of the {role} after the repeat.", (0.0, 2000.0)),
+        (
+            f"{role}_channel",
+            "text",
+            f"Channel of the radio of the {role} before and after the repeat, with its width.",
+        ),
+        (
+            f"{role}_regulatory_domain",
+            "text",
+            f"Regulatory domain of the radio of the {role}: two letters of the country, `00` for the world.",
+        ),
+        (
+            f"{role}_other_networks",
+            "count",
+            f"Networks of others that the {role} receives on its channel, the larger number of before and after.",
+        ),
+        (
+            f"{role}_other_networks_max_dbm",
+            "dBm",
+            f"Strongest signal of these networks at the {role}; empty without such a network.",
+            (-300.0, 100.0),
+        ),
+        (
+            f"{role}_others_airtime_share",
+            "share",
+            (
+                f"Share of the airtime at the {role} that is busy without its own transmissions, in 0.5 s before and "
+                "after the repeat; the larger one."
+            ),
+        ),
         (f"{role}_disk_free_bytes", "B", f"Free disk space in the home of the {role} after the repeat."),
     )

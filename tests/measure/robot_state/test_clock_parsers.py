@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.measure.robot_state import chrony, clocks, health, ptp, snapshots, timesyncd
+from fieldkit.measure.robot_state import chrony, clocks, health, neighbourhood, ptp, snapshots, timesyncd
 from fieldkit.measure.robot_state.snapshots import SourceOutput
 from tests.helpers.paths import DATA
 
@@ -152,5 +152,12 @@ def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:
 
 def test_the_script_has_the_command_of_each_parser() -> None:
     script = (Path(snapshots.__file__).parents[2] / "remote" / "snapshot.sh").read_text(encoding="ascii")
-    names = set(re.findall(r"source_of ([a-z]+) ", script))
-    assert names == {chrony.NAME, timesyncd.NAME, timesyncd.STATE_NAME, ptp.NAME, health.NAME, health.THROTTLED_NAME}
+    names = set(re.findall(r"source_of ([a-z-]+) ", script))
+    of_clocks = {chrony.NAME, timesyncd.NAME, timesyncd.STATE_NAME, ptp.NAME}
+    of_radio = {
+        neighbourhood.INFO_NAME,
+        neighbourhood.REGULATORY_NAME,
+        neighbourhood.SCAN_NAME,
+        neighbourhood.SURVEY_NAME,
+    }
+    assert names == of_clocks | of_radio | {health.NAME, health.THROTTLED_NAME}

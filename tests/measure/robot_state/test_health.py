@@ -53,8 +53,8 @@ def test_flags_of_a_raspberry_pi(before: str, after: str, flags: set[str] | None
 
 
 def test_a_kernel_reports_under_voltage_without_vcgencmd() -> None:
-    assert health.flags_during(state("undervoltage 0"), state("undervoltage 1")) == {"under-voltage"}
-    assert health.flags_during(state("undervoltage 0"), state("undervoltage 0")) == set()
+    assert health.flags_during(state("undervoltage 0"), state("undervoltage 1")) == frozenset({"under-voltage"})
+    assert health.flags_during(state("undervoltage 0"), state("undervoltage 0")) == frozenset[str]()
     assert health.flags_during(state("undervoltage 0"), state("undervoltage 2")) is None
 
 
