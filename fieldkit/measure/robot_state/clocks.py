@@ -6,16 +6,12 @@ from typing import Final
 
 from fieldkit.core.columns import Measured, Value, plain_name
 from fieldkit.core.model import Role
-from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import host
 from fieldkit.measure.robot_clock import Offset
-from fieldkit.measure.robot_state import chrony, exchanges, ptp, snapshots, timesyncd
+from fieldkit.measure.robot_state import chrony, exchanges, ptp, timesyncd
 from fieldkit.measure.robot_state.clock_report import ClockReport
 from fieldkit.measure.robot_state.marks import RepeatMark
 from fieldkit.measure.robot_state.snapshots import Snapshot
 
-WRONG_S: Final = 0.1
-"""Offset above which a clock is wrong: far above the errors of NTP, and visible in time stamps of topics."""
 _MARGIN_S: Final = 0.001
 """Difference between measured and reported offsets that is tolerated in addition to their errors."""
 
@@ -70,33 +66,21 @@ def chosen(of_programs: Sequence[ClockReport]) -> ClockReport | None:
     return next((report for report in of_programs if report.is_synchronized), of_programs[0] if of_programs else None)
 
 
-def read(evidence: AttemptEvidence, names: Mapping[Role, str]) -> dict[Role, RobotClock]:
-    """Return the clocks of the robots in an attempt.
+def read(name: str, pair: Sequence[Snapshot], laptop: Offset | None) -> RobotClock:
+    """Return the clock of a robot in an attempt.
 
     Args:
-        evidence: The attempt.
-        names: Name of the robot in each role.
+        name: Its name.
+        pair: Its snapshots before and after the attempt.
+        laptop: Offset of its clock from the laptop's; None if unknown.
     """
-    times = evidence.read_or_none(exchanges.read, exchanges.FILE) or {}
-    return {role: _read_robot(evidence, role, name, times.get(role)) for role, name in names.items()}
-
-
-def _read_robot(evidence: AttemptEvidence, role: Role, name: str, times_ns: tuple[int, int] | None) -> RobotClock:
-    of_snapshots = (
-        chosen(reports(snapshot))
-        for file in (snapshots.before_file, snapshots.after_file)
-        if (snapshot := evidence.read_or_none(snapshots.read, file(role))) is not None
-    )
-    state = evidence.read_or_none(host.state, host.before_file(role))
-    laptop = None
-    if times_ns is not None and state is not None and state.clock is not None:
-        laptop = exchanges.offset(*times_ns, state.clock)
-    return RobotClock(name, tuple(report for report in of_snapshots if report is not None), laptop)
+    reports_of_pair = (chosen(reports(snapshot)) for snapshot in pair)
+    return RobotClock(name, tuple(report for report in reports_of_pair if report is not None), laptop)
 
 
 def measure(role: Role, clock: RobotClock) -> Measured:
     """Return the columns of the clock of the robot in a role."""
-    report, laptop = clock.report, clock.laptop
+    report = clock.report
     is_synchronized = report is not None and report.is_synchronized
     reason = (report.problem if report else "") or "no program of the robot reports on its clock"
     values: dict[str, Value | None] = {
@@ -104,13 +88,7 @@ def measure(role: Role, clock: RobotClock) -> Measured:
         f"{role}_time_offset_s": report.offset_s if report and is_synchronized else None,
         f"{role}_time_error_s": report.error_s if report and is_synchronized else None,
     }
-    laptop_values: dict[str, Value | None] = {
-        f"{role}_laptop_offset_s": None if laptop is None else laptop.offset_s,
-        f"{role}_laptop_offset_error_s": None if laptop is None else laptop.error_s,
-    }
-    return Measured.from_optional(values, reason) | Measured.from_optional(
-        laptop_values, "its clock was not read, or was set meanwhile"
-    )
+    return Measured.from_optional(values, reason)
 
 
 def marks(clocks: Mapping[Role, RobotClock], measured: Measured) -> Iterator[RepeatMark]:
@@ -129,13 +107,13 @@ def marks(clocks: Mapping[Role, RobotClock], measured: Measured) -> Iterator[Rep
 
 
 def wrong_clock(clock: RobotClock) -> str | None:
-    """Return a sentence on a clock that is wrong by more than `WRONG_S`, or None if it is not known to be wrong."""
+    """Return a sentence on a clock that is wrong by more than `exchanges.WRONG_S`, or None if none is known."""
     report = clock.report
     offset_s = None
-    if clock.laptop is not None and abs(clock.laptop.offset_s) - clock.laptop.error_s > WRONG_S:
+    if clock.laptop is not None and exchanges.is_wrong(clock.laptop):
         offset_s = clock.laptop.offset_s
     elif report is not None and report.is_synchronized and report.offset_s is not None:
-        is_wrong = abs(report.offset_s) - (report.error_s or 0.0) > WRONG_S
+        is_wrong = exchanges.is_wrong(Offset(report.offset_s, report.error_s or 0.0))
         offset_s = report.offset_s if is_wrong else None
     if offset_s is None:
         return None

@@ -13,8 +13,6 @@ from typing import Final
 
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.model import Role
-from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.robot_state import snapshots
 from fieldkit.measure.robot_state.marks import RepeatMark
 from fieldkit.measure.robot_state.snapshots import Snapshot
 
@@ -104,17 +102,7 @@ def _flags(snapshot: Snapshot) -> tuple[frozenset[str] | None, frozenset[str] | 
     alarm = None if health is None or health.failure else _ALARM.search(health.text)
     if alarm is None:
         return None, None
-    now = frozenset({UNDER_VOLTAGE}) if alarm[1] == "1" else frozenset()
-    return now, None
-
-
-def read(evidence: AttemptEvidence, role: Role) -> tuple[Health, Health]:
-    """Return the state of a robot before and after an attempt; without a snapshot all values are unknown."""
-    before, after = (
-        parse(evidence.read_or_none(snapshots.read, file(role)) or {})
-        for file in (snapshots.before_file, snapshots.after_file)
-    )
-    return before, after
+    return frozenset({UNDER_VOLTAGE} if alarm[1] == "1" else ()), None
 
 
 def flags_during(before: Health, after: Health) -> frozenset[str] | None:
@@ -149,12 +137,7 @@ def measure(role: Role, before: Health, after: Health) -> Measured:
 
 
 def marks(names: Mapping[Role, str], flags_by_role: Mapping[Role, frozenset[str] | None]) -> Iterator[RepeatMark]:
-    """Yield the marks of an attempt that throttled computers cause.
-
-    Args:
-        names: Name of the robot in each role.
-        flags_by_role: Result of `flags_during` for each role.
-    """
+    """Yield the marks that throttled computers cause, from name and result of `flags_during` of each robot."""
     for role, flags in flags_by_role.items():
         if UNDER_VOLTAGE in (flags or ()):
             yield RepeatMark(UNDER_VOLTAGE, f"{names[role]}: the supply voltage is too low")

@@ -21,12 +21,7 @@ class RepeatMark:
 
 
 def measure(marks: Iterable[RepeatMark], *, is_known: bool) -> Measured:
-    """Return the columns of the marks.
-
-    Args:
-        marks: The marks.
-        is_known: Whether any source of a robot answered, so that an attempt without marks has the value `none`.
-    """
+    """Return the columns of the marks; `is_known` if a source answered, so that the value without marks is `none`."""
     all_marks = list(marks)
     names = MARK_SEPARATOR.join(dict.fromkeys(mark.name for mark in all_marks))
     reasons = "; ".join(dict.fromkeys(mark.reason for mark in all_marks))

@@ -14,8 +14,6 @@ from typing import Final
 
 from fieldkit.core.columns import Measured, Value
 from fieldkit.core.model import Role
-from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.robot_state import snapshots
 from fieldkit.measure.robot_state.marks import RepeatMark
 from fieldkit.measure.robot_state.snapshots import Snapshot
 
@@ -59,7 +57,7 @@ _HALF_WIDTH_MHZ: Final = 10.0
 
 
 @dataclass(frozen=True)
-class Channel:
+class WifiChannel:
     """Channel of a radio.
 
     Attributes:
@@ -83,7 +81,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Neighbourhood:
+class RadioState:
     """State of a radio and its channel at one time; attributes are None if unknown.
 
     Attributes:
@@ -93,13 +91,13 @@ class Neighbourhood:
         others_share: Share of the airtime that was busy without own transmissions.
     """
 
-    channel: Channel | None = None
+    channel: WifiChannel | None = None
     country: str | None = None
     signals_dbm: tuple[float | None, ...] | None = None
     others_share: float | None = None
 
 
-def parse(snapshot: Snapshot) -> Neighbourhood:
+def parse(snapshot: Snapshot) -> RadioState:
     """Return the state in a snapshot."""
     info, regulatory, scan, survey = (
         "" if (output := snapshot.get(name)) is None or output.failure else output.text
@@ -109,7 +107,7 @@ def parse(snapshot: Snapshot) -> Neighbourhood:
     own = _ADDRESS.search(info)
     has_scan = (output := snapshot.get(SCAN_NAME)) is not None and output.failure is None and channel is not None
     country = _COUNTRY.search(regulatory)
-    return Neighbourhood(
+    return RadioState(
         channel,
         country[1] if country else None,
         _signals(scan, channel, own[1] if own else "") if has_scan and channel is not None else None,
@@ -117,15 +115,15 @@ def parse(snapshot: Snapshot) -> Neighbourhood:
     )
 
 
-def _channel(info: str) -> Channel | None:
+def _channel(info: str) -> WifiChannel | None:
     match = _CHANNEL.search(info)
     if match is None:
         return None
     frequency_mhz = int(match[2])
-    return Channel(int(match[1]), frequency_mhz, int(match[3]), int(match[4] or frequency_mhz))
+    return WifiChannel(int(match[1]), frequency_mhz, int(match[3]), int(match[4] or frequency_mhz))
 
 
-def _signals(scan: str, channel: Channel, own_address: str) -> tuple[float | None, ...]:
+def _signals(scan: str, channel: WifiChannel, own_address: str) -> tuple[float | None, ...]:
     """Return the received power of each network of others that was received on a channel."""
     parts = _NETWORK.split(scan)
     signals: dict[str, float | None] = {}
@@ -159,16 +157,7 @@ def _times_ms(survey: str) -> Mapping[str, int] | None:
     return None
 
 
-def read(evidence: AttemptEvidence, role: Role) -> tuple[Neighbourhood, Neighbourhood]:
-    """Return the state of a robot's radio before and after an attempt; unknown without a snapshot."""
-    before, after = (
-        parse(evidence.read_or_none(snapshots.read, file(role)) or {})
-        for file in (snapshots.before_file, snapshots.after_file)
-    )
-    return before, after
-
-
-def measure(role: Role, states: Sequence[Neighbourhood]) -> Measured:
+def measure(role: Role, states: Sequence[RadioState]) -> Measured:
     """Return the columns of the neighbourhood of the robot in a role; of several states the largest values."""
     channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
     countries = list(dict.fromkeys(state.country for state in states if state.country))
@@ -186,7 +175,7 @@ def measure(role: Role, states: Sequence[Neighbourhood]) -> Measured:
     return Measured.from_optional(prefixed, "its radio does not report it, or received no other network")
 
 
-def channel_problem(states: Sequence[Neighbourhood]) -> str | None:
+def channel_problem(states: Sequence[RadioState]) -> str | None:
     """Return a sentence if the channel or the regulatory domain changed between two states, or None."""
     channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
     countries = list(dict.fromkeys(state.country for state in states if state.country))
@@ -196,7 +185,7 @@ def channel_problem(states: Sequence[Neighbourhood]) -> str | None:
     return None
 
 
-def marks(names: Mapping[Role, str], states_by_role: Mapping[Role, Sequence[Neighbourhood]]) -> Iterator[RepeatMark]:
+def marks(names: Mapping[Role, str], states_by_role: Mapping[Role, Sequence[RadioState]]) -> Iterator[RepeatMark]:
     """Yield a mark for each robot on whose channel others use more airtime than `BUSY_SHARE`."""
     for role, states in states_by_role.items():
         share = max((state.others_share or 0.0 for state in states), default=0.0)

@@ -12,10 +12,13 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import reading
 
 _HEADER: Final = re.compile(r"==> ([a-z][a-z0-9-]{0,30}) <==", re.ASCII)
 _CODE: Final = re.compile(r" code ([0-9]{1,3})", re.ASCII)
+_FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153: "printed too much"}
+"""Failure by exit code: 128 plus SIGKILL or SIGXFSZ."""
 _NOT_EXECUTABLE: Final = (126, 127)
 """Exit codes of a program that cannot be started: BusyBox finds files that are not executable."""
 MAX_SOURCES: Final = 50
@@ -36,17 +39,7 @@ class SourceOutput:
     @property
     def failure(self) -> str | None:
         """The reason why the source has no value, for example `did not answer in time`; None if it succeeded."""
-        match self.code:
-            case 0:
-                return None
-            case None:
-                return "was interrupted"
-            case 137:
-                return "did not answer in time"
-            case 153:
-                return "printed too much"
-            case _:
-                return f"failed with exit code {self.code}"
+        return None if self.code == 0 else _FAILURES.get(self.code, f"failed with exit code {self.code}")
 
 
 Snapshot = Mapping[str, SourceOutput]
@@ -70,6 +63,12 @@ def read(path: Path) -> Snapshot:
         EvidenceError: The file is missing or cannot be read.
     """
     return parse(reading.text(path))
+
+
+def of_attempt(evidence: AttemptEvidence, role: Role) -> tuple[Snapshot, Snapshot]:
+    """Return the snapshots of a robot before and after an attempt; a missing one is empty."""
+    before, after = (evidence.read_or_none(read, file(role)) or {} for file in (before_file, after_file))
+    return before, after
 
 
 def parse(text: str) -> Snapshot:

@@ -19,7 +19,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import session_jobs, store
-from fieldkit.trial.check import contact, probe, radio, software, system, time_sources
+from fieldkit.trial.check import contact, probe, radio, software, system
 from fieldkit.trial.check.report import LAPTOP, Report
 from fieldkit.trial.check.software import Probed
 from fieldkit.trial.plan import Plan
@@ -162,6 +162,8 @@ def _check(
         software.check_agent(plan, role, sections, shell, report)
         if not all_checks:
             return
+        from fieldkit.trial.check import time_sources  # noqa: PLC0415 (a trial does not need it)
+
         stage = time_sources.CHECK
         time_sources.judge(time_sources.read_reports(shell), report)
         for point in plugins.entry_points(plugins.CHECKS):

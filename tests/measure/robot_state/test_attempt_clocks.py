@@ -100,7 +100,7 @@ def test_robots_without_sources_have_no_marks(tmp_path: Path) -> None:
         write(tmp_path, role)
     measured = measure(tmp_path)
     assert "marks" not in measured.values
-    assert measured.missing["sender_time_source"] == "no program of the robot reports on its clock"
+    assert measured.missing["sender_time_source"] == "no program of the robot reports it"
 
 
 def test_an_exchange_bounds_the_offset_and_a_clock_that_was_set_has_none() -> None:

@@ -5,7 +5,16 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.measure.robot_state import chrony, clocks, health, neighbourhood, ptp, snapshots, timesyncd
+from fieldkit.measure.robot_state import (
+    attempt_states,
+    chrony,
+    clocks,
+    health,
+    neighbourhood,
+    ptp,
+    snapshots,
+    timesyncd,
+)
 from fieldkit.measure.robot_state.snapshots import SourceOutput
 from tests.helpers.paths import DATA
 
@@ -153,11 +162,16 @@ def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:
 def test_the_script_has_the_command_of_each_parser() -> None:
     script = (Path(snapshots.__file__).parents[2] / "remote" / "snapshot.sh").read_text(encoding="ascii")
     names = set(re.findall(r"source_of ([a-z-]+) ", script))
+    assert names == attempt_states.CLOCK_SOURCES | attempt_states.RADIO_SOURCES | {health.NAME, health.THROTTLED_NAME}
+
+
+def test_the_names_of_sources_that_need_a_parser_are_complete() -> None:
     of_clocks = {chrony.NAME, timesyncd.NAME, timesyncd.STATE_NAME, ptp.NAME}
-    of_radio = {
+    assert of_clocks == attempt_states.CLOCK_SOURCES
+    of_radio = (
         neighbourhood.INFO_NAME,
         neighbourhood.REGULATORY_NAME,
         neighbourhood.SCAN_NAME,
         neighbourhood.SURVEY_NAME,
-    }
-    assert names == of_clocks | of_radio | {health.NAME, health.THROTTLED_NAME}
+    )
+    assert set(of_radio) == attempt_states.RADIO_SOURCES

@@ -8,7 +8,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.robot_state import attempt_states, neighbourhood
-from fieldkit.measure.robot_state.neighbourhood import Channel, Neighbourhood
+from fieldkit.measure.robot_state.neighbourhood import RadioState, WifiChannel
 from fieldkit.measure.robot_state.snapshots import SourceOutput
 from tests.helpers.paths import DATA
 
@@ -22,7 +22,7 @@ def text(name: str) -> str:
     return (DATA / "iw" / f"{name}.txt").read_text(encoding="utf-8").strip("\n")
 
 
-def parse(info: str = "", scan: str | None = None, survey: str = "", reg: str = "") -> Neighbourhood:
+def parse(info: str = "", scan: str | None = None, survey: str = "", reg: str = "") -> RadioState:
     outputs = {"iw-info": info, "iw-survey": survey, "iw-reg": reg} | ({} if scan is None else {"iw-scan": scan})
     return neighbourhood.parse({name: SourceOutput(output, 0) for name, output in outputs.items()})
 
@@ -42,15 +42,15 @@ def survey(*times: tuple[int, int, int | None]) -> str:
 @pytest.mark.parametrize(
     ("info", "channel"),
     [
-        (text("info-ap"), Channel(1, 2412, 20, 2412)),
-        (text("info-txpower"), Channel(1, 2412, 20, 2412)),
-        (text("info-hwsim-station-6"), Channel(6, 2437, 20, 2437)),
-        (INFO.format(CHANNEL_36), Channel(36, 5180, 80, 5210)),
+        (text("info-ap"), WifiChannel(1, 2412, 20, 2412)),
+        (text("info-txpower"), WifiChannel(1, 2412, 20, 2412)),
+        (text("info-hwsim-station-6"), WifiChannel(6, 2437, 20, 2437)),
+        (INFO.format(CHANNEL_36), WifiChannel(36, 5180, 80, 5210)),
         (text("info-hwsim-down-5"), None),
         (text("no-wifi"), None),
     ],
 )
-def test_the_channel_of_a_radio(info: str, channel: Channel | None) -> None:
+def test_the_channel_of_a_radio(info: str, channel: WifiChannel | None) -> None:
     assert parse(info).channel == channel
 
 
