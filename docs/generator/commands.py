@@ -16,6 +16,7 @@ DOCS: Final = Path(__file__).resolve().parents[1]
 GUIDES: Final = {
     "trial": "field.md",
     "check": "checks.md",
+    "clocks": "robot-state.md",
     "campaign": "campaign.md",
     "resume": "campaign.md",
     "stop": "motion.md",

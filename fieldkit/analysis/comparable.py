@@ -58,6 +58,21 @@ MIXTURE_COLUMNS: Final = frozenset(
 )
 """Columns that `mixtures` needs in addition to the columns that identify conditions."""
 
+MARKS: Final = "marks"
+"""Column with the marks of a repeat: conditions that can explain a difference."""
+NO_MARKS: Final = "none"
+MARK_SEPARATOR: Final = " and "
+_HARMLESS_MARKS: Final = frozenset({"no time source"})
+"""Marks that affect no figure, because fieldkit measures the offsets of clocks itself."""
+
+_RADIO_COLUMNS: Final = (
+    "sender_channel",
+    "receiver_channel",
+    "sender_regulatory_domain",
+    "receiver_regulatory_domain",
+)
+"""Settings of the radios whose difference is noted."""
+
 _MESSAGES: Final = 2
 """Acceptable difference of recorded sizes in messages, because a recorder starts and stops between two messages."""
 
@@ -151,6 +166,10 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
     yield from _file_sizes(a, b)
     yield from _datagram_sizes(a, b)
     yield from _offload_state(a, b)
+    yield from _marks(a, b)
+    for name in _RADIO_COLUMNS:
+        if name in a.texts and name in b.texts:
+            yield from _compare_column(name, a, b, refuses=False)
 
 
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
@@ -213,3 +232,19 @@ def _offload_text(rows: Repeats) -> str:
     if not len(finite):
         return UNKNOWN
     return "on" if (finite > 0).any() else "off"
+
+
+def _marks(a: Repeats, b: Repeats) -> Iterator[Concern]:
+    """Yield a concern for each mark that a different share of the repeats of A and B has.
+
+    It is a note for marks that affect no figure, and if the marks of a run are not known.
+    """
+    if MARKS not in a.texts or MARKS not in b.texts:
+        return
+    of_a, of_b = ([set(marks.split(MARK_SEPARATOR)) for marks in rows.texts[MARKS]] for rows in (a, b))
+    is_known = all({""} != set().union(*of_run) for of_run in (of_a, of_b))
+    for name in sorted(set().union(*of_a, *of_b) - {"", NO_MARKS}):
+        count_a, count_b = (sum(name in marks for marks in of_run) for of_run in (of_a, of_b))
+        if count_a * len(of_b) != count_b * len(of_a):
+            texts = (f"it in {count_a} of {len(of_a)} repeats", f"it in {count_b} of {len(of_b)}")
+            yield Concern(f"{MARKS}, {name}", *texts, (), refuses=is_known and name not in _HARMLESS_MARKS)

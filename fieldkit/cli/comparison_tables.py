@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.analysis import comparison_results, paper_tables, wording
 from fieldkit.analysis.cells import Estimate
-from fieldkit.analysis.comparable import VARIED, Concern
+from fieldkit.analysis.comparable import MARKS, NO_MARKS, VARIED, Concern
 from fieldkit.analysis.compare import Comparison, Difference, Pair, compare
 from fieldkit.analysis.quantities import Quantity, parse_amount, symbols
 from fieldkit.cli import comparison_sides
@@ -37,8 +37,8 @@ def show(arguments: argparse.Namespace) -> int:
     if comparison.refusals and not arguments.force:
         raise ConfigurationError(
             "A and B are not comparable:" + "".join(f"\n  {refusal}" for refusal in comparison.refusals),
-            remedy="run both under the same conditions (to look up a name: fieldkit columns show NAME); "
-            "or, to compare them anyway, add --force",
+            remedy=f"run both under the same conditions (to look up a name: fieldkit columns show NAME)"
+            f"{_without_marks(comparison)}; or, to compare them anyway, add --force",
         )
     for concern in comparison.concerns:
         show_note(f"{_concern_text(comparison, concern)}: {concern}")
@@ -47,6 +47,12 @@ def show(arguments: argparse.Namespace) -> int:
     else:
         print_text(_FORMATS[arguments.format](comparison), end="")
     return THRESHOLD_MISSED if comparison.exceeds_threshold else 0
+
+
+def _without_marks(comparison: Comparison) -> str:
+    """Return the option that leaves out marked repeats, if marks are a reason for the refusal."""
+    has_marks = any(refusal.what.startswith(f"{MARKS}, ") for refusal in comparison.refusals)
+    return f""", or leave out marked repeats: --where '{MARKS} == "{NO_MARKS}"'""" if has_marks else ""
 
 
 def _threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, float]:

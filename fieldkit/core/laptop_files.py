@@ -15,6 +15,7 @@ MEDIUM: Final = "medium.txt"
 AIR: Final = ("air.pcap", "air.csv")
 """Files that a testbed's oracle may write into an attempt's folder (`Oracle.record_air`)."""
 POSITIONS: Final = "positions.json"
+EXCHANGES: Final = "exchanges.txt"
 UNFETCHED: Final = "unfetched.txt"
 """File of each robot: `ROLE-unfetched.txt`."""
 ANSWER: Final = "answer-"
@@ -38,7 +39,7 @@ STEP_ERROR: Final = "step-error.log"
 """Traceback of an exception that a step raised."""
 
 _NAMES: Final = (
-    *(TRACK, LINK, LATENESS, MEDIUM, *AIR, POSITIONS),
+    *(TRACK, LINK, LATENESS, MEDIUM, *AIR, POSITIONS, EXCHANGES),
     *(PLAN, JOURNAL, MOTION, MANIFEST, TRIAL_CSV, SUMMARY_CSV, PREFLIGHT, STEP_ERROR),
 )
 _RESERVED: Final = re.compile(

@@ -17,11 +17,12 @@
 #                                        wait for the end
 #   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
 #                                        delete OLD, renew the lock (TOKEN `-`: none), check for KIB of free disk space,
-#                                        create DIR, write the state of the host to ROLE-before.txt, and start the job
-#                                        `link`, which samples the Wi-Fi into ROLE-link.txt
-#   job.sh pack  DIR ROLE INTERFACE      stop the job `link`, write ROLE-after.txt and hashes, send small files as a tar: first
-#                                        the hashes and the list of large files; then fail if a job for which `stop` did not
-#                                        wait has failed
+#                                        create DIR, write the state of the host to ROLE-before.txt and a snapshot to
+#                                        ROLE-sources-before.txt, and start the job `link`, which samples the Wi-Fi
+#                                        into ROLE-link.txt
+#   job.sh pack  DIR ROLE INTERFACE      stop the job `link`, write ROLE-after.txt, ROLE-sources-after.txt and hashes, send
+#                                        small files as a tar: first the hashes and the list of large files; then fail if a
+#                                        job for which `stop` did not wait has failed
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE; pieces are counted from 0
 #   job.sh sum   DIR FILE                print the hash of FILE
 #   job.sh end   DIR                     stop all running jobs of DIR; no other job can start there
@@ -43,6 +44,8 @@
 #                                        list the states: `stationary`, `landed`, `land` or `return` (in progress), `ended`,
 #                                        `silent`, or `alarm` (a drone may be in the air)
 #   job.sh life_signs FILE               print FILE and the time since boot
+#   job.sh snapshot                      print the outputs of all sources of the robot's state, see `snapshot.sh`
+#   job.sh health                        print the load, temperatures, batteries and free disk space of this computer
 #   job.sh needs                         fail if a program is missing that this script calls
 #   job.sh command_loop                  print `ready`; then run each line of standard input, `NONCE [held] VERB WORD...`, as
 #                                        if the script was called with it. On both streams NONCE precedes the output, and

@@ -76,6 +76,10 @@ unwritten() { # fail with the reason why file $1 cannot be written
     fail "cannot write $1${why:+: ${why##*: }}"
 }
 
+reported() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
+    [ -e "$1" ] || snapshot ".sources-$$" "$2" >"$1" 2>/dev/null || unwritten "$1"
+}
+
 begin() {
     dir=$1 role=$2 interface=$3 kib=$4 token=$5 old=${6-}
     [ -z "$old" ] || remove "$old" # before the lock is checked, so that fetched files are deleted also without a lock
@@ -88,6 +92,7 @@ begin() {
         lasting .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
+    reported "$role-sources-before.txt" "$interface"
     watch "$role" "$interface"
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
@@ -99,6 +104,7 @@ pack() {
     gone
     [ -e "$role-after.txt" ] || { echo "==> jobs <==" && endings && state "$3"; } >"$role-after.txt" 2>&1 ||
         unwritten "$role-after.txt"
+    reported "$role-sources-after.txt" "$3"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"

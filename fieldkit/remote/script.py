@@ -18,7 +18,16 @@ HOME: Final = ".fieldkit"
 REPLY_S: Final = 10.0
 """Timeout for the answer of a robot, in addition to the duration of the command."""
 
-_PARTS: Final = ("common.sh", "leader.sh", "lock.sh", "evidence.sh", "telemetry.sh", "motion.sh", "job.sh")
+_PARTS: Final = (
+    "common.sh",
+    "leader.sh",
+    "lock.sh",
+    "snapshot.sh",
+    "evidence.sh",
+    "telemetry.sh",
+    "motion.sh",
+    "job.sh",
+)
 _FOLDER: Final = Path(__file__).parent
 
 SCRIPT: Final = b"\n".join(_FOLDER.joinpath(name).read_bytes() for name in _PARTS)

@@ -85,6 +85,9 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         yield Caution(
             f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
         )
+    if marked := [reason for reason in valid.texts.get("marks_reason", ()) if reason]:
+        count = format_count(len(marked), "valid repeat")
+        yield Caution(f"{count} marked: conditions of the robots can explain differences.", _counted(marked))
     yield from map(Caution, mixtures(repeats))
     if (version_count := len(np.unique(repeats.numbers["schema_version"]))) > 1:
         yield Caution(

@@ -7,7 +7,9 @@ from typing import Final
 from fieldkit.core import columns
 from fieldkit.core.columns import Column, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import FIXED_ROLES, Role, sort_roles
 from fieldkit.measure.evidence import link, oracle_delays, outage_columns
+from fieldkit.measure.robot_state import state_columns
 from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
@@ -96,6 +98,12 @@ def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
     return tuple(column for step in steps for column in of_step(step) if column.name not in _common_columns())
 
 
+def of_robots(roles: Iterable[Role]) -> tuple[Column, ...]:
+    """Return the columns of the reports of robots on their clocks and computers, and of the marks that they cause."""
+    of_roles = (column for role in sort_roles(roles) for column in state_columns.declare_columns(role))
+    return (*state_columns.MARK_COLUMNS, *of_roles)
+
+
 def filled_by(steps: Iterable[Step]) -> tuple[Column, ...]:
     """Return the columns of a trial.csv that these steps, the testbed or the plan fill, in order."""
     step_columns = [column for step in steps for column in of_step(step)]
@@ -121,12 +129,12 @@ def column_conflict(column: Column, filled: Collection[str]) -> str | None:
 
 @cache
 def installed() -> tuple[Column, ...]:
-    """Return the columns of every trial, and the columns that step kinds of other packages declare.
+    """Return the columns of every trial, of robots in fixed roles, and of step kinds of other packages.
 
     Raises:
         ConfigurationError: As for `step_types`, or a kind declares an invalid column, or one that exists already.
     """
-    by_name = dict(_common_columns())
+    by_name = {**_common_columns(), **{column.name: column for column in of_robots(FIXED_ROLES)}}
     for kind, step in step_types().items():
         for column in step.columns:
             declaration_error = column.declaration_error()

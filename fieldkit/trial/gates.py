@@ -8,10 +8,11 @@ from typing import Final
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS
 from fieldkit.core.columns import Column, Measured, cell, step_prefixed
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Lateness, RepeatId
+from fieldkit.core.model import Lateness, RepeatId, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
 from fieldkit.measure.positions import position_columns
+from fieldkit.measure.robot_state import attempt_states
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.view import View
 from fieldkit.trial import hosts
@@ -90,6 +91,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
             result = Measured.all_missing(columns, reason)
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
+    names = {role: scene.robot(role).name for role in sort_roles(plan.procedure.roles())}
+    problems += attempt_states.problems(evidence, names)
+    measured = attempt_states.measure(evidence, names, measured)
     # Otherwise an optional file would count as missing, and the error of its reader would be lost.
     problems += (
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)

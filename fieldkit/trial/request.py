@@ -13,7 +13,7 @@ from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
 from fieldkit.trial import step_packages
-from fieldkit.trial.columns import OTHERS, of_steps
+from fieldkit.trial.columns import OTHERS, of_robots, of_steps
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.hashes import code_hash, data_hash
 from fieldkit.trial.plan import Plan
@@ -114,7 +114,9 @@ def make_plan(
         lab_bytes=lab_bytes,
         simulators=dict(simulators),
         step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
-        columns=freeze((*others, *of_steps(placed.step for placed in procedure.walk()))) or None,
+        columns=freeze(
+            (*others, *of_steps(placed.step for placed in procedure.walk()), *of_robots(procedure.roles()))
+        ),
     )
     plan.program_copies()  # raises before robots are started if a step of another package cannot give its commands
     return plan

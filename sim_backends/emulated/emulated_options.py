@@ -35,6 +35,9 @@ def uses_debian_ros(choice: RosChoice) -> bool:
     return choice is RosChoice.DEBIAN
 
 
+ScriptName = Annotated[str, schema.pattern_field(r"^[A-Za-z0-9][A-Za-z0-9._+-]{0,40}$", "the name of a program")]
+
+
 class RobotOptions(Strict):
     """Tool variants of one robot; for a tool that is not named, the robot uses the tool of this machine.
 
@@ -46,6 +49,8 @@ class RobotOptions(Strict):
         netcat: `traditional`, `openbsd`, `ncat` or `busybox`: its only netcat, installed as `nc` and under its own
             name.
         ping: `iputils` or `busybox`.
+        scripts: Programs that only this robot has, as shell scripts by name, which replace those of this machine:
+            `{vcgencmd: echo throttled=0x50005}`. See [state of the robots](robot-state.md#emulated-robots).
     """
 
     ssh: SshServer = "openssh"
@@ -53,6 +58,7 @@ class RobotOptions(Strict):
     userland: Userland = "gnu"
     netcat: Netcat | None = None
     ping: Ping | None = None
+    scripts: dict[ScriptName, str] = Field(default_factory=dict)
 
     def programs(self) -> set[str]:
         """Return the programs that this machine must have for these variants, besides those that every lab needs."""

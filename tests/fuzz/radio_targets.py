@@ -8,10 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from fieldkit.core.columns import cell
+from fieldkit.core.columns import Measured, cell
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import LinkSample, Role
+from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, program_output, robot_link_samples
+from fieldkit.measure.robot_state import attempt_states, state_columns
 from tests.fuzz.harness import Target
 from tests.helpers.paths import DATA
 
@@ -79,6 +81,26 @@ def _match_expression(data: bytes, place: Path) -> None:
         program_output.by_expression(place / "run.txt", expression)
 
 
+def _measure_states(data: bytes, place: Path) -> None:
+    """Measure an attempt from a mutated snapshot; all values must be valid in the table."""
+    for when in ("before", "after"):
+        (place / f"sender-sources-{when}.txt").write_bytes(data)
+    evidence, names = AttemptEvidence(place), {Role.SENDER: "rover"}
+    measured = attempt_states.measure(evidence, names, Measured())
+    list(attempt_states.problems(evidence, names))
+    for column in (*state_columns.MARK_COLUMNS, *state_columns.declare_columns("sender")):
+        assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
+
+
+def _snapshot(**paths: str) -> bytes:
+    """A snapshot with stored outputs, by name of the source with `_` for `-`."""
+    text = ""
+    for name, path in paths.items():
+        lines = (DATA / path).read_text(encoding="utf-8").split("\n")
+        text += f"==> {name.replace('_', '-')} <==\n" + "".join(f" {line}\n" for line in (*lines, "code 0"))
+    return text.encode()
+
+
 def radio_targets() -> Iterator[Target]:
     """Yield the targets."""
     samples = robot_link_samples.parse(_SAMPLES_TEXT)
@@ -93,5 +115,13 @@ def radio_targets() -> Iterator[Target]:
         yield Target(f"own-{name}".replace(".", "_"), (seed,), partial(_read_robot_samples, name))
     outputs = (*sorted(path.read_bytes() for path in _IW.glob("*.txt")), _WIRELESS.encode())
     yield Target("telemetry", outputs, _parse_iw)
+    snapshots = (
+        _snapshot(chrony="chrony/slow-2023.txt", ptp="linuxptp/current-1.2.txt"),
+        _snapshot(chrony="chrony/synchronized-4.3.csv", timesyncd="timedatectl/status-245.txt"),
+        _snapshot(iw_info="iw/info-hwsim-station-6.txt", iw_scan="iw/scan-hwsim-5.txt", iw_reg="iw/reg-balena.txt"),
+        b"==> health <==\n cpu  1 0 5 8 5 0 0 0 0 0\n temperature 48312\n battery 80 12300000\n disk 9\n code 0\n",
+        b"==> vcgencmd <==\n throttled=0x50005\n code 0\n",
+    )
+    yield Target("robot-state", snapshots, _measure_states)
     yield Target("json-path", _PATHS, _evaluate_path)
     yield Target("expression", _EXPRESSIONS, _match_expression)

@@ -34,6 +34,7 @@ pytestmark = pytest.mark.emulated
 
 FOLDER = jobs.work_folder("trial", "udp-01-1")
 LINK_JOB = "link"
+SNAPSHOTS = ("sender-sources-after.txt", "sender-sources-before.txt")
 LINK_FILES = {"sender-link.txt.gz"} if shutil.which("iw", path=f"{os.environ['PATH']}:/usr/sbin:/sbin") else set()
 """Samples of the link, which fieldkit/remote/telemetry.sh takes if iw is installed."""
 
@@ -496,7 +497,7 @@ def test_folder_is_fetched_completely_with_the_host_state_before_and_after(shell
     into = tmp_path / "local"
     into.mkdir()
     fetching.fetch(shell, FOLDER, "sender", "lo", into)
-    expected = {"job.log", "scan.bag", "sender-after.txt", "sender-before.txt", *LINK_FILES}
+    expected = {"job.log", "scan.bag", "sender-after.txt", "sender-before.txt", *SNAPSHOTS, *LINK_FILES}
     assert {path.name for path in into.iterdir()} == expected
     assert (into / "scan.bag").read_bytes() == b"abc"
     assert "==> /proc/net/snmp <==\n" in (into / "sender-before.txt").read_text(encoding="utf-8")
@@ -576,6 +577,7 @@ def test_regular_files_in_one_level_of_folders_are_fetched(shell: LocalShell, tm
             "scan/scan_0.db3",
             "sender-after.txt",
             "sender-before.txt",
+            *SNAPSHOTS,
             *LINK_FILES,
         }
     assert (into / "scan" / "scan_0.db3").read_text(encoding="ascii") == "b\n"

@@ -70,7 +70,10 @@ def names(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
 
 
-WHOLE = {"camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sender-after.txt"}
+WHOLE = {
+    *("camera.bag", "scan/scan_0.db3", "small.bag", "sender-before.txt", "sender-after.txt"),
+    *("sender-sources-before.txt", "sender-sources-after.txt"),
+}
 
 
 def test_large_files_are_fetched_in_pieces_and_small_ones_in_an_archive(robot: LossyRobot, into: Path) -> None:

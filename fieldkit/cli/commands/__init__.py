@@ -18,6 +18,7 @@ COMMANDS: Final[Mapping[str, str]] = MappingProxyType(
         "init": "write a commented site file",
         "enroll": "pin a robot's host key in the site file",
         "check": "check everything that a trial needs",
+        "clocks": "list the clocks of all robots and what sets them",
         "trial": "run a procedure at one or more distances",
         "campaign": "run the trials of a campaign file, or continue them",
         "resume": "continue a trial that stopped",

@@ -17,6 +17,7 @@ from fieldkit.core.errors import (
 from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.robot_state import exchanges
 from fieldkit.steps.motions import STOPPED, Motions
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import gates, hosts, size, step_errors, store
@@ -84,7 +85,8 @@ class Attempts:
         remote = started.remote(self._plan.trial)
         self._reached = None
         with self._storing_interrupted(started, partial):
-            self._robots.begin(remote, old=self._last_remote or None)
+            times_ns = self._robots.begin(remote, old=self._last_remote or None)
+            (partial / exchanges.FILE).write_text(exchanges.text(times_ns), encoding="ascii")
             failure = self._measure(started, remote, partial)
             reasons = [failure.located] if failure else []
             if reasons:

@@ -162,6 +162,10 @@ def _check(
         software.check_agent(plan, role, sections, shell, report)
         if not all_checks:
             return
+        from fieldkit.trial.check import time_sources  # noqa: PLC0415 (a trial does not need it)
+
+        stage = time_sources.CHECK
+        time_sources.judge(time_sources.read_reports(shell), report)
         for point in plugins.entry_points(plugins.CHECKS):
             stage = point.name
             robot_check: RobotCheck = plugins.load(point)

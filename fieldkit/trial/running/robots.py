@@ -1,7 +1,7 @@
 """The robots of a trial during one attempt: create folders, run the steps, fetch the evidence, clean up."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -64,10 +64,13 @@ class Robots:
         """The control connection of each robot of the cast."""
         return self._testbed.shells
 
-    def begin(self, remote: str, *, old: str | None) -> None:
+    def begin(self, remote: str, *, old: str | None) -> Mapping[Role, tuple[int, int]]:
         """Create an attempt's folder `remote` on each robot, and remove the folder `old` unless it was not fetched.
 
         Programs of the lab are copied now, before the first step, so that the copies do not load the radio later.
+
+        Returns:
+            The laptop's clock before the request to each robot and after its answer; see `robot_state.exchanges`.
 
         Raises:
             FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
@@ -75,7 +78,10 @@ class Robots:
         plan = self._plan
         puts = [(put, put.program.content()) for put in plan.program_copies()]
 
+        times_ns: dict[Role, tuple[int, int]] = {}
+
         def make(role: Role) -> None:
+            request_ns = time.time_ns()
             self._boots[role] = evidence.begin(
                 self.shells[role],
                 remote,
@@ -85,6 +91,7 @@ class Robots:
                 token=plan.session,
                 need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
             )
+            times_ns[role] = request_ns, time.time_ns()
             for put, content in puts:
                 if put.role == role:
                     from fieldkit.remote import programs  # noqa: PLC0415 (few procedures copy programs)
@@ -93,6 +100,7 @@ class Robots:
                     programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
         self._run_on_all(make)
+        return times_ns
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""

@@ -51,6 +51,7 @@ BUSYBOX: Final = "/usr/bin/busybox"
 SFTP_FOLDER: Final = "/usr/lib/openssh"
 
 _BIN: Final = "/usr/bin"
+_SCRIPTS: Final = f"{STATE}/scripts"
 _PROGRAM_FOLDERS: Final = (_BIN, "/usr/sbin")
 
 _ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
@@ -205,6 +206,8 @@ def mount_programs(spec: RobotSpec) -> None:
         OSError: A link could not be created, or the kernel refused a mount.
         SubprocessError: busybox did not list its applets.
     """
+    for name, script in spec.scripts.items():
+        _write(Path(_SCRIPTS, name), f"#!/bin/sh\n{script}\n", mode=0o755)
     for number, (folder, layer) in enumerate(program_layers(spec).items()):
         source = Path(STATE, f"programs-{number}")
         source.mkdir(mode=0o755)
@@ -233,6 +236,7 @@ def program_layers(spec: RobotSpec) -> dict[str, Layer]:
         programs["ping"] = BUSYBOX
     elif spec.ping == "iputils":
         programs.pop("ping", None)
+    programs |= {name: f"{_SCRIPTS}/{name}" for name in spec.scripts}
     if not spec.sftp:
         layers[SFTP_FOLDER] = {"sftp-server": None}
     return {folder: layer for folder, layer in layers.items() if layer}

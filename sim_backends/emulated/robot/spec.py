@@ -138,6 +138,7 @@ class RobotSpec:
         sftp: True if that server offers SFTP.
         userland: Source of `sh`, `tar`, `ip` and similar tools.
         netcat: Its only netcat, as `nc` and by its full name; None for the netcat of this machine or of the userland.
+        scripts: Programs that only this robot has: shell scripts by name.
         ping: Its `ping`; None for the `ping` of this machine or of the userland.
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
         ros2: Its ROS 2 over the radio; None if it has none.
@@ -179,6 +180,7 @@ class RobotSpec:
     userland: Userland = "gnu"
     netcat: Netcat | None = None
     ping: Ping | None = None
+    scripts: dict[str, str] = field(default_factory=dict)
     mesh_hello_s: float | None = None
     ros2: Ros2Spec | None = None
     routes_zenoh: bool = False

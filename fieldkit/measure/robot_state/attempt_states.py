@@ -1,0 +1,102 @@
+"""Measure the state of the robots before and after an attempt, and mark the attempt.
+
+Parsers are imported only if a robot has their source.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from fieldkit.core.columns import Measured, plain_name
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.robot_state import exchanges, health, marks, snapshots
+from fieldkit.measure.robot_state.marks import RepeatMark
+from fieldkit.measure.robot_state.snapshots import Snapshot
+from fieldkit.measure.robot_state.state_columns import declare_columns
+
+CLOCK_SOURCES: Final = frozenset(("chrony", "ptp", "timesyncd", "timedatectl"))
+RADIO_SOURCES: Final = frozenset(("iw-info", "iw-reg", "iw-scan", "iw-survey"))
+_ONE_WAY: Final = "one_way_withheld"
+_OFFSET: Final = "clock_offset_s"
+_NO_SOURCE: Final = "no program of the robot reports it"
+
+_Snapshots = Mapping[Role, tuple[Snapshot, Snapshot]]
+"""Snapshots of each robot before and after an attempt; empty if they are missing."""
+
+
+def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Measured) -> Measured:
+    """Return the columns of an attempt, with those of the robots' reports.
+
+    If a one-way delay is withheld because no offset of the clocks is known, its reason also names wrong clocks and
+    missing time sources.
+
+    Args:
+        evidence: The attempt.
+        names: Name of the robot in each role.
+        measured: The columns of its steps.
+    """
+    of_robots = {role: snapshots.of_attempt(evidence, role) for role in names}
+    of_clocks, clock_marks, has_clocks = _measure_clocks(evidence, names, of_robots, measured)
+    computers = {role: (health.parse(before), health.parse(after)) for role, (before, after) in of_robots.items()}
+    flags = {role: health.flags_during(*states) for role, states in computers.items()}
+    of_radios, radio_marks, has_airtime = _measure_radios(names, of_robots)
+    all_marks = (*clock_marks, *health.marks(names, flags), *radio_marks)
+    is_known = has_clocks or has_airtime or any(value is not None for value in flags.values())
+    measured = _with_clock_reasons(measured, "; ".join(mark.reason for mark in clock_marks)) | of_clocks | of_radios
+    for role in names:
+        measured |= health.measure(role, *computers[role]) | Measured.all_missing(declare_columns(role), _NO_SOURCE)
+    return measured | marks.measure(all_marks, is_known=is_known)
+
+
+def problems(evidence: AttemptEvidence, names: Mapping[Role, str]) -> Iterator[str]:
+    """Yield each reason why the states of the robots make an attempt void; arguments as for `measure`."""
+    for role, name in names.items():
+        pair = snapshots.of_attempt(evidence, role)
+        if any(RADIO_SOURCES & snapshot.keys() for snapshot in pair):
+            from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (few robots have iw)
+
+            if reason := neighbourhood.channel_problem(tuple(map(neighbourhood.parse, pair))):
+                yield f"{name}: {reason}"
+
+
+def _measure_clocks(
+    evidence: AttemptEvidence, names: Mapping[Role, str], of_robots: _Snapshots, measured: Measured
+) -> tuple[Measured, list[RepeatMark], bool]:
+    """Return the columns of the clocks, their marks, and whether a program reports on a clock."""
+    offsets = {role: exchanges.laptop_offset(evidence, role) for role in names}
+    result = Measured()
+    for role, offset in offsets.items():
+        result |= exchanges.measure(role, offset)
+    has_source = any(CLOCK_SOURCES & snapshot.keys() for pair in of_robots.values() for snapshot in pair)
+    if not has_source and not any(offset and exchanges.is_wrong(offset) for offset in offsets.values()):
+        return result, [], False
+    from fieldkit.measure.robot_state import clocks  # noqa: PLC0415 (see the docstring)
+
+    robot_clocks = {role: clocks.read(name, of_robots[role], offsets[role]) for role, name in names.items()}
+    for role, clock in robot_clocks.items():
+        result |= clocks.measure(role, clock)
+    is_known = any(clock.report is not None for clock in robot_clocks.values())
+    return result, list(clocks.marks(robot_clocks, measured)), is_known
+
+
+def _measure_radios(names: Mapping[Role, str], of_robots: _Snapshots) -> tuple[Measured, list[RepeatMark], bool]:
+    """Return the columns of the radios, their marks, and whether an airtime is known."""
+    if not any(RADIO_SOURCES & snapshot.keys() for pair in of_robots.values() for snapshot in pair):
+        return Measured(), [], False
+    from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (see the docstring)
+
+    radios = {role: tuple(map(neighbourhood.parse, pair)) for role, pair in of_robots.items()}
+    result = Measured()
+    for role, states in radios.items():
+        result |= neighbourhood.measure(role, states)
+    is_known = any(state.others_share is not None for states in radios.values() for state in states)
+    return result, list(neighbourhood.marks(names, radios)), is_known
+
+
+def _with_clock_reasons(measured: Measured, reasons: str) -> Measured:
+    values = dict(measured.values)
+    for name, value in measured.values.items():
+        offset_name = name.removesuffix(_ONE_WAY) + _OFFSET
+        if reasons and plain_name(name) == _ONE_WAY and offset_name not in measured.values:
+            values[name] = f"{value}; {reasons}"
+    return Measured(values, measured.missing)

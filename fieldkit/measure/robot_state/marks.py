@@ -1,0 +1,31 @@
+"""Marks of an attempt: conditions of the robots that can explain a difference between repeats."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from fieldkit.core.columns import Measured, Value
+from fieldkit.measure.robot_state.state_columns import MARK_SEPARATOR, MARKS, NO_MARKS
+
+
+@dataclass(frozen=True)
+class RepeatMark:
+    """One mark.
+
+    Attributes:
+        name: Its name in the column `marks`.
+        reason: A sentence with the name of the robot, without a full stop.
+    """
+
+    name: str
+    reason: str
+
+
+def measure(marks: Iterable[RepeatMark], *, is_known: bool) -> Measured:
+    """Return the columns of the marks; `is_known` if a source answered, so that the value without marks is `none`."""
+    all_marks = list(marks)
+    names = MARK_SEPARATOR.join(dict.fromkeys(mark.name for mark in all_marks))
+    reasons = "; ".join(dict.fromkeys(mark.reason for mark in all_marks))
+    values: dict[str, Value | None] = {MARKS: names or (NO_MARKS if is_known else None)}
+    return Measured.from_optional(values, "no source of a robot reports on its state") | Measured.from_optional(
+        {"marks_reason": reasons or None}, "the repeat has no mark"
+    )

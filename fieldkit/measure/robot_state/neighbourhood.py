@@ -1,0 +1,194 @@
+"""Networks and airtime of others on the channel of a robot's radio, before and after an attempt, and its channel.
+
+`iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw); it
+sends no packet. Own networks have the state `associated` or `joined`, or the radio's own address. `iw dev INTERFACE
+survey dump` is printed twice, 0.5 s apart, while the robots send nothing for the attempt: the time in which the
+channel was busy, without own transmissions, is the airtime of others (and of own beacons). A driver that resets its
+counters gives no value.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from fieldkit.core.columns import Measured, Value
+from fieldkit.core.model import Role
+from fieldkit.measure.robot_state.marks import RepeatMark
+from fieldkit.measure.robot_state.snapshots import Snapshot
+
+INFO_NAME: Final = "iw-info"
+"""Name of the source with the output of `iw dev INTERFACE info`."""
+REGULATORY_NAME: Final = "iw-reg"
+"""Name of the source with the output of `iw reg get`."""
+SCAN_NAME: Final = "iw-scan"
+"""Name of the source with the networks on the channel."""
+SURVEY_NAME: Final = "iw-survey"
+"""Name of the source with two outputs of `iw dev INTERFACE survey dump`."""
+
+BUSY_CHANNEL: Final = "busy channel"
+BUSY_SHARE: Final = 0.2
+"""Share of the airtime that others use above which a repeat is marked."""
+
+_CHANNEL: Final = re.compile(
+    r"^[ \t]*channel ([0-9]{1,3}) \(([0-9]{4,5})(?:\.[0-9])? MHz\), width: ([0-9]{1,3}) MHz(?: \(no HT\))?"
+    r"(?:, center1: ([0-9]{4,5}))?",
+    re.MULTILINE | re.ASCII,
+)
+_ADDRESS: Final = re.compile(r"^[ \t]*addr ([0-9a-f:]{17})$", re.MULTILINE | re.ASCII)
+_COUNTRY: Final = re.compile(r"^country ([A-Z0-9]{2}): ", re.MULTILINE | re.ASCII)
+_NETWORK: Final = re.compile(
+    r"^BSS ([0-9a-f:]{17}) ?\(on [^)\n]{1,20}\)(?: -- ([a-z ]{1,20}))?$", re.MULTILINE | re.ASCII
+)
+_FREQUENCY: Final = re.compile(r"^[ \t]*freq: ([0-9]{4,5})(?:\.[0-9])?$", re.MULTILINE | re.ASCII)
+_SIGNAL: Final = re.compile(r"^[ \t]*signal: (-[0-9]{1,3}(?:\.[0-9]{1,2})?) dBm$", re.MULTILINE | re.ASCII)
+_LAST_SEEN: Final = re.compile(r"^[ \t]*last seen: ([0-9]{1,9}) ms ago$", re.MULTILINE | re.ASCII)
+_SURVEY: Final = re.compile(r"^Survey data from ", re.MULTILINE)
+_TIME: Final = re.compile(
+    r"^[ \t]*channel (active|busy|transmit) time:[ \t]*([0-9]{1,15}) ms$", re.MULTILINE | re.ASCII
+)
+_IN_USE: Final = "[in use]"
+_SEPARATOR: Final = "=="
+"""Line between the two outputs of the survey."""
+_STALE_MS: Final = 5000
+"""Age from which a network in the list of a scan was not received by this scan."""
+_HALF_WIDTH_MHZ: Final = 10.0
+"""Half of the width of the channel on which every network sends its beacons."""
+
+
+@dataclass(frozen=True)
+class WifiChannel:
+    """Channel of a radio.
+
+    Attributes:
+        number: Its number.
+        frequency_mhz: Centre of its primary channel of 20 MHz.
+        width_mhz: Its width.
+        centre_mhz: Its centre.
+    """
+
+    number: int
+    frequency_mhz: int
+    width_mhz: int
+    centre_mhz: int
+
+    def __str__(self) -> str:
+        return f"{self.number} ({self.frequency_mhz} MHz), width {self.width_mhz} MHz"
+
+    def overlaps(self, frequency_mhz: float) -> bool:
+        """Return True if the beacons of a network at this frequency are in the channel, at least in part."""
+        return abs(frequency_mhz - self.centre_mhz) < self.width_mhz / 2 + _HALF_WIDTH_MHZ
+
+
+@dataclass(frozen=True)
+class RadioState:
+    """State of a radio and its channel at one time; attributes are None if unknown.
+
+    Attributes:
+        channel: Channel of the radio.
+        country: Regulatory domain: two letters of the country, `00` for the world.
+        signals_dbm: Received power of each network of others on the channel; None in it if it is not reported.
+        others_share: Share of the airtime that was busy without own transmissions.
+    """
+
+    channel: WifiChannel | None = None
+    country: str | None = None
+    signals_dbm: tuple[float | None, ...] | None = None
+    others_share: float | None = None
+
+
+def parse(snapshot: Snapshot) -> RadioState:
+    """Return the state in a snapshot."""
+    info, regulatory, scan, survey = (
+        "" if (output := snapshot.get(name)) is None or output.failure else output.text
+        for name in (INFO_NAME, REGULATORY_NAME, SCAN_NAME, SURVEY_NAME)
+    )
+    channel = _channel(info)
+    own = _ADDRESS.search(info)
+    has_scan = (output := snapshot.get(SCAN_NAME)) is not None and output.failure is None and channel is not None
+    country = _COUNTRY.search(regulatory)
+    return RadioState(
+        channel,
+        country[1] if country else None,
+        _signals(scan, channel, own[1] if own else "") if has_scan and channel is not None else None,
+        _others_share(survey),
+    )
+
+
+def _channel(info: str) -> WifiChannel | None:
+    match = _CHANNEL.search(info)
+    if match is None:
+        return None
+    frequency_mhz = int(match[2])
+    return WifiChannel(int(match[1]), frequency_mhz, int(match[3]), int(match[4] or frequency_mhz))
+
+
+def _signals(scan: str, channel: WifiChannel, own_address: str) -> tuple[float | None, ...]:
+    """Return the received power of each network of others that was received on a channel."""
+    parts = _NETWORK.split(scan)
+    signals: dict[str, float | None] = {}
+    for address, state, body in zip(parts[1::3], parts[2::3], parts[3::3], strict=True):
+        frequency, signal, seen = (pattern.search(body) for pattern in (_FREQUENCY, _SIGNAL, _LAST_SEEN))
+        is_stale = seen is not None and int(seen[1]) >= _STALE_MS
+        if state or address == own_address or is_stale or frequency is None:
+            continue
+        if channel.overlaps(float(frequency[1])):
+            signals[address] = None if signal is None else float(signal[1])
+    return tuple(signals.values())
+
+
+def _others_share(survey: str) -> float | None:
+    first, _, second = survey.partition(f"{_SEPARATOR}\n")
+    before, after = _times_ms(first), _times_ms(second)
+    if before is None or after is None:
+        return None
+    active, busy, transmit = (after[name] - before[name] for name in ("active", "busy", "transmit"))
+    if active <= 0 or not 0 <= transmit <= busy:
+        return None
+    return min((busy - transmit) / active, 1.0)
+
+
+def _times_ms(survey: str) -> Mapping[str, int] | None:
+    """Return the times of the channel in use; None if active or busy time is missing."""
+    for section in _SURVEY.split(survey)[1:]:
+        if _IN_USE in section:
+            times = {name: int(value) for name, value in _TIME.findall(section)}
+            return {"transmit": 0, **times} if {"active", "busy"} <= times.keys() else None
+    return None
+
+
+def measure(role: Role, states: Sequence[RadioState]) -> Measured:
+    """Return the columns of the neighbourhood of the robot in a role; of several states the largest values."""
+    channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
+    countries = list(dict.fromkeys(state.country for state in states if state.country))
+    counts = [len(state.signals_dbm) for state in states if state.signals_dbm is not None]
+    signals = [signal for state in states for signal in state.signals_dbm or () if signal is not None]
+    shares = [state.others_share for state in states if state.others_share is not None]
+    values: dict[str, Value | None] = {
+        "channel": ", then ".join(channels) or None,
+        "regulatory_domain": ", then ".join(countries) or None,
+        "other_networks": max(counts, default=None),
+        "other_networks_max_dbm": max(signals, default=None),
+        "others_airtime_share": max(shares, default=None),
+    }
+    prefixed = {f"{role}_{name}": value for name, value in values.items()}
+    return Measured.from_optional(prefixed, "its radio does not report it, or received no other network")
+
+
+def channel_problem(states: Sequence[RadioState]) -> str | None:
+    """Return a sentence if the channel or the regulatory domain changed between two states, or None."""
+    channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
+    countries = list(dict.fromkeys(state.country for state in states if state.country))
+    for what, values in (("channel", channels), ("regulatory domain", countries)):
+        if len(values) > 1:
+            return f"the {what} of its radio changed during the repeat, from {values[0]} to {values[1]}"
+    return None
+
+
+def marks(names: Mapping[Role, str], states_by_role: Mapping[Role, Sequence[RadioState]]) -> Iterator[RepeatMark]:
+    """Yield a mark for each robot on whose channel others use more airtime than `BUSY_SHARE`."""
+    for role, states in states_by_role.items():
+        share = max((state.others_share or 0.0 for state in states), default=0.0)
+        if share > BUSY_SHARE:
+            channel = next((f" on channel {state.channel.number}" for state in states if state.channel), "")
+            yield RepeatMark(BUSY_CHANNEL, f"{names[role]}: others use {100 * share:.0f} % of the airtime{channel}")

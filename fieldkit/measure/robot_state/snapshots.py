@@ -1,0 +1,93 @@
+"""Snapshots of a robot's sources: the outputs of its programs on its clock and computer at one time.
+
+`fieldkit/remote/snapshot.sh` has the command of each source, and writes a snapshot: a line `==> NAME <==` per source,
+then the lines of its output, each after a blank, and ` code CODE` as the last line. A source whose program
+the robot does not have is missing.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from fieldkit.core.model import Role
+from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.evidence import reading
+
+_HEADER: Final = re.compile(r"==> ([a-z][a-z0-9-]{0,30}) <==", re.ASCII)
+_CODE: Final = re.compile(r" code ([0-9]{1,3})", re.ASCII)
+_FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153: "printed too much"}
+"""Failure by exit code: 128 plus SIGKILL or SIGXFSZ."""
+_NOT_EXECUTABLE: Final = (126, 127)
+"""Exit codes of a program that cannot be started: BusyBox finds files that are not executable."""
+MAX_SOURCES: Final = 50
+
+
+@dataclass(frozen=True)
+class SourceOutput:
+    """Output of one source.
+
+    Attributes:
+        text: Its standard output and standard error.
+        code: Its exit code; None if the snapshot was interrupted.
+    """
+
+    text: str
+    code: int | None
+
+    @property
+    def failure(self) -> str | None:
+        """The reason why the source has no value, for example `did not answer in time`; None if it succeeded."""
+        return None if self.code == 0 else _FAILURES.get(self.code, f"failed with exit code {self.code}")
+
+
+Snapshot = Mapping[str, SourceOutput]
+"""Outputs of a robot's sources by name."""
+
+
+def before_file(role: Role) -> str:
+    """Return the name of the file with a robot's snapshot before an attempt."""
+    return f"{role}-sources-before.txt"
+
+
+def after_file(role: Role) -> str:
+    """Return the name of the file with a robot's snapshot after an attempt."""
+    return f"{role}-sources-after.txt"
+
+
+def read(path: Path) -> Snapshot:
+    """Return the snapshot in a file.
+
+    Raises:
+        EvidenceError: The file is missing or cannot be read.
+    """
+    return parse(reading.text(path))
+
+
+def of_attempt(evidence: AttemptEvidence, role: Role) -> tuple[Snapshot, Snapshot]:
+    """Return the snapshots of a robot before and after an attempt; a missing one is empty."""
+    before, after = (evidence.read_or_none(read, file(role)) or {} for file in (before_file, after_file))
+    return before, after
+
+
+def parse(text: str) -> Snapshot:
+    """Return the outputs in the text of a snapshot. If several have the same name, the first is used."""
+    outputs: dict[str, SourceOutput] = {}
+    name, lines = "", list[str]()
+
+    def end_source() -> None:
+        code = _CODE.fullmatch(lines[-1]) if lines else None
+        is_missing = code is not None and int(code[1]) in _NOT_EXECUTABLE
+        if name and name not in outputs and len(outputs) < MAX_SOURCES and not is_missing:
+            body = "\n".join(line.removeprefix(" ") for line in lines[: -1 if code else None])
+            outputs[name] = SourceOutput(body.strip("\n"), int(code[1]) if code else None)
+
+    for line in text.split("\n"):
+        if header := _HEADER.fullmatch(line):
+            end_source()
+            name, lines = header[1], []
+        elif line.startswith(" "):
+            lines.append(line)
+    end_source()
+    return outputs

@@ -1,0 +1,118 @@
+"""Columns of the robots' reports on their state, and the marks of a repeat.
+
+A mark names a condition that can explain a difference between repeats. A marked repeat is valid.
+"""
+
+from typing import Final
+
+from fieldkit.core.columns import BACKGROUND, CLOCK_DIFFERENCE_BOUNDS_S, Column, Figure, Kind, columns
+
+MARKS: Final = "marks"
+MARK_SEPARATOR: Final = " and "
+NO_MARKS: Final = "none"
+"""Value of the column `marks` if sources of the robots answered and report nothing that needs a mark."""
+
+MARK_COLUMNS: Final = columns(
+    160,
+    (
+        MARKS,
+        "text",
+        (
+            "Conditions of the robots that can explain a difference between repeats, joined by `and`: wrong clock, "
+            "no time source, clocks disagree, under-voltage, throttled, busy channel. `none` if the robots report "
+            "none; empty if no robot has a program that reports any."
+        ),
+        Figure("marks", Kind.WORDS, rank=BACKGROUND + 10),
+    ),
+    ("marks_reason", "text", "Reasons of the marks, with the names of the robots; empty without a mark."),
+)
+
+
+def declare_columns(role: str) -> tuple[Column, ...]:
+    """Return the columns of the robot in a role."""
+    return columns(
+        160,
+        (
+            f"{role}_time_source",
+            "text",
+            (
+                f"Program that sets the clock of the {role}, and its time source: `chrony 10.0.0.1`. Empty if it has "
+                "no source."
+            ),
+        ),
+        (
+            f"{role}_time_offset_s",
+            "s",
+            (
+                f"Clock of the {role} minus its time source, reported by that program before or after the repeat, "
+                "whichever may be larger. Empty if it has no source."
+            ),
+            CLOCK_DIFFERENCE_BOUNDS_S,
+        ),
+        (
+            f"{role}_time_error_s",
+            "s",
+            f"Maximum error of {role}_time_offset_s, reported by that program, if the time source is correct.",
+        ),
+        (
+            f"{role}_laptop_offset_s",
+            "s",
+            (
+                f"Clock of the {role} minus the laptop's at the start of the repeat, from one exchange over the "
+                "control connection."
+            ),
+            CLOCK_DIFFERENCE_BOUNDS_S,
+        ),
+        (f"{role}_laptop_offset_error_s", "s", f"Maximum error of {role}_laptop_offset_s."),
+        (
+            f"{role}_cpu_share",
+            "share",
+            f"Share of the processor time of the {role} that was in use during the repeat, by all programs.",
+        ),
+        (
+            f"{role}_temperature_c",
+            "degC",
+            f"Highest temperature of a sensor of the {role} before and after the repeat, in degrees Celsius.",
+            (-100.0, 300.0),
+        ),
+        (
+            f"{role}_power_state",
+            "text",
+            (
+                f"Limits of the processor of the {role} during the repeat: under-voltage, frequency capped, "
+                "throttled, soft temperature limit; `normal` without one. Empty if it is not a Raspberry Pi."
+            ),
+        ),
+        (f"{role}_battery_share", "share", f"Lowest charge of the batteries of the {role} after the repeat."),
+        (f"{role}_battery_v", "V", f"Lowest voltage of the batteries of the {role} after the repeat.", (0.0, 2000.0)),
+        (
+            f"{role}_channel",
+            "text",
+            f"Channel of the radio of the {role} before and after the repeat, with its width.",
+        ),
+        (
+            f"{role}_regulatory_domain",
+            "text",
+            f"Regulatory domain of the radio of the {role}: two letters of the country, `00` for the world.",
+        ),
+        (
+            f"{role}_other_networks",
+            "count",
+            f"Networks of others that the {role} receives on its channel, the larger number of before and after.",
+        ),
+        (
+            f"{role}_other_networks_max_dbm",
+            "dBm",
+            f"Strongest signal of these networks at the {role}; empty without such a network.",
+            (-300.0, 100.0),
+        ),
+        (
+            f"{role}_others_airtime_share",
+            "share",
+            (
+                f"Share of the airtime at the {role} that is busy without its own transmissions, in 0.5 s before and "
+                "after the repeat; the larger one."
+            ),
+        ),
+        (f"{role}_disk_free_bytes", "B", f"Free disk space in the home of the {role} after the repeat."),
+    )

@@ -1,0 +1,84 @@
+# Snapshot of what the programs of a robot report on its state, before and after an attempt.
+#
+# All sources run at the same time, each with a time limit, so a program that hangs delays an attempt by SOURCE_S seconds
+# at most. They use local sockets only and send no packet over a network: chronyc without names (-n), pmc without
+# boundary hops (-b 0), a passive scan. The output has a line `==> NAME <==` per source, then its lines, each after a blank, so that no
+# output can contain such a line; the last one is `code CODE`.
+
+SOURCE_S=2
+SOURCE_BLOCKS=64 # limit of the output of a source, in blocks of 512 or 1,024 bytes
+
+source_of() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
+    [ -d "$folder" ] || mkdir "$folder" || return
+    name=$folder/$1
+    shift
+    {
+        # In another folder, because the timeout of busybox may run a second longer, and this folder is deleted.
+        (ulimit -f "$SOURCE_BLOCKS"; cd / && exec setsid timeout -s KILL "$SOURCE_S" "$@") 2>&1 &
+        wait "$!"
+        code=$?
+        kill -KILL "-$!" # processes that it left, which the timeout of busybox does not end
+        echo
+        echo "code $code"
+    } </dev/null >"$name" 2>/dev/null &
+}
+
+clock_sources() {
+    ! command -v chronyc >/dev/null || source_of chrony chronyc -n -c tracking
+    if [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; then
+        source_of timedatectl timedatectl show
+        source_of timesyncd timedatectl timesync-status
+    fi
+    if command -v pmc >/dev/null; then # its default socket is in a folder that only root can write
+        source_of ptp pmc -u -b 0 -i "/tmp/fieldkit-pmc-$$" \
+            'GET CURRENT_DATA_SET' 'GET TIME_STATUS_NP' 'GET PORT_DATA_SET'
+    fi
+}
+
+health() { # print values of the computer, one a line
+    read -r line </proc/stat && echo "$line"
+    for zone in /sys/class/thermal/thermal_zone*/temp; do
+        read -r value 2>/dev/null <"$zone" && echo "temperature $value"
+    done
+    for supply in /sys/class/power_supply/*; do # the battery of a mouse has the scope Device
+        read -r value 2>/dev/null <"$supply/type" && [ "$value" = Battery ] || continue
+        read -r value 2>/dev/null <"$supply/scope" && [ "$value" = Device ] && continue
+        read -r charge 2>/dev/null <"$supply/capacity" || charge=-
+        read -r voltage 2>/dev/null <"$supply/voltage_now" || voltage=-
+        echo "battery $charge $voltage"
+    done
+    for monitor in /sys/class/hwmon/*; do
+        read -r value 2>/dev/null <"$monitor/name" && [ "$value" = rpi_volt ] || continue
+        read -r value 2>/dev/null <"$monitor/in0_lcrit_alarm" && echo "undervoltage $value"
+    done
+    (free && echo "disk $free") || :
+}
+
+radio_sources() { # $1 interface
+    command -v iw >/dev/null && info=$(timeout -s KILL "$SOURCE_S" iw dev "$1" info 2>/dev/null) || return 0
+    source_of iw-info iw dev "$1" info
+    source_of iw-reg iw reg get
+    # The channel is read twice while the robots send nothing for an attempt, in which the scan only receives.
+    source_of iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
+    case $info in *"channel "*" ("*" MHz"*) ;; *) return 0 ;; esac
+    info=${info#*channel *" ("}
+    info=${info%%" MHz"*}
+    set -- iw dev "$1" scan freq "${info%.*}" passive
+    [ "$(id -u)" = 0 ] || set -- sudo -n "$@"
+    source_of iw-scan "$@"
+}
+
+snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -: print the outputs of all sources
+    folder=$1
+    (
+        PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
+        export LC_ALL=C
+        clock_sources
+        [ "$2" = - ] || radio_sources "$2"
+        source_of health sh "$self" health
+        ! command -v vcgencmd >/dev/null || source_of vcgencmd vcgencmd get_throttled
+        wait
+        cd "$folder" && awk 'FNR == 1 { print "==> " FILENAME " <==" } { print " " $0 }' *
+        rm -rf -- "../${folder##*/}" "/tmp/fieldkit-pmc-$$"
+    )
+}

@@ -1,0 +1,100 @@
+"""Check of the time sources of robots: what sets each clock, and whether this agrees with the measured offsets."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.measure.robot_clock import Offset, offset
+from fieldkit.measure.robot_state import clocks, snapshots
+from fieldkit.measure.robot_state.clock_report import ClockReport
+from fieldkit.remote import jobs, script
+from fieldkit.remote.shell import Shell
+from fieldkit.steps import clocks as clock_exchanges
+from fieldkit.trial.check import contact
+from fieldkit.trial.check.report import Report
+
+CHECK: Final = "time source"
+
+SNAPSHOT_S: Final = 15.0
+"""Timeout of a snapshot. Its sources end after 2 s; the rest is for a slow connection."""
+
+_NO_PROGRAM: Final = "no program of the robot reports that it sets the clock"
+_INSTALL: Final = "sudo apt-get install chrony   # then add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf"
+_REMEDIES: Final[Mapping[str, str]] = {
+    "chronyd does not run": "sudo systemctl enable --now chrony",
+    "chrony": "chronyc -n sources   # add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf, restart chrony",
+    "systemd-timesyncd": "sudo timedatectl set-ntp true   # and set NTP=ADDRESS in /etc/systemd/timesyncd.conf",
+    "ptp4l": "sudo pmc -u -b 0 'GET PORT_DATA_SET'   # does its network have a PTP master?",
+}
+"""Remedy by problem, or by program."""
+
+
+@dataclass(frozen=True)
+class RobotTime:
+    """Clock of one robot.
+
+    Attributes:
+        offset: Offset from the laptop's clock; None if the robot sent no time.
+        reports: Reports of its programs.
+    """
+
+    offset: Offset | None
+    reports: tuple[ClockReport, ...]
+
+
+def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
+    """Return the reports of a robot's programs on its clock; the job script must be installed.
+
+    Raises:
+        LinkError: The robot did not answer.
+        RobotError: The script failed.
+    """
+    output = script.call(shell, "snapshot", deadline=Deadline.after(SNAPSHOT_S))
+    return clocks.reports(snapshots.parse(output.decode(errors="replace")))
+
+
+def read(shell: Shell) -> RobotTime:
+    """Log in on a robot, and return its clock; raises as `read_reports`."""
+    jobs.install(shell, Deadline.after(contact.CONTACT_S))
+    exchanges = clock_exchanges.exchanges(shell, contact.CONTACT_S)
+    return RobotTime(offset(exchanges) if exchanges else None, read_reports(shell))
+
+
+def judge(reports: Sequence[ClockReport], report: Report, *, all_robots: bool = False) -> None:
+    """Add a finding for each program that sets a robot's clock.
+
+    Args:
+        reports: Reports of its programs.
+        report: Receives the findings.
+        all_robots: Whether to add a finding for a robot without such a program.
+    """
+    for clock_report in reports:
+        if clock_report.problem:
+            remedy = _REMEDIES.get(clock_report.problem) or _REMEDIES.get(clock_report.program, _INSTALL)
+            report.warn(CHECK, clock_report.problem, remedy)
+        else:
+            error = "" if clock_report.error_s is None else f" \N{PLUS-MINUS SIGN} {clock_report.error_s:.6f} s"
+            detail = f"{clock_report.program} follows {clock_report.reference}, {clock_report.offset_s:+.6f} s{error}"
+            report.ok(CHECK, detail)
+    if not reports and all_robots:
+        report.warn(CHECK, _NO_PROGRAM, _INSTALL)
+
+
+def contradictions(times: Mapping[str, RobotTime]) -> Iterator[str]:
+    """Yield a sentence for each pair of robots whose measured offset contradicts the reports of their programs.
+
+    Args:
+        times: Clock by name of the robot.
+    """
+    for (first, first_time), (second, second_time) in combinations(times.items(), 2):
+        if first_time.offset is None or second_time.offset is None:
+            continue
+        measured = Offset(
+            second_time.offset.offset_s - first_time.offset.offset_s,
+            second_time.offset.error_s + first_time.offset.error_s,
+        )
+        reports = clocks.chosen(first_time.reports), clocks.chosen(second_time.reports)
+        if sentence := clocks.contradiction((first, second), reports, measured):
+            yield sentence

@@ -1,0 +1,88 @@
+"""Snapshots of a robot's sources in each userland: outputs, failures, time limits and sizes.
+
+The sources are scripts that print real outputs.
+"""
+
+import shlex
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fieldkit.core.deadline import Deadline
+from fieldkit.measure.robot_state import chrony, clocks, health, snapshots
+from fieldkit.remote import evidence, fetching, jobs, script
+from tests.helpers.paths import DATA
+from tests.helpers.sshd import wait_until
+from tests.helpers.userlands import USERLANDS_OF_LONG_TESTS, LocalShell, userland_path
+
+pytestmark = pytest.mark.emulated
+
+FOLDER = jobs.work_folder("trial", "udp-01-1")
+
+
+@pytest.fixture(params=USERLANDS_OF_LONG_TESTS)
+def shell(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LocalShell]:
+    home = tmp_path / "home"
+    home.mkdir()
+    local_shell = LocalShell(home, userland_path(request.param, tmp_path / "bin"))
+    jobs.install(local_shell, Deadline.after(30))
+    yield local_shell
+    wait_until(lambda: jobs.list_running(local_shell, Deadline.after(30)) == (), Deadline.after(60))
+
+
+def give(tmp_path: Path, name: str, text: str) -> None:
+    """Add a program to the robot."""
+    path = tmp_path / "bin" / name
+    path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
+    path.chmod(0o755)
+
+
+def take(shell: LocalShell) -> snapshots.Snapshot:
+    text = script.call(shell, "snapshot", deadline=Deadline.after(60)).decode()
+    assert not [path for path in (shell.home / ".fieldkit").iterdir() if path.name.startswith(".sources")]
+    return snapshots.parse(text)
+
+
+def test_snapshots_of_an_attempt_are_fetched(shell: LocalShell, tmp_path: Path) -> None:
+    calls = tmp_path / "calls"
+    give(
+        tmp_path,
+        "chronyc",
+        f'echo "$*" >>{shlex.quote(str(calls))}; cat {shlex.quote(str(DATA))}/chrony/none-4.3.csv',
+    )
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    evidence.begin(shell, FOLDER, "sender", "wlan0")
+    (tmp_path / "local").mkdir()
+    fetching.fetch(shell, FOLDER, "sender", "wlan0", tmp_path / "local")
+    for name in ("sender-sources-before.txt", "sender-sources-after.txt"):
+        report = chrony.parse(snapshots.read(tmp_path / "local" / name)["chrony"])
+        assert report.problem == "chrony has no source"
+    assert calls.read_text().splitlines() == ["-n -c tracking"] * 2, "no names are resolved, and no call is repeated"
+
+
+def test_programs_that_hang_fail_or_flood_give_no_value_and_delay_little(shell: LocalShell, tmp_path: Path) -> None:
+    give(tmp_path, "chronyc", "sleep 600")
+    give(tmp_path, "pmc", "yes 'offset 0'")
+    started_s = time.monotonic()
+    taken = take(shell)
+    assert time.monotonic() - started_s < 20, "the limit is 2 s; this machine may be busy"
+    assert taken["chrony"].failure == "did not answer in time"
+    assert taken["ptp"].failure is not None
+    assert len(taken["ptp"].text) <= 64 * 1024
+    assert all(report.offset_s is None for report in clocks.reports(taken))
+
+
+def test_a_robot_without_these_programs_reports_its_computer(shell: LocalShell, tmp_path: Path) -> None:
+    give(tmp_path, "chronyc", "exit 3")
+    (tmp_path / "bin" / "chronyc").chmod(0o644)
+    taken = take(shell)
+    assert "chrony" not in taken
+    state = health.parse(taken)
+    assert state.all_ticks is not None
+    assert state.busy_ticks is not None
+    assert 0 < state.busy_ticks < state.all_ticks
+    assert state.disk_free_bytes is not None
+    assert state.disk_free_bytes == pytest.approx(shutil.disk_usage(shell.home).free, rel=0.2)
