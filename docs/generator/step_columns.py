@@ -7,6 +7,7 @@ from docs.generator.markdown import page, table
 from fieldkit.core.columns import Column
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import iperf3, ping
+from fieldkit.measure.telemetry import telemetry_columns
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
 from fieldkit.ros.bags import recorded_topics
@@ -21,6 +22,7 @@ STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`record` with `reception: true`": recorded_topics.COLUMNS,
     "a flow inside `fault`": recoveries.declare_columns("FLOW", FaultKind.REBOOT),
     "`mavlink`": tlog.COLUMNS,
+    "any step, with `telemetry` in a robot's profile": telemetry_columns.COLUMNS,
     "`fly`": fly_log.COLUMNS,
     "`move` of a robot that fieldkit drives": drive_log.COLUMNS,
 }

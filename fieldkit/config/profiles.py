@@ -11,6 +11,9 @@ from fieldkit.config.sections import Sectioned
 from fieldkit.config.wifi_phy import WifiPhy, check_standard
 from fieldkit.core import plugins
 
+TELEMETRY: Final = "telemetry"
+"""Key of the section with sources of the state of a radio without `iw` (`fieldkit.measure.telemetry`)."""
+
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
 TopicName = Annotated[

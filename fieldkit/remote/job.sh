@@ -256,7 +256,7 @@ main() {
     verb=${1-}
     [ $# -gt 0 ] && shift
     case $verb in
-        sample) sample "$@" ;;
+        sample | poll) "$verb" "$@" ;;
         start | run | serve) launch "$verb" "$@" ;;
         wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
         end) [ ! -d "$1" ] || end "$1" ;;

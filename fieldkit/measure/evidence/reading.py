@@ -1,5 +1,6 @@
 """Reading of evidence files, with errors that contain a remedy, and checks that a file is complete."""
 
+import gzip
 import json
 import os
 import re
@@ -77,6 +78,20 @@ def text(path: Path) -> str:
             f"is longer than {MAX_TEXT_BYTES >> 20} MiB, the limit of a tool's output", where=str(path)
         )
     return content.decode(errors="replace")
+
+
+def compressed(path: Path) -> bytes:
+    """Return the first `MAX_TEXT_BYTES` of the content of a file in gzip format.
+
+    Raises:
+        EvidenceError: The file is missing, cannot be read, or has another format.
+    """
+    size(path)  # raises an error if it is not a readable file
+    try:
+        with gzip.open(path, "rb") as file:
+            return file.read(MAX_TEXT_BYTES)
+    except (OSError, EOFError, zlib.error) as error:
+        raise EvidenceError(f"cannot be read: {error}", where=str(path)) from error
 
 
 def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:

@@ -1,7 +1,7 @@
 """The robots of a trial during one attempt: create folders, run the steps, fetch the evidence, clean up."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -74,6 +74,7 @@ class Robots:
         """
         plan = self._plan
         puts = [(put, put.program.content()) for put in plan.program_copies()]
+        sources = self._telemetry_sources()
 
         def make(role: Role) -> None:
             self._boots[role] = evidence.begin(
@@ -84,6 +85,7 @@ class Robots:
                 old=None if old in self.unfetched.folders[role] else old,
                 token=plan.session,
                 need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
+                sources=sources.get(role, ()),
             )
             for put, content in puts:
                 if put.role == role:
@@ -91,6 +93,14 @@ class Robots:
                     programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
         self._run_on_all(make)
+
+    def _telemetry_sources(self) -> Mapping[Role, Sequence[Sequence[str]]]:
+        """Return the telemetry sources that each robot queries during an attempt."""
+        if not self._plan.telemetry_roles():
+            return {}
+        from fieldkit.trial import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+
+        return telemetry_queries.of_robots(self._plan)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
@@ -115,6 +125,10 @@ class Robots:
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._monitored_processes(), ExitStack() as stack:
+            if self._plan.telemetry_roles() and scene.laptop_folder is not None:
+                from fieldkit.trial.running import laptop_telemetry  # noqa: PLC0415 (few profiles have sources)
+
+                stack.enter_context(laptop_telemetry.querying(self._plan, scene.laptop_folder))
             for section in self._plan.procedure.sections.values():
                 stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:
