@@ -7,11 +7,11 @@ from docs.generator.markdown import page, table
 from fieldkit.core.columns import Column
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import iperf3, ping
-from fieldkit.measure.telemetry import telemetry_columns
 from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
 from fieldkit.ros.bags import recorded_topics
 from fieldkit.ros.streams import topic_columns, topic_stalls
+from fieldkit.telemetry import telemetry_columns
 from fieldkit.trial.columns import installed
 
 STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {

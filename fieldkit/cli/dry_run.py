@@ -49,10 +49,10 @@ def _remarks(plan: Plan) -> Iterator[str]:
         yield f"if {name} has the tools of its profile, this will be refused: {refusal.what}; {refusal.remedy}"
     for line in plan.dry_run_notes(plan.scene(RepeatId(plan.protocols[0], 1), "")):
         yield f"while steps run: {line}"
-    if plan.telemetry_roles():
-        from fieldkit.trial import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+    if cast := plan.telemetry_cast():
+        from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-        for line in telemetry_queries.dry_run_notes(plan):
+        for line in telemetry_queries.dry_run_notes(cast):
             yield f"while steps run: {line}"
 
 
@@ -86,11 +86,12 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
 
 def _telemetry_sources(plan: Plan, role: Role) -> Sequence[Sequence[str]]:
     """Return the telemetry sources that a robot queries during an attempt."""
-    if not plan.telemetry_roles():
+    cast = plan.telemetry_cast()
+    if not cast:
         return ()
-    from fieldkit.trial import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+    from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-    return telemetry_queries.of_robots(plan).get(role, ())
+    return telemetry_queries.of_robots(cast).get(role, ())
 
 
 def _copy_command(put: PutProgram, robot: Robot, folder: str) -> str:

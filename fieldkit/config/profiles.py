@@ -12,7 +12,7 @@ from fieldkit.config.wifi_phy import WifiPhy, check_standard
 from fieldkit.core import plugins
 
 TELEMETRY: Final = "telemetry"
-"""Key of the section with sources of the state of a radio without `iw` (`fieldkit.measure.telemetry`)."""
+"""Key of the section with sources of the state of a radio without `iw` (`fieldkit.telemetry`)."""
 
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 

@@ -104,8 +104,8 @@ def _with_telemetry(
     plan: Plan, role: Role, evidence: AttemptEvidence, of_link: Measured, notes: list[str]
 ) -> Measured:
     """Return the columns of a robot's link with the values of its telemetry sources; add to `notes` which failed."""
-    from fieldkit.measure.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
-    from fieldkit.measure.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
+    from fieldkit.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
+    from fieldkit.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
 
     telemetry = telemetry_of(plan.cast[role].profile)
     if telemetry is None:

@@ -123,10 +123,10 @@ class Plan(Strict):
                 planned_jobs = tuple(entry.step.jobs(scene))
             yield from planned_jobs
 
-    def telemetry_roles(self) -> tuple[Role, ...]:
-        """Return the roles of the procedure whose robots have telemetry sources in their profiles."""
+    def telemetry_cast(self) -> dict[Role, Robot]:
+        """Return the robots of the procedure whose profiles have telemetry sources."""
         roles = sorted(self.procedure.roles() & self.cast.keys())
-        return tuple(role for role in roles if TELEMETRY in self.cast[role].profile.sections)
+        return {role: self.cast[role] for role in roles if TELEMETRY in self.cast[role].profile.sections}
 
     def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
@@ -143,11 +143,12 @@ class Plan(Strict):
         return tuple(dict.fromkeys((*step_refusals, *section_refusals, *self._telemetry_refusals())))
 
     def _telemetry_refusals(self) -> Iterable[Refusal]:
-        if not self.telemetry_roles():
+        cast = self.telemetry_cast()
+        if not cast:
             return ()
-        from fieldkit.trial import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+        from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-        return telemetry_queries.refusals(self)
+        return telemetry_queries.refusals(cast, self.cast)
 
     def _sections(self) -> Iterable[ProcedureSection]:
         return self.procedure.sections.values()

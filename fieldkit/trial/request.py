@@ -127,7 +127,7 @@ def _telemetry_columns(cast: Cast) -> Iterator[Column]:
     """Yield the columns of telemetry sources, which only trials of robots with such sources have."""
     for role in link.ROLES:
         if role in cast and TELEMETRY in cast[role].profile.sections:
-            from fieldkit.measure.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
+            from fieldkit.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
 
             yield from telemetry_columns.of_role(role)
 

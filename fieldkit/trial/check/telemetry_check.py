@@ -22,9 +22,8 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probed: Probed, report: 
     profile = plan.cast[role].profile
     if TELEMETRY not in profile.sections:
         return
-    from fieldkit.measure.telemetry import source_readings  # noqa: PLC0415 (few profiles have sources; also below)
-    from fieldkit.measure.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
-    from fieldkit.trial.running import laptop_telemetry  # noqa: PLC0415
+    from fieldkit.telemetry import laptop_telemetry, source_readings  # noqa: PLC0415 (few profiles have sources)
+    from fieldkit.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
 
     telemetry = telemetry_of(profile)
     for name, source in telemetry.sources.items() if telemetry is not None else ():
@@ -46,4 +45,4 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probed: Probed, report: 
 def _remedy(kind: str) -> str:
     if kind == "modemmanager":
         return "enable the extended signal: sudo mmcli -m any --signal-setup=2; without root it needs a polkit rule"
-    return "run its command by hand: fieldkit trial ... --dry-run shows it; see docs/telemetry.md"
+    return "run its command by hand: fieldkit trial ... --dry-run shows it"

@@ -96,11 +96,12 @@ class Robots:
 
     def _telemetry_sources(self) -> Mapping[Role, Sequence[Sequence[str]]]:
         """Return the telemetry sources that each robot queries during an attempt."""
-        if not self._plan.telemetry_roles():
+        cast = self._plan.telemetry_cast()
+        if not cast:
             return {}
-        from fieldkit.trial import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+        from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-        return telemetry_queries.of_robots(self._plan)
+        return telemetry_queries.of_robots(cast)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
@@ -125,10 +126,10 @@ class Robots:
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._monitored_processes(), ExitStack() as stack:
-            if self._plan.telemetry_roles() and scene.laptop_folder is not None:
-                from fieldkit.trial.running import laptop_telemetry  # noqa: PLC0415 (few profiles have sources)
+            if (cast := self._plan.telemetry_cast()) and scene.laptop_folder is not None:
+                from fieldkit.telemetry import laptop_telemetry  # noqa: PLC0415 (few profiles have sources)
 
-                stack.enter_context(laptop_telemetry.querying(self._plan, scene.laptop_folder))
+                stack.enter_context(laptop_telemetry.querying(cast, scene.laptop_folder))
             for section in self._plan.procedure.sections.values():
                 stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:

@@ -12,7 +12,7 @@ from typing import Final
 
 from fieldkit.core.text import shorten
 from fieldkit.measure.evidence import program_output
-from fieldkit.measure.telemetry.telemetry_section import Extraction, TelemetrySource
+from fieldkit.telemetry.telemetry_section import Extraction, TelemetrySource
 
 Values = Mapping[str, float | str]
 """Values by name, as in `telemetry_section.Values`."""

@@ -16,9 +16,9 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples
-from fieldkit.measure.telemetry import source_readings
-from fieldkit.measure.telemetry.source_readings import SourceReadings
-from fieldkit.measure.telemetry.telemetry_section import Telemetry, TelemetrySource
+from fieldkit.telemetry import source_readings
+from fieldkit.telemetry.source_readings import SourceReadings
+from fieldkit.telemetry.telemetry_section import TelemetrySection, TelemetrySource
 
 _MAX_TEXTS: Final = 4
 _IMPOSSIBLE: Final = "its value is impossible"
@@ -96,7 +96,7 @@ class _Series:
     reason: str
 
 
-def measure(role: Role, telemetry: Telemetry, evidence: AttemptEvidence, base: Measured) -> TelemetryVerdict:
+def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, base: Measured) -> TelemetryVerdict:
     """Return the columns of one robot.
 
     Args:

@@ -15,10 +15,10 @@ from fieldkit.core import laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Role
 from fieldkit.measure.evidence import reading
-from fieldkit.measure.telemetry import source_outputs
-from fieldkit.measure.telemetry.source_outputs import Values
-from fieldkit.measure.telemetry.telemetry_section import MAX_OUTPUT_BYTES, TelemetrySource
 from fieldkit.remote.command import printable
+from fieldkit.telemetry import source_outputs
+from fieldkit.telemetry.source_outputs import Values
+from fieldkit.telemetry.telemetry_section import MAX_OUTPUT_BYTES, TelemetrySource
 
 _HEAD: Final = re.compile(rb"==> ([0-9]{1,10}\.[0-9]{2}) ([0-9]{1,3}|large|interface) ([0-9]{1,5}) <==\n")
 _TOO_LONG: Final = f"its output was longer than {MAX_OUTPUT_BYTES >> 10} KiB"

@@ -13,11 +13,10 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Final
 
-from fieldkit.measure.telemetry import source_readings
-from fieldkit.measure.telemetry.telemetry_section import TelemetrySource
+from fieldkit.backends.protocols import Cast
 from fieldkit.remote.script import SCRIPT
-from fieldkit.trial import telemetry_queries
-from fieldkit.trial.plan import Plan
+from fieldkit.telemetry import source_readings, telemetry_queries
+from fieldkit.telemetry.telemetry_section import TelemetrySource
 
 _END_S: Final = 2.0
 ONCE: Final = "0"
@@ -25,16 +24,16 @@ ONCE: Final = "0"
 
 
 @contextmanager
-def querying(plan: Plan, folder: Path) -> Iterator[None]:
+def querying(cast: Cast, folder: Path) -> Iterator[None]:
     """Query the sources of the laptop while the body runs.
 
     Args:
-        plan: The trial.
+        cast: The robot in each role.
         folder: Folder for the outputs.
     """
     with ExitStack() as stack:
         started = []
-        for role, name, source in telemetry_queries.sources(plan, "laptop"):
+        for role, name, source in telemetry_queries.sources(cast, "laptop"):
             file = folder / source_readings.file(role, name, source)
             argv = _argv(source, stack.enter_context(credentials_file(source, os.environ)))
             with file.open("wb") as output:

@@ -63,7 +63,7 @@ def _is_url(text: str) -> str:
     return text
 
 
-class Credentials(Strict):
+class CredentialsReference(Strict):
     """Reference to credentials, which are read on the computer that runs the query, and are never stored.
 
     For `http` they are lines of a [curl config](https://curl.se/docs/manpage.html#-K), such as
@@ -80,7 +80,7 @@ class Credentials(Strict):
     ) = None
 
     @schema.model_validator(mode="after")
-    def _has_one_place(self) -> "Credentials":
+    def _has_one_place(self) -> "CredentialsReference":
         if (self.file is None) == (self.environment is None):
             raise schema.validation_error("credentials need either file: or environment:")
         return self
@@ -126,7 +126,7 @@ class Snmp(Strict):
     address: Annotated[str, AfterValidator(_is_address)]
     port: Annotated[Int, Field(gt=0, lt=65536)] = 161
     version: Annotated[str, Field(pattern="^(1|2c|3)$")] = "2c"
-    credentials: Credentials | None = None
+    credentials: CredentialsReference | None = None
 
     def argv(self, oids: Sequence[str], credentials_file: str | None) -> tuple[str, ...]:
         """Return the command that prints a line `OID VALUE` per object."""
@@ -147,7 +147,7 @@ class Http(Strict):
     """
 
     url: Annotated[str, AfterValidator(_is_url)]
-    credentials: Credentials | None = None
+    credentials: CredentialsReference | None = None
 
     @property
     def address(self) -> str:
@@ -301,7 +301,7 @@ class TelemetrySource(Strict):
         return device.address if device is not None else None
 
     @property
-    def credentials(self) -> Credentials | None:
+    def credentials(self) -> CredentialsReference | None:
         """Its credentials, if it needs any."""
         device = self.snmp or self.http
         return device.credentials if device is not None else None
@@ -345,7 +345,7 @@ class TelemetrySource(Strict):
 SourceName = Annotated[str, pattern_field(r"^[a-z][a-z0-9_]{0,19}$", "a short name in lower-case letters")]
 
 
-class Telemetry(ProfileSection):
+class TelemetrySection(ProfileSection):
     """[Sources](telemetry.md) of the state of the robot's radio, in addition to `iw`.
 
     A source that fails gives no value. A value that several sources give is that of the first one.
@@ -365,6 +365,6 @@ class Telemetry(ProfileSection):
         return {name: source for name, source in self.sources.items() if source.at == computer}
 
 
-def telemetry_of(profile: RobotProfile) -> Telemetry | None:
+def telemetry_of(profile: RobotProfile) -> TelemetrySection | None:
     """Return the section `telemetry` of a profile, or None if it has no such section."""
-    return profile.section(TELEMETRY, Telemetry)
+    return profile.section(TELEMETRY, TelemetrySection)
