@@ -318,6 +318,7 @@ class RobotProfile(catalog.Named, Sectioned):
         tools: Programs on the robot, each a name or a path.
         ros: Its ROS settings; a robot without them records nothing.
         limits: Limits of the robot.
+        unsupported: Reason why no trial can use a robot of this model; empty if trials can.
     """
 
     section_group = plugins.PROFILE_SECTIONS
@@ -329,6 +330,7 @@ class RobotProfile(catalog.Named, Sectioned):
     tools: Tools = Tools.defaults()
     ros: Ros | None = None
     limits: Limits
+    unsupported: str = Field(default="", exclude_if=schema.is_empty)
 
     @property
     def topics(self) -> tuple[PublishedTopic, ...]:
