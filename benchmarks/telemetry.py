@@ -5,6 +5,8 @@ the kernel `iw` fails early, and the sampler gets a stored station text instead;
 added. The reference is a loop in the same shell that calls `iw` three times and sleeps 0.2 s. Processor time is the
 kernel's count for the shell and its children, per second.
 
+A telemetry source of a profile is a program that only prints a line, every 2 s.
+
 A slower computer is simulated by an `iw` that runs several times. The sampler must then call it less often to stay
 within its share of the processor.
 """
@@ -58,6 +60,9 @@ while :; do
 done
 """
 
+# A telemetry source of a profile at its default interval; the cost of its program is added.
+_POLL: Final = ("poll", ".began", "-", "-", "-", "2", "2", "echo", "signal:")
+
 
 def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: float) -> tuple[float, int]:
     """Run a script in a folder like an attempt's; return processor time in ms per second, and the sample count."""
@@ -102,6 +107,8 @@ def main() -> int:
             continue
         loop = measure(shell, _IW.replace("SLOWER", "1") + _LOOP, (), options.seconds)
         rows.append({"shell": name, "what": "loop of iw", "slower": 1, "ms_per_s": loop[0], "samples": loop[1]})
+        poll = measure(shell, SCRIPT.decode(), _POLL, options.seconds)
+        rows.append({"shell": name, "what": "a source", "slower": 1, "ms_per_s": poll[0], "samples": poll[1]})
         for slower in SLOWER:
             text = _IW.replace("SLOWER", str(slower)) + SCRIPT.decode()
             used = measure(shell, text, ("sample", "wlan0", "-"), options.seconds)

@@ -31,7 +31,8 @@ MAY_IMPORT = {
     "lab": {"backends", "config"},
     "agent": set(),  # it runs on robots, where not even `core` is available: see tests/agent
     "steps": {"agent", "backends", "config", "measure", "remote"},
-    "trial": {"analysis", "backends", "config", "measure", "remote", "steps"},
+    "telemetry": {"backends", "config", "measure", "remote", "steps"},
+    "trial": {"analysis", "backends", "config", "measure", "remote", "steps", "telemetry"},
     "campaign": {"analysis", "backends", "config", "trial"},
     "report": {"analysis", "lab", "measure", "trial"},
     "export": {"analysis", "measure", "trial"},
@@ -47,6 +48,7 @@ MAY_IMPORT = {
         "remote",
         "report",
         "steps",
+        "telemetry",
         "trial",
     },
     # Found by entry points:

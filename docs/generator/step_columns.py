@@ -11,6 +11,7 @@ from fieldkit.measure.transfers import iperf3_load, recoveries, stalls
 from fieldkit.motion.logs import drive_log, fly_log, tlog
 from fieldkit.ros.bags import recorded_topics
 from fieldkit.ros.streams import topic_columns, topic_stalls
+from fieldkit.telemetry import telemetry_columns
 from fieldkit.trial.columns import installed
 
 STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
@@ -21,6 +22,7 @@ STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`record` with `reception: true`": recorded_topics.COLUMNS,
     "a flow inside `fault`": recoveries.declare_columns("FLOW", FaultKind.REBOOT),
     "`mavlink`": tlog.COLUMNS,
+    "any step, with `telemetry` in a robot's profile": telemetry_columns.COLUMNS,
     "`fly`": fly_log.COLUMNS,
     "`move` of a robot that fieldkit drives": drive_log.COLUMNS,
 }

@@ -117,7 +117,8 @@ def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) ->
         robots: Names of robots in the site file.
 
     Raises:
-        ConfigurationError: A profile is invalid or does not exist; the message has the line of the site file.
+        ConfigurationError: A profile is invalid, does not exist, or is of a robot that no trial can use; the message
+            has the line of the site file.
     """
     loaded: dict[str, RobotProfile] = {}
     profiles = {}
@@ -125,4 +126,7 @@ def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) ->
         name = site.robots[robot].profile
         with document.locating_errors("robots", robot, "profile") if document else nullcontext():
             profiles[robot] = loaded[name] if name in loaded else loaded.setdefault(name, load_profile(name))
+            if reason := profiles[robot].unsupported:
+                remedy = "give this robot another profile, or remove it from the site file"
+                raise ConfigurationError(f"no trial can use the profile {name}: {reason}", remedy=remedy)
     return profiles

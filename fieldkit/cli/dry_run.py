@@ -1,10 +1,10 @@
 """Show the commands of a trial without running them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.events import CommandPlanned, Note, Sink
-from fieldkit.core.model import Protocol, RepeatId
+from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from fieldkit.remote import evidence, fetching, jobs
@@ -49,6 +49,11 @@ def _remarks(plan: Plan) -> Iterator[str]:
         yield f"if {name} has the tools of its profile, this will be refused: {refusal.what}; {refusal.remedy}"
     for line in plan.dry_run_notes(plan.scene(RepeatId(plan.protocols[0], 1), "")):
         yield f"while steps run: {line}"
+    if cast := plan.telemetry_cast():
+        from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+
+        for line in telemetry_queries.dry_run_notes(cast):
+            yield f"while steps run: {line}"
 
 
 def _folder(plan: Plan, protocol: Protocol) -> str:
@@ -66,7 +71,7 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
                 continue
             location = (scene.folder, role, robot.profile.radio.interface)
             commands = [
-                (0, "begin", quote(evidence.begin_command(*location))),
+                (0, "begin", quote(evidence.begin_command(*location, sources=_telemetry_sources(plan, role)))),
                 *((0, "put", _copy_command(put, robot, folder)) for put in plan.program_copies() if put.role is role),
                 *(
                     (number, planned.job.name, in_shell(planned.job))
@@ -77,6 +82,16 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
             ]
             for number, name, command in commands:
                 yield CommandPlanned(protocol, robot.name, role, folder, number, name, command)
+
+
+def _telemetry_sources(plan: Plan, role: Role) -> Sequence[Sequence[str]]:
+    """Return the telemetry sources that a robot queries during an attempt."""
+    cast = plan.telemetry_cast()
+    if not cast:
+        return ()
+    from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+
+    return telemetry_queries.of_robots(cast).get(role, ())
 
 
 def _copy_command(put: PutProgram, robot: Robot, folder: str) -> str:

@@ -11,6 +11,9 @@ from fieldkit.config.sections import Sectioned
 from fieldkit.config.wifi_phy import WifiPhy, check_standard
 from fieldkit.core import plugins
 
+TELEMETRY: Final = "telemetry"
+"""Key of the section with sources of the state of a radio without `iw` (`fieldkit.telemetry`)."""
+
 RECORD_PLACEHOLDERS: Final = frozenset({"duration_s", "name", "topics"})
 
 TopicName = Annotated[
@@ -323,6 +326,7 @@ class RobotProfile(catalog.Named, Sectioned):
         tools: Programs on the robot, each a name or a path.
         ros: Its ROS settings; a robot without them records nothing.
         limits: Limits of the robot.
+        unsupported: Reason why no trial can use a robot of this model; empty if trials can.
     """
 
     section_group = plugins.PROFILE_SECTIONS
@@ -335,6 +339,7 @@ class RobotProfile(catalog.Named, Sectioned):
     tools: Tools = Tools.defaults()
     ros: Ros | None = None
     limits: Limits
+    unsupported: str = Field(default="", exclude_if=schema.is_empty)
 
     @property
     def topics(self) -> tuple[PublishedTopic, ...]:

@@ -22,6 +22,8 @@ ANSWER: Final = "answer-"
 FAULT: Final = "fault-"
 FAULT_TIMES: Final = "-times.txt"
 """File of each fault: `fault-KIND-times.txt`."""
+TELEMETRY: Final = ("-telemetry-", "-laptop.txt")
+"""Around the name of a telemetry source that the laptop queries: `ROLE-telemetry-NAME-laptop.txt`."""
 PLAN: Final = "trial.yaml"
 JOURNAL: Final = "journal.jsonl"
 CAMPAIGN: Final = "campaign.yaml"
@@ -45,7 +47,7 @@ _NAMES: Final = (
 _RESERVED: Final = re.compile(
     # The name of a step comes before the first dot.
     rf"(?:[^./]*\.)?(?:{'|'.join(map(re.escape, _NAMES))}|{re.escape(ANSWER)}.*\.txt|.*-{re.escape(UNFETCHED)}"
-    rf"|{re.escape(FAULT)}.*{re.escape(FAULT_TIMES)})\Z",
+    rf"|{re.escape(FAULT)}.*{re.escape(FAULT_TIMES)}|.*{re.escape(TELEMETRY[0])}.*{re.escape(TELEMETRY[1])}(?:\.gz)?)\Z",
     re.IGNORECASE | re.DOTALL,
 )
 
@@ -53,6 +55,11 @@ _RESERVED: Final = re.compile(
 def answer_file(column: str) -> str:
     """Return the name of the file with the operator's answer for a column."""
     return f"{ANSWER}{column}.txt"
+
+
+def telemetry_file(role: str, name: str) -> str:
+    """Return the name of the file with the outputs of a telemetry source that the laptop queries."""
+    return f"{role}{TELEMETRY[0]}{name}{TELEMETRY[1]}"
 
 
 def fault_times_file(kind: str) -> str:

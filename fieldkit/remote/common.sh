@@ -15,12 +15,14 @@
 #                                        wait until FILE stops growing (`-`: none), send SIGNAL to the process group, and
 #                                        SIGKILL after GRACE seconds; with TEXT return when LOG contains it, and let `pack`
 #                                        wait for the end
-#   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD]
+#   job.sh begin DIR ROLE INTERFACE KIB TOKEN [OLD [SOURCE...]]
 #                                        delete OLD, renew the lock (TOKEN `-`: none), check for KIB of free disk space,
 #                                        create DIR, write the state of the host to ROLE-before.txt and a snapshot to
 #                                        ROLE-sources-before.txt, and start the job `link`, which samples the Wi-Fi
-#                                        into ROLE-link.txt
-#   job.sh pack  DIR ROLE INTERFACE      stop the job `link`, write ROLE-after.txt, ROLE-sources-after.txt and hashes, send
+#                                        into ROLE-link.txt, and a job for each SOURCE
+#   job.sh poll FILE TOKEN ADDRESS INTERFACE INTERVAL LIMIT ARGV...
+#                                        run ARGV at intervals and print its output, see telemetry.sh
+#   job.sh pack  DIR ROLE INTERFACE      stop these jobs, write ROLE-after.txt, ROLE-sources-after.txt and hashes, send
 #                                        small files as a tar: first the hashes and the list of large files; then fail if a
 #                                        job for which `stop` did not wait has failed
 #   job.sh piece DIR FILE NUMBER BYTES   send a piece of FILE; pieces are counted from 0

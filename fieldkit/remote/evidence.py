@@ -1,10 +1,10 @@
 """The folder of an attempt on a robot: its creation before the attempt, the stop of its jobs, and its deletion."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Final
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.remote.command import printable
+from fieldkit.remote.command import printable, quote
 from fieldkit.remote.script import CALL, HOME, REPLY_S, call, require_success, word
 from fieldkit.remote.shell import Shell
 
@@ -19,10 +19,12 @@ def begin_command(
     old: str | None = None,
     token: str | None = None,
     need_kib: int = MIN_FREE_KIB,
+    sources: Sequence[Sequence[str]] = (),
 ) -> tuple[str, ...]:
     """Return the command that creates `folder` and records the state of the host in it; see `begin`."""
     lock = "-" if token is None else word(token)
-    return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *([old] if old else []))
+    polled = (old or "", *map(quote, sources)) if sources else ((old,) if old else ())
+    return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *polled)
 
 
 def begin(
@@ -34,6 +36,7 @@ def begin(
     old: str | None = None,
     token: str | None = None,
     need_kib: int = MIN_FREE_KIB,
+    sources: Sequence[Sequence[str]] = (),
 ) -> str:
     """Create the attempt's folder and record the state of the host in it; idempotent.
 
@@ -45,6 +48,8 @@ def begin(
         old: A folder to delete.
         token: Token of the trial's lock, which is renewed.
         need_kib: Free disk space that the evidence needs.
+        sources: Telemetry sources that the robot queries until its evidence is fetched: each the name and the words
+            of `poll` in telemetry.sh.
 
     Returns:
         The boot ID of the robot, as `boot` returns it.
@@ -54,7 +59,7 @@ def begin(
         LockLostError: The lock was broken, or taken over after it had expired.
         RobotError: Its disk has less free space than needed, or cannot be written.
     """
-    command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib)
+    command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib, sources=sources)
     completed = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
     require_success(shell, completed)
     return printable(completed.stdout)

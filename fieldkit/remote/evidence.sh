@@ -94,6 +94,7 @@ begin() {
     [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
     reported "$role-sources-before.txt" "$interface"
     watch "$role" "$interface"
+    [ $# -le 6 ] || { shift 6 && poll_sources "$role" "$interface" "$@"; }
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
 

@@ -18,9 +18,17 @@ watch() { # $1 role, $2 interface: start to sample in this folder; does nothing 
     detach "$meta" 86400 - 0 /dev/null "$1-link.txt" "$meta/log" "$shell" "$self" sample "$2" "$token"
 }
 
-unwatch() { # $1 role: stop it
-    meta=.jobs/link
-    [ -d "$meta" ] || return 0
+unwatch() { # $1 role: stop it, and the sources of the profile
+    for meta in .jobs/link .jobs/telemetry-*; do
+        [ -d "$meta" ] || continue
+        end_sampler
+    done
+    for sampled in "$1-link.txt" "$1-telemetry-"*.txt; do
+        [ ! -e "$sampled" ] || gzip -nf "$sampled" 2>/dev/null || :
+    done
+}
+
+end_sampler() { # stop the sampler in $meta
     clock
     until_s=$((now + 2))
     # A job that was just started may not have written its pid yet.
@@ -31,7 +39,76 @@ unwatch() { # $1 role: stop it
         while alive "$meta" && clock && [ "$now" -le "$until_s" ]; do nap 0.002; done
         ! alive "$meta" || signal KILL
     fi
-    [ ! -e "$1-link.txt" ] || gzip -nf "$1-link.txt" 2>/dev/null || :
+}
+
+poll_sources() { # $1 role, $2 interface, then a quoted line for each source: NAME and the words of `poll` from ADDRESS on
+    PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
+    role=$1 interface=$2
+    shift 2
+    read -r token _ <.began
+    for line do poll_source "$line"; done
+}
+
+poll_source() { # $1 quoted line of a source; does nothing if it was started before
+    eval "set -- $1"
+    meta=$PWD/.jobs/telemetry-$1 file=$role-telemetry-$1.txt
+    mkdir "$meta" 2>/dev/null || return 0
+    shift
+    echo "query a telemetry source: $*" >"$meta/command"
+    detach "$meta" 86400 - 0 /dev/null "$file" "$meta/log" sh "$self" poll .began "$token" "$@"
+}
+
+QUERIED=65536 # limit of an output, in bytes
+POLLED=4194304 # limit of all outputs of a source
+
+poll() { # $1 file without which it ends, $2 token of the lock or -, ADDRESS or -, INTERFACE that ADDRESS must not use, or -,
+    # INTERVAL in s (0: once), LIMIT of a run in s, ARGV...
+    present=$1 token=$2 address=$3 tested=$4 interval=$5 limit=$6 total=0 child=
+    shift 6
+    output=$PWD/.poll-$$
+    export LC_ALL=C # mmcli prints numbers with a comma in some languages
+    trap end_poll TERM INT HUP
+    exec 2>/dev/null # shells print a message for each killed command
+    while [ -e "$present" ]; do
+        [ "$token" = - ] || ours || break
+        read -r up _ </proc/uptime
+        if over_tested; then
+            printf '==> %s interface 0 <==\n\n' "$up"
+            break
+        fi
+        (ulimit -f $((QUERIED / 512 + 1)) && exec timeout -s KILL "$limit" "$@") >"$output" 2>"$output-errors" </dev/null &
+        child=$!
+        wait "$child"
+        code=$? child=
+        # Errors of queries with credentials may contain these.
+        if [ "$code" -ne 0 ] && [ "$address" = - ]; then
+            dd if="$output-errors" of="$output" bs=300 count=1
+        fi
+        size=$(($(wc -c <"$output")))
+        [ "$size" -le "$QUERIED" ] || { size=0 code=large && : >"$output"; }
+        printf '==> %s %s %s <==\n' "$up" "$code" "$size"
+        cat "$output"
+        echo
+        total=$((total + size))
+        [ "$interval" -gt 0 ] && [ "$total" -le "$POLLED" ] || break
+        sleep "$interval" &
+        child=$!
+        wait "$child"
+        child=
+    done
+    rm -f -- "$output" "$output-errors"
+}
+
+end_poll() { # end the running command, which timeout has made the leader of a process group
+    trap '' TERM INT HUP
+    [ -z "$child" ] || kill -KILL "-$child" || kill -KILL "$child"
+    rm -f -- "$output" "$output-errors"
+    exit 0
+}
+
+over_tested() { # true if packets to $address leave by the interface under test
+    [ "$address" != - ] && [ "$tested" != - ] && route=$(ip route get "$address") || return 1
+    case "$route " in *" dev $tested "*) ;; *) return 1 ;; esac
 }
 
 sample() { # $1 interface, $2 token of the lock, or -: until it is stopped, the folder is deleted, or the lock is lost

@@ -67,6 +67,14 @@ OF_EVERY_ATTEMPT: Final = (
         "none: the evidence is refused",
     ),
     CrossCheck(
+        "values of telemetry sources in a robot's profile",
+        ("*_link_source", "*_sinr_*", "*_band", "*_cell", "*_neighbours_min", "*_telemetry_samples"),
+        "`ROLE-telemetry-NAME.txt`, `ROLE-telemetry-NAME-laptop.txt`",
+        (),
+        "only the radio measures them; a source that fails gives no value",
+        CheckOutcome.UNCHECKED,
+    ),
+    CrossCheck(
         "lateness of the emulator, its radio links",
         ("emulator_*", "sender_*", "receiver_*"),
         "`lateness.txt`, `link.csv`; a robot's own `ROLE-link.txt`",

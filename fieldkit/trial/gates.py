@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS
+from fieldkit.config.profiles import TELEMETRY
 from fieldkit.core.columns import Column, Measured, cell, step_prefixed
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import Lateness, RepeatId, sort_roles
+from fieldkit.core.model import Lateness, RepeatId, Role, sort_roles
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
 from fieldkit.measure.positions import position_columns
@@ -33,11 +34,13 @@ class EvidenceVerdict:
             each.
         measured: The values that could be measured nevertheless.
         step_errors: Tracebacks of the exceptions that steps and readers of files raised on the evidence.
+        notes: Sentences about values that are missing although the profile of a robot has a source for them.
     """
 
     problems: tuple[str, ...]
     measured: Measured
     step_errors: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def has_failed(self) -> bool:
@@ -63,8 +66,12 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     lateness = evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
     timeless = plan.simulators.get(CLOCK) == INSTRUCTIONS
     measured = oracle_delays.measure_lateness(lateness) | oracle_delays.measure_window_lateness(lateness)
+    notes: list[str] = []
     for role in link.ROLES:
-        measured |= link.measure(role, evidence.links(role))
+        of_link = link.measure(role, evidence.links(role))
+        if TELEMETRY in plan.cast[role].profile.sections:
+            of_link = _with_telemetry(plan, role, evidence, of_link, notes)
+        measured |= of_link
     placement_problem = _placement_problem(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
@@ -98,7 +105,22 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     problems += (
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
     )
-    return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks))
+    return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
+
+
+def _with_telemetry(
+    plan: Plan, role: Role, evidence: AttemptEvidence, of_link: Measured, notes: list[str]
+) -> Measured:
+    """Return the columns of a robot's link with the values of its telemetry sources; add to `notes` which failed."""
+    from fieldkit.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
+    from fieldkit.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
+
+    telemetry = telemetry_of(plan.cast[role].profile)
+    if telemetry is None:
+        return of_link
+    verdict = telemetry_columns.measure(role, telemetry, evidence, of_link)
+    notes += verdict.notes
+    return verdict.measured
 
 
 def _placement_problem(scene: Scene, evidence: AttemptEvidence) -> str | None:

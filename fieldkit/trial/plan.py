@@ -8,6 +8,7 @@ from typing import Annotated, Final
 
 from fieldkit.backends.protocols import Robot
 from fieldkit.config import schema
+from fieldkit.config.profiles import TELEMETRY
 from fieldkit.config.schema import Field, Int, Number, Strict
 from fieldkit.core import laptop_files
 from fieldkit.core.columns import Column
@@ -122,6 +123,11 @@ class Plan(Strict):
                 planned_jobs = tuple(entry.step.jobs(scene))
             yield from planned_jobs
 
+    def telemetry_cast(self) -> dict[Role, Robot]:
+        """Return the robots of the procedure whose profiles have telemetry sources."""
+        roles = sorted(self.procedure.roles() & self.cast.keys())
+        return {role: self.cast[role] for role in roles if TELEMETRY in self.cast[role].profile.sections}
+
     def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
         planned = (job for scene in self.scenes() for job in self.jobs(scene))
@@ -134,7 +140,15 @@ class Plan(Strict):
             refusal for scene in self.scenes(variants) for step in steps for refusal in step.refusals(scene)
         )
         section_refusals = (refusal for section in self._sections() for refusal in section.refusals(self))
-        return tuple(dict.fromkeys((*step_refusals, *section_refusals)))
+        return tuple(dict.fromkeys((*step_refusals, *section_refusals, *self._telemetry_refusals())))
+
+    def _telemetry_refusals(self) -> Iterable[Refusal]:
+        cast = self.telemetry_cast()
+        if not cast:
+            return ()
+        from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+
+        return telemetry_queries.refusals(cast, self.cast)
 
     def _sections(self) -> Iterable[ProcedureSection]:
         return self.procedure.sections.values()

@@ -1,17 +1,19 @@
 """The operator's request for a trial, and the plan that is made from it."""
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from types import MappingProxyType
 
 from fieldkit import __version__
 from fieldkit.backends.protocols import Cast
+from fieldkit.config.profiles import TELEMETRY
 from fieldkit.core import plugins
-from fieldkit.core.columns import SCHEMA_VERSION
+from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
+from fieldkit.measure.evidence import link
 from fieldkit.trial import step_packages
 from fieldkit.trial.columns import OTHERS, of_robots, of_steps
 from fieldkit.trial.frozen import freeze
@@ -115,11 +117,25 @@ def make_plan(
         simulators=dict(simulators),
         step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze(
-            (*others, *of_steps(placed.step for placed in procedure.walk()), *of_robots(procedure.roles()))
+            (
+                *others,
+                *of_steps(placed.step for placed in procedure.walk()),
+                *of_robots(procedure.roles()),
+                *_telemetry_columns(cast),
+            )
         ),
     )
     plan.program_copies()  # raises before robots are started if a step of another package cannot give its commands
     return plan
+
+
+def _telemetry_columns(cast: Cast) -> Iterator[Column]:
+    """Yield the columns of telemetry sources, which only trials of robots with such sources have."""
+    for role in link.ROLES:
+        if role in cast and TELEMETRY in cast[role].profile.sections:
+            from fieldkit.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
+
+            yield from telemetry_columns.of_role(role)
 
 
 def _robot_data(cast: Cast) -> dict[str, object]:

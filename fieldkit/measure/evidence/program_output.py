@@ -82,10 +82,18 @@ def document(path: Path) -> object:
         EvidenceError: As `text`, or the output is not JSON.
     """
     try:
-        parsed: object = json.loads(text(path).removeprefix("\ufeff"))
+        return parse_json(text(path))
+    except ValueError as error:
+        raise EvidenceError(str(error), where=str(path)) from error
+
+
+def parse_json(output: str) -> object:
+    """Return the value of JSON text; raises ValueError with the reason if it is not JSON."""
+    try:
+        parsed: object = json.loads(output.removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
         reason = _TOO_DEEP if isinstance(error, RecursionError) else str(error)
-        raise EvidenceError(f"is not JSON: {reason}", where=str(path)) from error
+        raise ValueError(f"is not JSON: {reason}") from error
     return parsed
 
 
@@ -97,10 +105,22 @@ def at_path(path: Path, where: str) -> object:
     """
     printed = document(path)
     try:
+        return search_json(printed, where)
+    except ValueError as error:
+        raise EvidenceError(str(error), where=str(path)) from error
+
+
+def search_json(printed: object, where: str) -> object:
+    """Return the value at the path `where` in a JSON value; None if there is none.
+
+    Raises:
+        ValueError: A function in the path was applied to a value of the wrong type, or it is nested too deeply.
+    """
+    try:
         result: object = _compile_path(where).search(printed)
     except (ValueError, RecursionError) as error:
         reason = _TOO_DEEP if isinstance(error, RecursionError) else " ".join(str(error).split())
-        raise EvidenceError(reason, where=str(path)) from error
+        raise ValueError(reason) from error
     return result
 
 
@@ -110,8 +130,14 @@ def by_expression(path: Path, expression: str) -> object:
     Raises:
         EvidenceError: As `text`.
     """
-    match = _compile_expression(expression).search(text(path))
-    return None if match is None else match[1]
+    return search_text(text(path), expression)
+
+
+def search_text(output: str, expression: str) -> str | None:
+    """Return the text of the expression's group in its first match in a text; None if it does not match."""
+    match = _compile_expression(expression).search(output)
+    group: str | None = None if match is None else match[1]
+    return group
 
 
 def value(column: Column, extracted: object) -> Value:

@@ -1,8 +1,10 @@
 """Reading of evidence files, with errors that contain a remedy, and checks that a file is complete."""
 
+import gzip
 import os
 import re
 import stat
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
@@ -74,6 +76,20 @@ def text(path: Path) -> str:
             f"is longer than {MAX_TEXT_BYTES >> 20} MiB, the limit of a tool's output", where=str(path)
         )
     return content.decode(errors="replace")
+
+
+def compressed(path: Path) -> bytes:
+    """Return the first `MAX_TEXT_BYTES` of the content of a file in gzip format.
+
+    Raises:
+        EvidenceError: The file is missing, cannot be read, or has another format.
+    """
+    size(path)  # raises an error if it is not a readable file
+    try:
+        with gzip.open(path, "rb") as file:
+            return file.read(MAX_TEXT_BYTES)
+    except (OSError, EOFError, zlib.error) as error:
+        raise EvidenceError(f"cannot be read: {error}", where=str(path)) from error
 
 
 @contextmanager

@@ -9,9 +9,7 @@ Drivers omit values that they do not support. A received power of 0 dBm or more 
 percentage.
 """
 
-import gzip
 import re
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
@@ -147,13 +145,7 @@ def _sampler_text(path: Path) -> str:
     compressed = path.with_name(f"{path.name}.gz")
     if not compressed.is_file():
         return ""
-    reading.size(compressed)  # raises an error if it is not a readable file
-    try:
-        with gzip.open(compressed, "rb") as file_:
-            content = file_.read(reading.MAX_TEXT_BYTES)
-    except (OSError, EOFError, zlib.error) as error:
-        raise EvidenceError(f"cannot be read: {error}", where=str(compressed)) from error
-    return content.decode(errors="replace")
+    return reading.compressed(compressed).decode(errors="replace")
 
 
 def parse(text: str) -> Sequence[LinkSample]:

@@ -14,7 +14,7 @@ from fieldkit.core.errors import (
     RobotError,
     TestbedLostError,
 )
-from fieldkit.core.events import PhaseStarted, Sink
+from fieldkit.core.events import Note, PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.robot_state import exchanges
@@ -97,6 +97,8 @@ class Attempts:
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, clean=not reasons)
             verdict = self._judge(started, partial)
+            for note in verdict.notes:
+                self._sink(Note(f"{repeat}: {note}"))
             raised = [failure.traceback_text] if isinstance(failure, StepError) else []
             step_errors.store([*raised, *verdict.step_errors], partial)
             has_failed = bool(raised) or (not reasons and verdict.has_failed)

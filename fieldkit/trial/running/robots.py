@@ -1,7 +1,7 @@
 """The robots of a trial during one attempt: create folders, run the steps, fetch the evidence, clean up."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -77,6 +77,7 @@ class Robots:
         """
         plan = self._plan
         puts = [(put, put.program.content()) for put in plan.program_copies()]
+        sources = self._telemetry_sources()
 
         times_ns: dict[Role, tuple[int, int]] = {}
 
@@ -90,6 +91,7 @@ class Robots:
                 old=None if old in self.unfetched.folders[role] else old,
                 token=plan.session,
                 need_kib=(size.evidence_bytes(plan, role) + size.reserve_bytes(plan, role)) // 1024,
+                sources=sources.get(role, ()),
             )
             times_ns[role] = request_ns, time.time_ns()
             for put, content in puts:
@@ -101,6 +103,15 @@ class Robots:
 
         self._run_on_all(make)
         return times_ns
+
+    def _telemetry_sources(self) -> Mapping[Role, Sequence[Sequence[str]]]:
+        """Return the telemetry sources that each robot queries during an attempt."""
+        cast = self._plan.telemetry_cast()
+        if not cast:
+            return {}
+        from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
+
+        return telemetry_queries.of_robots(cast)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
@@ -125,6 +136,10 @@ class Robots:
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._monitored_processes(), ExitStack() as stack:
+            if (cast := self._plan.telemetry_cast()) and scene.laptop_folder is not None:
+                from fieldkit.telemetry import laptop_telemetry  # noqa: PLC0415 (few profiles have sources)
+
+                stack.enter_context(laptop_telemetry.querying(cast, scene.laptop_folder))
             for section in self._plan.procedure.sections.values():
                 stack.enter_context(section.around_steps(self._plan, scene, self.shells))
             for entry in self._plan.procedure.steps:

@@ -67,7 +67,7 @@ def completions(lab: Path, line: str) -> list[str]:
         ("fieldkit check los --backend ", ["emulated", "field"]),
         ("fieldkit enroll ", ["leader", "follower"]),
         ("fieldkit lab shell ", [""]),
-        ("fieldkit lab up --profile ", ["duckiedrone", "husky", "iris", "turtlebot3_burger"]),
+        ("fieldkit lab up --profile ", sorted(path.stem for path in (ROOT / "robots").glob("*.yaml"))),
         ("fieldkit resume ", ["trials/", "trials/campaign/", "trials/one"]),
         ("fieldkit report trials/", ["trials/campaign/", "trials/one"]),
         ("fieldkit compare trials/one r", ["rows.csv"]),

@@ -1,0 +1,116 @@
+"""Queries of telemetry sources by the laptop, beside the steps of an attempt.
+
+The laptop runs the same program as a robot: `poll` in telemetry.sh.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.remote.script import SCRIPT
+from fieldkit.telemetry import source_readings, telemetry_queries
+from fieldkit.telemetry.telemetry_section import TelemetrySource
+
+_END_S: Final = 2.0
+ONCE: Final = "0"
+"""Interval of a single query."""
+
+
+@contextmanager
+def querying(cast: Cast, folder: Path) -> Iterator[None]:
+    """Query the sources of the laptop while the body runs.
+
+    Args:
+        cast: The robot in each role.
+        folder: Folder for the outputs.
+    """
+    with ExitStack() as stack:
+        started = []
+        for role, name, source in telemetry_queries.sources(cast, "laptop"):
+            file = folder / source_readings.file(role, name, source)
+            argv = _argv(source, stack.enter_context(credentials_file(source, os.environ)))
+            with file.open("wb") as output:
+                # The working directory is not the folder of the trial, which is on a disk that may be removed.
+                process = subprocess.Popen(
+                    argv,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.DEVNULL,
+                    cwd=stack.enter_context(_temporary_folder()),
+                    start_new_session=True,
+                )
+            started.append(process)
+        try:
+            yield
+        finally:
+            for process in started:
+                process.terminate()
+            for process in started:
+                _end(process)
+
+
+def _argv(source: TelemetrySource, credentials: str | None, interval: str | None = None) -> tuple[str, ...]:
+    address, tested, every, *rest = source.poll_words("-", credentials)
+    words = (f"/proc/{os.getpid()}", "-", address, tested, interval or every, *rest)
+    return ("sh", "-c", SCRIPT.decode(), "job.sh", "poll", *words)
+
+
+def query_once(source: TelemetrySource, environment: Mapping[str, str]) -> bytes:
+    """Return the output of one query on this computer, in the format of `source_readings`."""
+    with credentials_file(source, environment) as credentials, _temporary_folder() as folder:
+        process = subprocess.Popen(
+            _argv(source, credentials, ONCE),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd=folder,
+            start_new_session=True,
+        )
+        try:
+            output, _ = process.communicate(timeout=source.limit + 10)
+        except subprocess.TimeoutExpired:
+            output = b""
+        finally:
+            process.terminate()
+            _end(process)
+    return output
+
+
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """Wait for the end of a query that was requested to end, which ends the running command; else kill both."""
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(_END_S)
+        return
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+@contextmanager
+def credentials_file(source: TelemetrySource, environment: Mapping[str, str]) -> Iterator[str | None]:
+    """Yield a temporary file with the credentials of an environment variable; None if the source uses no variable."""
+    credentials = source.credentials
+    if credentials is None or credentials.environment is None:
+        yield None
+        return
+    with _temporary_folder() as folder:
+        file = Path(folder, "snmp.conf")  # curl accepts any name
+        file.touch(mode=0o600)
+        file.write_text(f"{environment.get(credentials.environment, '')}\n", encoding="utf-8")
+        yield str(file)
+
+
+@contextmanager
+def _temporary_folder() -> Iterator[str]:
+    folder = tempfile.mkdtemp(prefix="fieldkit-telemetry-")
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,227 @@
+"""Values in the output of one query of a telemetry source: of mmcli, batctl, snmpget, or at locations of the profile.
+
+Outputs are not trusted: JSON may have any shape and any numbers. A value that is missing, or has another type, is
+absent, never 0.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+from fieldkit.core.text import shorten
+from fieldkit.measure.evidence import program_output
+from fieldkit.telemetry.telemetry_section import Extraction, TelemetrySource
+
+Values = Mapping[str, float | str]
+"""Values by name, as in `telemetry_section.Values`."""
+
+TEXTS: Final = frozenset({"band", "cell"})
+_NUMBER: Final = re.compile(r"([+-]?[0-9]{1,15}(?:\.[0-9]{1,9})?)(?: ?(dBm|dB))?", re.ASCII)
+_UNITS: Final = {"signal_dbm": "dBm", "noise_dbm": "dBm", "sinr_db": "dB"}
+_MISSING_TEXTS: Final = frozenset({"", "--", "unknown", "n/a", "none", "null"})
+
+_MAX_AGE_S: Final = 10.0
+"""A mesh node counts as a neighbour if it was heard within this time. Nodes announce themselves every second, and are
+listed for 200 s after they have disappeared (batman-adv, `BATADV_PURGE_TIMEOUT`)."""
+
+_UMTS: Final = frozenset({"umts", "hsdpa", "hsupa", "hspa", "hspa-plus"})
+_SIGNALS: Final = (
+    (frozenset({"lte", "lte-cat-m", "lte-nb-iot"}), "lte", "rsrp", "snr"),
+    (frozenset({"5gnr"}), "5g", "rsrp", "snr"),
+    (_UMTS, "umts", "rscp", ""),
+    (frozenset({"evdo0", "evdoa", "evdob"}), "evdo", "rssi", "sinr"),
+    (frozenset({"1xrtt"}), "cdma1x", "rssi", ""),
+    (frozenset({"gsm", "gsm-compact", "gprs", "edge"}), "gsm", "rssi", ""),
+)
+"""Access technologies, their key in the output of `mmcli --signal-get -J`, and the keys of signal and SINR."""
+
+_CHANNELS: Final = ("earfcn", "nrarfcn", "uarfcn", "arfcn")
+
+# Lines of batctl's table of neighbours: those of BATMAN IV begin with the interface, those of BATMAN V with the node.
+_MESH_LINE: Final = re.compile(
+    r"^[ \t]*(?:[A-Za-z0-9._-]{1,15}[ \t]+)?([0-9a-f]{2}(?::[0-9a-f]{2}){5})[ \t]+([0-9]{1,6}\.[0-9]{3})s",
+    re.MULTILINE | re.ASCII,
+)
+_SNMP_LINE: Final = re.compile(r"^(\.[0-9.]{5,300}) (.{1,2000})$", re.MULTILINE | re.ASCII)
+
+
+def values(source: TelemetrySource, output: str) -> Values:
+    """Return the values in one output of a source.
+
+    Raises:
+        ValueError: The output has another format; the message is the predicate of a sentence.
+    """
+    match source.kind:
+        case "modemmanager":
+            return modem_values(output)
+        case "batctl":
+            return mesh_values(output)
+        case "snmp":
+            return _located(source, dict(_SNMP_LINE.findall(output)))
+        case _:
+            return _located(source, output)
+
+
+def _located(source: TelemetrySource, output: str | Mapping[str, str]) -> Values:
+    """Return the values at the locations of the profile, in text or in objects of SNMP."""
+    printed: object = None
+    located: dict[str, float | str] = {}
+    for name, location in source.values.items() if source.values is not None else ():
+        if isinstance(output, str):
+            if location.path is not None and printed is None:
+                printed = program_output.parse_json(output)
+            extracted = (
+                program_output.search_json(printed, location.path)
+                if location.path is not None
+                else program_output.search_text(output, location.expression or "")
+            )
+        else:
+            extracted = _snmp_value(output, location)
+        if (value := _value(name, extracted, location.factor)) is not None:
+            located[name] = value
+    return located
+
+
+def _snmp_value(objects: Mapping[str, str], location: Extraction) -> str | None:
+    """Return the value of an object; None if the agent has no such object."""
+    text = objects.get(f".{(location.oid or '').lstrip('.')}", "").strip()
+    if not text or text.startswith(("No Such ", "No more variables")):
+        return None
+    return text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text
+
+
+def _value(name: str, extracted: object, factor: float = 1) -> float | str | None:
+    """Return a value of a type that its column has; None for any other."""
+    if isinstance(extracted, bool | list | dict) or extracted is None:
+        return None
+    if name in TEXTS:
+        text = shorten(" ".join(str(extracted)[:200].split()))
+        return None if text.lower() in _MISSING_TEXTS else text
+    if isinstance(extracted, str):
+        match = _NUMBER.fullmatch(extracted.strip())
+        if match is None or (match[2] and match[2] != _UNITS.get(name)):
+            return None
+        number = float(match[1])
+    else:
+        try:
+            number = float(extracted)  # type: ignore[arg-type]
+        except (TypeError, ValueError, OverflowError):
+            return None
+    number *= factor
+    # Drivers of modems and radios report 0 or a positive number for an unknown signal, as those of Wi-Fi.
+    is_power = name in {"signal_dbm", "noise_dbm"}
+    return number if math.isfinite(number) and (number < 0 or not is_power) else None
+
+
+def _documents(output: str) -> Iterator[object]:
+    """Yield the JSON values in an output with one value per line; other lines are skipped."""
+    for line in output.splitlines():
+        if line[:1] in {"{", "["}:
+            try:
+                yield json.loads(line)
+            except (ValueError, RecursionError):
+                continue
+
+
+def _at(document: object, *keys: str) -> object:
+    for key in keys:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document
+
+
+def modem_values(output: str) -> Values:
+    """Return the values in the outputs of mmcli: signal, modem, and cells or location, each a line of JSON.
+
+    The signal is that of the access technology in use: RSRP for LTE and 5G, RSCP for UMTS, otherwise RSSI. If LTE and
+    5G are in use at the same time (NSA), it is that of LTE, which has the serving cell.
+
+    Raises:
+        ValueError: There is no JSON of mmcli.
+    """
+    modems = [modem for document in _documents(output) if isinstance(modem := _at(document, "modem"), dict)]
+    if not modems:
+        raise ValueError("is not JSON of mmcli")
+    merged: dict[str, object] = {}
+    for modem in modems:
+        for key, content in modem.items():
+            earlier = merged.get(key)
+            both = isinstance(earlier, dict) and isinstance(content, dict)
+            merged[key] = {**earlier, **content} if both else content  # type: ignore[dict-item]
+    technologies = _texts(_at(merged, "generic", "access-technologies"))
+    located = _modem_signal(_at(merged, "signal"), technologies)
+    cells = [dict(_cell_facts(text)) for text in _texts(_at(merged, "generic", "cell-info"))]
+    serving = next((cell for cell in cells if cell.get("serving") == "yes"), {})
+    channels = (f", {key.upper()} {serving[key]}" for key in _CHANNELS if key in serving)
+    channel = next(channels, "")
+    band = f"{serving.get('cell type') or '/'.join(technologies)}{channel}"
+    cell = serving.get("ci") or _at(merged, "location", "3gpp", "cid")
+    operator = _at(merged, "3gpp", "operator-code")
+    for name, text in (("band", band), ("cell", cell)):
+        if (value := _value(name, text)) is not None:
+            located[name] = value
+    known_operator = _value("cell", operator)
+    if "cell" in located and known_operator is not None:
+        located["cell"] = f"{known_operator} {located['cell']}"
+    if cells:
+        located["neighbours"] = float(sum(cell.get("serving") == "no" for cell in cells))
+    return located
+
+
+def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | str]:
+    for names, key, power, ratio in _SIGNALS:
+        # Values of another technology are of an earlier connection, and have another meaning.
+        if technologies and not names & set(technologies):
+            continue
+        signal_dbm = _value("signal_dbm", _at(signal, key, power))
+        if signal_dbm is None:
+            continue
+        sinr_db = _value("sinr_db", _at(signal, key, ratio)) if ratio else None
+        return {"signal_dbm": signal_dbm} | ({} if sinr_db is None else {"sinr_db": sinr_db})
+    return {}
+
+
+def _texts(items: object) -> list[str]:
+    return [item[:500] for item in items[:100] if isinstance(item, str)] if isinstance(items, list) else []
+
+
+def _cell_facts(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the facts in `cell type: lte, serving: yes, ci: 01A2D001`."""
+    for fact in text.split(", "):
+        name, separator, value = fact.partition(": ")
+        if separator:
+            yield name, value
+
+
+def mesh_values(output: str) -> Values:
+    """Return the number of neighbours in the outputs of batctl: neighbours, an empty line, originators.
+
+    Raises:
+        ValueError: The output is neither JSON nor a table of batctl.
+    """
+    tables = re.split(r"\n\s*\n", output.strip(), maxsplit=1)
+    ages = _mesh_ages(tables[0])
+    return {"neighbours": float(sum(min(seen_s) <= _MAX_AGE_S for seen_s in ages.values()))}
+
+
+def _mesh_ages(table: str) -> dict[str, list[float]]:
+    """Return the times since each node was heard, by its address; a node can be heard on several interfaces."""
+    ages: dict[str, list[float]] = {}
+    text = table.strip()
+    if text.startswith("["):
+        try:
+            nodes = program_output.parse_json(text)
+        except ValueError:
+            nodes = None  # the header line of a table also begins with a bracket
+        if isinstance(nodes, list):
+            for node in nodes:
+                address, age_ms = _at(node, "neigh_address"), _at(node, "last_seen_msecs")
+                if isinstance(address, str) and isinstance(age_ms, int) and not isinstance(age_ms, bool):
+                    ages.setdefault(address[:40], []).append(age_ms / 1e3)
+            return ages
+    if "B.A.T.M.A.N" not in text and _MESH_LINE.search(text) is None:
+        raise ValueError("is not a list of batctl")
+    for match in _MESH_LINE.finditer(text):
+        ages.setdefault(match[1], []).append(float(match[2]))
+    return ages

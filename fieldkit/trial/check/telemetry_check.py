@@ -1,0 +1,48 @@
+"""Check of a robot's telemetry sources: each is queried once; an entry point of `fieldkit.checks`."""
+
+import os
+
+from fieldkit.config.profiles import TELEMETRY
+from fieldkit.core.columns import cell
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
+from fieldkit.remote.script import CALL, REPLY_S
+from fieldkit.remote.shell import Shell
+from fieldkit.trial.check.report import Report
+from fieldkit.trial.check.software import Probed
+from fieldkit.trial.plan import Plan
+
+
+def check_sources(plan: Plan, role: Role, shell: Shell, probed: Probed, report: Report) -> None:  # noqa: ARG001
+    """Report the values that each telemetry source of a robot gives, or the reason why it gives none.
+
+    Raises:
+        LinkError: The robot did not answer.
+    """
+    profile = plan.cast[role].profile
+    if TELEMETRY not in profile.sections:
+        return
+    from fieldkit.telemetry import laptop_telemetry, source_readings  # noqa: PLC0415 (few profiles have sources)
+    from fieldkit.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
+
+    telemetry = telemetry_of(profile)
+    for name, source in telemetry.sources.items() if telemetry is not None else ():
+        if source.at == "laptop":
+            output = laptop_telemetry.query_once(source, os.environ)
+        else:
+            address, tested, _, *rest = source.poll_words(profile.radio.interface)
+            words = (*CALL, "poll", "/", "-", address, tested, laptop_telemetry.ONCE, *rest)
+            output = shell.run(words, deadline=Deadline.after(source.limit + REPLY_S), check=False).stdout
+        readings = source_readings.parse(output, source)
+        if readings.values:
+            known = ", ".join(f"{quantity} {cell(value)}" for quantity, value in readings.values[0].items())
+            report.ok(f"telemetry {name}", known)
+        else:
+            reason = readings.reason or "the query did not end"
+            report.warn(f"telemetry {name}", f"no value: {reason}", _remedy(source.kind))
+
+
+def _remedy(kind: str) -> str:
+    if kind == "modemmanager":
+        return "enable the extended signal: sudo mmcli -m any --signal-setup=2; without root it needs a polkit rule"
+    return "run its command by hand: fieldkit trial ... --dry-run shows it"
