@@ -1,12 +1,12 @@
-"""The page of the layouts of the protocol of external federates, from the code of the protocol."""
+"""The page of the rules and layouts of the protocol of external federates, from the code of the protocol."""
 
 import inspect
 from typing import Final
 
 from docs.generator.federate_frames import example_frames
-from docs.generator.markdown import page, table
+from docs.generator.markdown import page, relative, table
 from fieldkit.config.documentation import attribute_meanings
-from sim_backends.federates import frames
+from sim_backends.federates import exchanges, frames
 from sim_backends.federates.frames import MessageKind
 from sim_backends.federates.handshake import FederateCapability
 from sim_backends.federates.records import LAYOUTS
@@ -24,10 +24,12 @@ _NUMBERS: Final = (
 def federate_protocol() -> str:
     """Return the page."""
     return page(
-        "Layouts of the federate protocol",
-        f"Layouts of the [protocol](../federates.md#protocol) of external federates, version {frames.VERSION}. "
+        "Rules and layouts of the federate protocol",
+        f"Version {frames.VERSION} of the [protocol](../federates.md#protocol) of external federates. "
         "[Test vectors](federate-vectors.md) have a frame of each in hexadecimal.",
         _NUMBERS,
+        "## Rules",
+        relative(_without_title(exchanges.__doc__)),
         "## Messages",
         table(("kind", "message", "from", "body"), map(_message, MessageKind)),
         "## Parts of messages",

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, get_args
 
 from docs.generator.commands import commands
+from docs.generator.cosim_protocols import cosim_protocols
 from docs.generator.federate_frames import DESCRIPTION, WITHOUT_VECTOR, example_frames
 from docs.generator.federate_protocol import federate_protocol
 from docs.generator.markdown import page, relative, table
@@ -56,6 +57,7 @@ def pages() -> dict[str, str]:
         "campaign-file.md": lambda: page("Campaign file", describe(CampaignFile), _MARKS, keys_table(CampaignFile)),
         "scenario-file.md": scenario_file,
         "simulator-options.md": simulator_options,
+        "cosim-protocols.md": cosim_protocols,
         "recording-tables.md": recording_tables,
         "pytest-options.md": pytest_options,
         "columns.md": columns,
@@ -114,8 +116,9 @@ def index() -> str:
         ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
         ("[Rows of tables](table-rows.md)", "the column of each row that `trial`, `aggregate` and `report` print"),
         ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
+        ("[Classes of the co-simulation](cosim-protocols.md)", "for a sync policy, physics or network of your own"),
         ("[JSON events](events.md)", "output of `--json`"),
-        ("[Layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
+        ("[Rules and layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
         ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
         ("[Errors](../errors.md)", "messages and remedies"),
     )

@@ -1,4 +1,46 @@
-"""Requests and answers of the wire protocol after the handshake (docs/federates.md)."""
+"""Requests and answers of the wire protocol after the handshake, and the rules for both sides.
+
+Agents have indices from 0 in the order of their announcement, first the agents in `hello`. A later agent gets the
+next index in the first message that mentions it, for this copy and its copies.
+
+- **Handshake.** The coordinator sends hello, the federate answers with welcome or error. `welcome` repeats the
+  configuration hash, the SHA-256 of the JSON. `name` names the scenario or the federate. The side that accepts a
+  connection checks the token of join or hello.
+- **Transports.** Welcome lists the values of a packet's `protocol` that the network carries: `udp`, `tcp`, `topic`,
+  `ros1`; an empty list means all. The network refuses others with an error. [Real programs](lab-cosim.md) send `ip`,
+  whose size includes the IP header, and `ip-broadcast`: one packet per receiver, with equal source, number and time.
+  With the key `network.transports: builtin` these two and the capability *next event* suffice: fieldkit's own UDP,
+  TCP, topics and ROS 1 send IP packets.
+- **Configuration.** The JSON has `scenario` (keys as in [a scenario file](reference/scenario-file.md)), `world` ([a
+  world file](reference/world-file.md)), `robots` (limits of each agent's body, and its radio) and `options`. A simple
+  federate ignores it and uses the agents of hello. A network declared with `writes_captures` gets `captures` if the
+  run has an output folder: the `folder` for one `AGENT.pcap` each, of raw IP; `addresses` by agent; and `flows` by
+  name: `port` of the destination (0: its own), `ping` (identifier of ICMP echo; 0: none), `reply`.
+- **Physics: states.** `at_ns` is `to_ns` rounded down to a multiple of the `step_ns` in welcome; the states are valid
+  at this time. Positions are of the antenna. `heading_rad` is from east towards north, NaN if undefined. `limit_m_s2`
+  is the largest change of velocity per second from now on, infinity if unknown; in requests to a network it has no
+  meaning.
+- **Physics: requests.** The first `to_ns` is 0; it never decreases. Commands apply in the steps that begin at or
+  after `from_ns`, so the states at `from_ns` still have the old velocity. An agent keeps its last command until a new
+  one. A request within one step and without commands is not sent. The federate refuses a type of command that welcome
+  does not list.
+- **Network.** It simulates up to and including `to_ns`, and returns each packet exactly once: as an arrival with
+  `enters_ns` <= `at_ns` <= `to_ns`, and `at_ns` not before the previous `to_ns`; or as a drop with its reason. Both
+  lists are in order of time. `at_ns` of outcomes is `to_ns`. Packets are in order of `enters_ns`, which may equal the
+  previous `to_ns`. In a window of length 0 at the start `to_ns` is -1. Random draws depend on the seed; derive each
+  from the seed, `flow` and `number`, so that runs can be compared.
+- **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
+  `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
+  Otherwise agents stay at their positions until the next request.
+- **Absent agents** have no state. A physics with the capability 32 omits agents that it has removed; they may return.
+  With the scenario's keys `appears` and `disappears` the coordinator ignores states of absent agents, sends them no
+  commands, and drops their packets as `agent absent`; the network still reports the fates of those that it already
+  carries. A network without the capability 32 receives the last states of absent agents, or their start states.
+- **Transmitters and emitters** in welcome are agents that forward or interfere, and other sources of interference.
+- **Deadlines.** A federate that computes for longer than `heartbeat_ms` sends busy. The coordinator waits 30 s for a
+  frame (`--deadline`), and at most 20 times as long for an answer.
+- **Malformed frames** end the session; the side that receives one reports the position of the wrong byte.
+"""
 
 import struct
 from collections.abc import Mapping, Sequence

@@ -68,8 +68,9 @@ class PhysicsFederate(Protocol):
 
     Attributes:
         step_ns: Time step; there are states at whole steps only.
-        limits_m_s2: Largest change of each agent's velocity per second, in m/s^2. The mapping is read once; its
-            values may change during the run.
+        limits_m_s2: Largest change of each agent's velocity per second, in m/s^2; `math.inf` if unknown. Only
+            `error_bounded` uses it: a value that is too small breaks the bound, infinity costs exchanges. The mapping
+            is read once; its values may change during the run.
     """
 
     step_ns: int

@@ -1,7 +1,8 @@
-"""Coverage of the 95 % intervals by simulation, compared with the tables of docs/method-intervals.md."""
+"""Coverage of the 95 % intervals by simulation, compared with the tables of coverage.md."""
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from statistics import NormalDist
 from typing import Final
 
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 
 from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
 from tests.helpers.nightly import mark_nightly
-from tests.helpers.paths import ROOT
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
 REPEATS: Final = 20
@@ -23,7 +23,7 @@ RATES: Final = (0.01, 0.05, 0.35)
 # At most seven losses or two bursts are expected in a cell, so a cell without losses is likely, and an interval can
 # miss the true value only on one side.
 RARE: Final = {(36, 0.01)}
-METHOD: Final = ROOT / "docs" / "method-intervals.md"
+TABLES: Final = Path(__file__).with_name("coverage.md")
 
 Floats = NDArray[np.float64]
 Draw = Callable[[np.random.Generator, tuple[int, int]], Floats]
@@ -52,10 +52,10 @@ def covered(intervals: Intervals, truth: float) -> float:
     return 100 * float(np.mean((intervals.low <= truth + slack) & (truth - slack <= intervals.high)))
 
 
-def in_method(*key: str) -> list[float]:
-    """Return the numbers of the row of docs/method-intervals.md that starts with these cells."""
+def table_row(*key: str) -> list[float]:
+    """Return the numbers of the row of coverage.md that starts with these cells."""
     begin = re.escape("| " + " | ".join(key) + " |")
-    (row,) = re.findall(rf"^{begin}(.*)\|$", METHOD.read_text(encoding="utf-8"), re.MULTILINE)
+    (row,) = re.findall(rf"^{begin}(.*)\|$", TABLES.read_text(encoding="utf-8"), re.MULTILINE)
     return [float(number) for number in row.split("|")]
 
 
@@ -79,7 +79,7 @@ def test_shares_cover_for_any_burst_length(
     assert all(low <= percentage <= high for percentage in coverages)
     assert BAND[0] <= naive[0] <= BAND[1], "Wilson, of losses independent losses"
     assert naive[-1] < 75, "Wilson, of long bursts"
-    assert in_method(f"{packets}", f"{rate:.0%}".replace("%", " %")) == pytest.approx(
+    assert table_row(f"{packets}", f"{rate:.0%}".replace("%", " %")) == pytest.approx(
         [*coverages, naive[0], naive[-1]], abs=0.8
     )
 
@@ -129,7 +129,7 @@ def test_shares_cover_less_if_repeats_differ_strongly(
         "all of 36" if largest == 36 else f"half of 36, half of {largest}"
     )
     record_property("result", f"share, repeats that differ by far, {label}: {rounded(coverages)}")
-    assert in_method(label) == pytest.approx(coverages, abs=0.8)
+    assert table_row(label) == pytest.approx(coverages, abs=0.8)
 
 
 def lognormal(sigma: float) -> Draw:
@@ -166,7 +166,7 @@ def test_means_and_medians_cover_skewed_repeats(name: str, record_property: Call
     assert BAND[0] <= of_mean[-1] <= BAND[1]
     assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
     assert abs(of_mean[-1] - 95) < abs(plain - 95)
-    assert in_method(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
+    assert table_row(name) == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
 
 @pytest.mark.parametrize("burst", mark_nightly([5, 20]))
@@ -181,7 +181,7 @@ def test_means_and_medians_cover_bursty_shares(burst: int, record_property: Call
     record_property("result", f"shares lost, bursts of {burst}: mean {rounded(of_mean)}, median {rounded(of_median)}")
     assert all(BAND[0] <= percentage <= BAND[1] for percentage in of_mean)
     assert all(BAND[0] <= percentage <= ORDERED for percentage in of_median)
-    assert in_method(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
+    assert table_row(f"share lost, bursts of {burst}") == pytest.approx([*of_mean, plain, *of_median], abs=0.8)
 
 
 def two_modes(share: float, apart: float) -> tuple[Draw, float]:
@@ -214,7 +214,7 @@ def test_medians_have_the_assured_coverage_for_any_distribution(
     coverages = {n: covered(medians(draw(random, (CELLS, n))), middle) for n in FEW_AND_MANY}
     record_property("result", f"median, {name}, of {FEW_AND_MANY}: {rounded(list(coverages.values()))}")
     assert all(percentage >= 100 * assured(n) - 1 for n, percentage in coverages.items())
-    assert in_method(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
+    assert table_row(f"median, {name}") == pytest.approx(list(coverages.values()), abs=0.8)
 
 
 def rounded(coverages: list[float]) -> str:

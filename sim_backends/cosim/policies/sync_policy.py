@@ -46,7 +46,7 @@ class Situation:
 
     @property
     def next_ns(self) -> int | None:
-        """The time of the next event of programs or network, or None."""
+        """The time of the next event of programs or network, or None; `now_ns` if an event is due now."""
         times_ns = [at_ns for at_ns in (self.next_wake_ns(), self.next_event_ns()) if at_ns is not None]
         return max(min(times_ns), self.now_ns) if times_ns else None
 
@@ -60,8 +60,9 @@ class Situation:
 class SyncPolicy(Protocol):
     """Determines the length of each window, and how data crosses its borders.
 
-    A policy may have a text `decided_by` that describes what determined the last window; recordings contain it. A
-    policy with a method `extended_end_ns` is a `LookingAhead`.
+    The constructor may have the parameters `window_s`, `longest_s`, `bound_m`, `bound_db` and `exponent`: the values
+    of `policy` in a scenario. A policy may have a text `decided_by` that describes what determined the last window;
+    recordings contain it. A policy with a method `extended_end_ns` is a `LookingAhead`.
 
     Attributes:
         name: Its name in scenarios and tables.
@@ -80,7 +81,9 @@ class SyncPolicy(Protocol):
     defers_arrivals: bool
 
     def next_window(self, situation: Situation) -> int | None:
-        """Return the end of the next window, or None if there are no more events. It is called once per window.
+        """Return the end of the next window, an integer later than `situation.now_ns`; it is called once per window.
+
+        The end may be between physics steps. None means that the window lasts until the end of the run.
 
         Raises:
             PolicyError: The policy has no window for this situation.
