@@ -28,6 +28,7 @@ from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.stored import plans
 
 REPEATS: Final = (1_000, 5_000, 10_000)
 LAST: Final = 100
@@ -94,7 +95,7 @@ def run(out: Path, repeats: int) -> Path:
 
 def reopen(folder: Path) -> None:
     """Open a trial again, and continue it."""
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     started_s = time.perf_counter()
     ledger = Ledger(plan, folder, Stop())
     opened_s = time.perf_counter()

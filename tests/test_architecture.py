@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "agent": set(),  # it runs on robots, where not even `core` is available: see tests/agent
     "steps": {"agent", "backends", "config", "measure", "remote"},
     "trial": {"analysis", "backends", "config", "measure", "remote", "steps"},
-    "campaign": {"backends", "config", "trial"},
+    "campaign": {"analysis", "backends", "config", "trial"},
     "report": {"analysis", "lab", "measure", "trial"},
     "export": {"analysis", "measure", "trial"},
     "api": {"analysis", "export", "measure", "report", "trial"},

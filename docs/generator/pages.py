@@ -4,7 +4,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from dataclasses import fields
 from pathlib import Path
-from typing import Final, get_args
+from typing import Final
 
 from docs.generator.commands import commands
 from docs.generator.cosim_protocols import cosim_protocols
@@ -21,8 +21,9 @@ from fieldkit.config import loops
 from fieldkit.config.documentation import attribute_meanings, class_description
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.site import Site
-from fieldkit.core import errors, events
+from fieldkit.core import campaign_events, errors, events, sweep_events
 from fieldkit.core.columns import Column
+from fieldkit.core.model import MAX_STEPS
 from fieldkit.core.result_rows import DifferenceRow, EstimateRow, declared
 from fieldkit.measure.transfers.fates import PACKET_COLUMNS
 from fieldkit.pytest import plugin
@@ -178,7 +179,7 @@ def procedure() -> str:
                 ("`during`", "required", "Steps to repeat for each combination of values."),
             ),
         ),
-        f"A file has at most {loops.MAX_STEPS:,} steps after expansion.",
+        f"A file has at most {MAX_STEPS:,} steps after expansion.",
     )
 
 
@@ -308,11 +309,20 @@ def json_events() -> str:
             "`event`, `utc_ns` and the fields below. How a program answers requests: [automation](../automation.md)."
         ),
     ]
-    for record in get_args(events.Event):
+    for record in _event_types():
         meanings = attribute_meanings(record)
         lines = ((f"`{field.name}`", meanings.get(field.name, "")) for field in fields(record))
         blocks += [f"## {_snake(record.__name__)}", class_description(record), table(("field", "meaning"), lines)]
     return page("JSON events", *blocks)
+
+
+def _event_types() -> Iterator[type[events.Event]]:
+    """Yield the types of events: of a trial, of a campaign, of a sweep, each in the order of their declarations."""
+    for module in (events, campaign_events, sweep_events):
+        for member in vars(module).values():
+            is_declared = inspect.isclass(member) and member.__module__ == module.__name__
+            if is_declared and issubclass(member, events.Event) and member is not events.Event:
+                yield member
 
 
 def _snake(name: str) -> str:

@@ -7,10 +7,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import independence
 from fieldkit.analysis.quantities import DEFAULT_BY, Quantity, Tally, tallies
 from fieldkit.analysis.repeats import Key, Repeats
-from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
+from fieldkit.analysis.statistics import (
+    MIN_FOR_INDEPENDENCE_TESTS,
+    Intervals,
+    assured,
+    mean_shares,
+    means,
+    medians,
+    shares,
+    wilsons,
+)
 from fieldkit.core.columns import Column, Kind
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import ENDED, Status
@@ -199,6 +207,10 @@ def _quantities_without_value(
 def _correct_p_values(estimates: Sequence[dict[str, Estimate]]) -> None:
     """Correct the p-values `p_order` for the number of all estimates."""
     tested = [(cell, estimate) for cell in estimates for estimate in cell.values() if estimate.p_order is not None]
+    if not tested:
+        return
+    from fieldkit.analysis import independence  # noqa: PLC0415 (few repeats cannot be tested)
+
     corrected = independence.corrected(
         np.array([estimate.p_order for _, estimate in tested], dtype=np.float64)
     ).tolist()
@@ -323,6 +335,10 @@ def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[n
     """Return the p-value of independence in time of each cell; NaN if a start time is unknown, and for flags."""
     if quantity.kind is Kind.FLAG or "started_utc_ns" not in repeats.numbers:
         return np.full(len(chosen), np.nan)
+    if chosen.shape[1] < MIN_FOR_INDEPENDENCE_TESTS:
+        return np.full(len(chosen), np.nan)
+    from fieldkit.analysis import independence  # noqa: PLC0415 (few repeats cannot be tested)
+
     p_values = independence.p_values(repeats.observed(quantity)[0][chosen])
     return np.where(np.isnan(repeats.numbers["started_utc_ns"][chosen]).any(axis=1), np.nan, p_values)
 

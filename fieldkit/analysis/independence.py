@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fieldkit.analysis.statistics import MIN_FOR_INDEPENDENCE_TESTS
+
 Floats = NDArray[np.float64]
 
-MIN_FOR_TESTS: Final = 10
-"""Minimum number of repeats; with fewer, the p-values cannot be small enough after correction for many tests."""
 _MIN_DISTINCT: Final = 5  # with fewer distinct values the approximation of the distribution is too coarse
 
 _erfc = np.frompyfunc(erfc, 1, 1)
@@ -29,9 +29,9 @@ def p_values(values: Floats) -> Floats:
         values: Shape (cells, n), in the order of time.
 
     Returns:
-        Shape (cells,); NaN for fewer than `MIN_FOR_TESTS` repeats or fewer than five distinct values.
+        Shape (cells,); NaN for fewer than `MIN_FOR_INDEPENDENCE_TESTS` repeats or fewer than five distinct values.
     """
-    if values.shape[1] < MIN_FOR_TESTS:
+    if values.shape[1] < MIN_FOR_INDEPENDENCE_TESTS:
         return np.full(len(values), np.nan)
     centred = _ranks(values)
     centred -= centred.mean(axis=1, keepdims=True)

@@ -160,7 +160,9 @@ def parse(content: bytes, declared: Iterable[Column], where: str = "trial.csv") 
     try:
         return parse_rows(header_names(header), body, named)
     except ValueError as error:
-        raise parsing.first_problem(where, content, named) or EvidenceError(
+        from fieldkit.analysis.table_errors import first_problem  # noqa: PLC0415 (tables of fieldkit are valid)
+
+        raise first_problem(where, content, named) or EvidenceError(
             f"its values do not agree with the declarations of its columns: {error}",
             where=where,
             remedy="correct the declarations under columns: in trial.yaml",

@@ -31,6 +31,8 @@ _SERIES: Final = (
     (79 * NORMAL**9 + 776 * NORMAL**7 + 1482 * NORMAL**5 - 1920 * NORMAL**3 - 945 * NORMAL) / 92160,
 )
 _LAST_TERM: Final = 32 * (_QUANTILE_2 - NORMAL - sum(term / 2**power for power, term in enumerate(_SERIES, 1)))
+MIN_FOR_INDEPENDENCE_TESTS: Final = 10
+"""Minimum number of repeats; with fewer, the p-values cannot be small enough after correction for many tests."""
 MIN_FOR_ORDER_STATISTICS: Final = 6  # the range of five values contains the median with a probability of only 93.75 %
 _ROUNDING: Final = 1e-12  # smaller relative deviations are rounding errors of equal shares
 

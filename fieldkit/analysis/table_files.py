@@ -10,7 +10,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fieldkit.analysis import parsing
+from fieldkit.analysis import parsing, table_errors
 from fieldkit.analysis.repeats import SOURCE, Repeats, by_name, header_names, parse_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
@@ -228,7 +228,7 @@ class _Batch:
             yield (columns or {}), [(path, -1 if columns is None else rows)]
 
     def _parse_single(self, path: Path, body: bytes, declared: Mapping[str, Column]) -> Repeats:
-        if (error := parsing.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
+        if (error := table_errors.first_problem(str(path), self.header + b"\n" + body, declared)) is not None:
             raise error
         try:
             return parse_rows(self.names, body, declared)
@@ -288,8 +288,8 @@ def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
     return (
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
         and set(ENDED).issuperset(rows.texts["status"])
-        and all(parsing.are_possible(column, declared[name]) for name, column in rows.numbers.items())
-        and parsing.contradiction(rows.numbers, rows.quantities) is None
+        and all(table_errors.are_possible(column, declared[name]) for name, column in rows.numbers.items())
+        and table_errors.contradiction(rows.numbers, rows.quantities) is None
     )
 
 

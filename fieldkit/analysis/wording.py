@@ -1,4 +1,4 @@
-"""Texts about estimates and judgements: numbers with units, intervals, verdicts, cautions."""
+"""Texts about estimates: numbers with units, intervals, verdicts, cautions."""
 
 import math
 import re
@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.analysis.cells import Cell, Estimate
-from fieldkit.analysis.expectations import Scope
-from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import Quantity, Tally, in_order
 from fieldkit.analysis.statistics import CONFIDENCE, MIN_FOR_ORDER_STATISTICS, assured
 from fieldkit.core import columns
@@ -77,16 +75,17 @@ def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
         other: Its mean or 95th percentile, to be used instead; a lower bound if any repeat is censored.
     """
     if other is not None:
-        return f"{_at_least(estimate.n_censored > 0)}{scale.number(other)}"
-    return f"{_at_least(estimate.is_lower_bound)}{scale.number(estimate.value)}"
+        return f"{at_least(estimate.n_censored > 0)}{scale.number(other)}"
+    return f"{at_least(estimate.is_lower_bound)}{scale.number(estimate.value)}"
 
 
 def amount(scale: Scale, estimate: Estimate) -> str:
     """Return the value of an estimate with its unit, as `>= 2.30 s` if it is a lower bound."""
-    return f"{_at_least(estimate.is_lower_bound)}{scale.amount(estimate.value)}"
+    return f"{at_least(estimate.is_lower_bound)}{scale.amount(estimate.value)}"
 
 
-def _at_least(is_bound: bool) -> str:
+def at_least(is_bound: bool) -> str:
+    """Return the prefix of a value that is only a lower bound; empty for other values."""
     return ">= " if is_bound else ""
 
 
@@ -111,33 +110,6 @@ def with_interval(figure: str, scale: Scale, estimate: Estimate, between: str = 
     """
     part = incomplete(estimate)
     return between.join(filter(None, (figure, interval(scale, estimate), f"({part})" if part else "")))
-
-
-def judgement_texts(judgement: Judgement) -> tuple[str, str, str, str, str]:
-    """Return texts of the expectation, the protocol, the measured value, its interval, and the ruling."""
-    expectation = judgement.expectation
-    protocol = str((judgement.cell and judgement.cell.key.get("protocol")) or expectation.protocol or "").upper()
-    ruling = f"{judgement.ruling}: {judgement.why}" if judgement.why else str(judgement.ruling)
-    if judgement.estimate is None:
-        return expectation.text, protocol, "nothing", "", ruling
-    value, bounds = _measured(judgement, judgement.estimate)
-    part = incomplete(judgement.estimate)
-    return expectation.text, protocol, f"{value} ({part})" if part else value, bounds, ruling
-
-
-def _measured(judgement: Judgement, estimate: Estimate) -> tuple[str, str]:
-    """Return the measured value of a judgement, and the interval or bound that decided it."""
-    expectation = judgement.expectation
-    value_scale = scale_of(estimate.quantity, [estimate.value])
-    if expectation.scope is Scope.EVERY:
-        worst = estimate.maximum if expectation.is_below else estimate.minimum
-        worst_scale = scale_of(estimate.quantity, [worst])
-        return f"{_at_least(expectation.is_below and estimate.n_censored > 0)}{worst_scale.amount(worst)}", ""
-    if expectation.scope is Scope.SHARE and judgement.met is not None and judgement.limit is not None:
-        return f"{judgement.met} of {estimate.n} repeats", f"{Scale(100.0, '%').amount(judgement.limit)} or more"
-    if expectation.scope is Scope.PACKETS and judgement.limit is not None:
-        return value_scale.amount(estimate.value), f"{value_scale.amount(judgement.limit)} or less"
-    return amount(value_scale, estimate), interval(value_scale, estimate)
 
 
 def assumes_normal(estimate: Estimate) -> bool:

@@ -22,8 +22,9 @@ from fieldkit.export import table
 from fieldkit.export.table import Table
 from fieldkit.measure.transfers import fates
 from fieldkit.report.trial_folders import Evidence, load_evidence
-from fieldkit.trial import planned_evidence, sources
-from fieldkit.trial.sources import Sources
+from fieldkit.trial import planned_evidence
+from fieldkit.trial.stored import sources
+from fieldkit.trial.stored.sources import Sources
 
 
 @dataclass(frozen=True)

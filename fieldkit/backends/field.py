@@ -13,7 +13,7 @@ from fieldkit.config.profiles import RobotProfile
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site, is_ipv4
 from fieldkit.core import geometry
-from fieldkit.core.errors import ConfigurationError, FieldkitError
+from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Control, Fault, FaultKind, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.prompts import Answer, Operator
@@ -63,7 +63,8 @@ class FieldBackend:
     def cast(self, topology: Topology) -> Cast:
         """Return the robot in each role; see `Backend.cast`."""
         addresses = {name: robot.address or robot.host or "" for name, robot in self._site.robots.items()}
-        cast = cast_of(self._site, self._document, topology, addresses)
+        link_addresses = {name: robot.links for name, robot in self._site.robots.items()}
+        cast = cast_of(self._site, self._document, topology, addresses, link_addresses)
         for robot in cast.values():
             if not is_ipv4(robot.address):
                 raise ConfigurationError(
@@ -200,10 +201,11 @@ class FieldTestbed:
         name = self._cast[fault.role].name
         match fault.kind:
             case FaultKind.LINK_DOWN:
-                self.operator.ask(f"switch the Wi-Fi of {name} off")
+                what = f"the link {fault.link}" if fault.link else "the Wi-Fi"
+                self.operator.ask(f"switch {what} of {name} off")
                 start_s = time.monotonic()
                 time.sleep(fault.duration_s)
-                self.operator.ask(f"switch the Wi-Fi of {name} on again")
+                self.operator.ask(f"switch {what} of {name} on again")
                 return time.monotonic() - start_s
             case FaultKind.OUT_OF_RANGE:
                 self.operator.ask(f"carry {name} out of range, wait {fault.duration_s:g} s, and carry it back")
@@ -225,8 +227,12 @@ class FieldTestbed:
         )
         try:
             yield
-        except Exception:
-            self._bring_back(name)
+        except Exception as error:
+            try:
+                self._bring_back(name)
+            except ConfigurationError as unanswered:
+                unanswered.what += f"; before, the move failed: {describe_exception(error)}"
+                raise
             raise
         self._bring_back(name)
 

@@ -33,6 +33,18 @@ _FORMER_KEYS: Final = MappingProxyType({"drives": "drive", "flies": "mavlink"})
 """Section for each ability, by the key of the ability in plans of earlier versions."""
 
 
+class RobotLink(Strict):
+    """A robot's end of a link.
+
+    Attributes:
+        interface: Its network interface.
+        address: Its IPv4 address on the link.
+    """
+
+    interface: str
+    address: str
+
+
 class Robot(Strict):
     """A robot in a role, as it is written into the plan of a trial.
 
@@ -40,6 +52,7 @@ class Robot(Strict):
         name: Its name in the lab, `turtlebot-1`.
         address: Its IPv4 address on the radio under test.
         profile: Its profile.
+        links: Its ends of further links than the radio under test, by the name of the link.
         control: The network that SSH uses to reach it, from the site file.
         ros_master: Address on the radio of the robot that runs its ROS master; empty if its setup files define it.
         abilities: Sections of its profile by which steps may move it, for example `drive`.
@@ -48,6 +61,7 @@ class Robot(Strict):
     name: str
     address: str
     profile: RobotProfile
+    links: dict[str, RobotLink] = Field(default_factory=dict, exclude_if=schema.is_empty)
     control: Control = Control.SEPARATE
     ros_master: str = Field(default="", exclude_if=schema.is_empty)
     abilities: schema.Names = Field(default=frozenset(), exclude_if=schema.is_empty)
@@ -60,6 +74,13 @@ class Robot(Strict):
             return data
         abilities = [section for key, section in _FORMER_KEYS.items() if data.get(key)]
         return {key: value for key, value in data.items() if key not in _FORMER_KEYS} | {"abilities": abilities}
+
+    def link(self, name: str = "") -> RobotLink | None:
+        """Return its end of a link, of the radio under test if the name is empty; None if it has no such link."""
+        radio = self.profile.radio.interface
+        if not name or self.profile.links.get(name) == radio:
+            return RobotLink(interface=radio, address=self.address)
+        return self.links.get(name)
 
     @property
     def ros_graph(self) -> str:
@@ -100,7 +121,9 @@ class Oracle(Protocol):
         """
         ...
 
-    def delays(self, source: Role, destination: Role, protocol: model.Protocol, port: int) -> DelayParts:
+    def delays(
+        self, source: Role, destination: Role, protocol: model.Protocol, port: int, *, link: str = ""
+    ) -> DelayParts:
         """Return the parts of the delay of the packets from one robot to a port of another.
 
         Args:
@@ -108,6 +131,7 @@ class Oracle(Protocol):
             destination: The receiving robot.
             protocol: Transport protocol.
             port: Destination port, which distinguishes the flow from others.
+            link: Name of the link; empty for the radio under test.
 
         Returns:
             Sums over the packets and fragments of this flow that were delivered to `destination` since the first call

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterable, Mapping
 from contextlib import nullcontext
+from types import MappingProxyType
 
-from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot
+from fieldkit.backends.protocols import Backend, BackendFactory, Cast, Robot, RobotLink
 from fieldkit.config.profiles import RobotProfile, load_profile
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site
@@ -27,7 +28,17 @@ def load_backend(name: str, site: Site | None, document: Document | None) -> Bac
     return factory(site, document)
 
 
-def cast_of(site: Site, document: Document | None, topology: Topology, addresses: Mapping[str, str]) -> Cast:
+LinkAddresses = Mapping[str, Mapping[str, str]]
+"""Address on each further link by the link's name, by the robot's name."""
+
+
+def cast_of(
+    site: Site,
+    document: Document | None,
+    topology: Topology,
+    addresses: Mapping[str, str],
+    link_addresses: LinkAddresses = MappingProxyType({}),
+) -> Cast:
     """Return the cast that a site file gives for a topology.
 
     Args:
@@ -35,9 +46,11 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
         document: Its document, for messages with lines.
         topology: The topology.
         addresses: Address on the radio per robot name.
+        link_addresses: Addresses on further links.
 
     Raises:
-        ConfigurationError: The site file has no roles for the topology, or names a profile that does not exist.
+        ConfigurationError: The site file has no roles for the topology, names a profile that does not exist, or gives
+            no address for a link of a profile, or one for a link that the profile does not have.
     """
     if topology not in site.roles:
         other = "".join(f", or use --topology {name}" for name in list(site.roles)[:1])
@@ -61,11 +74,34 @@ def cast_of(site: Site, document: Document | None, topology: Topology, addresses
             name=names[role],
             address=addresses[names[role]],
             profile=profiles[names[role]],
+            links=_links_of(names[role], profiles[names[role]], link_addresses.get(names[role], {}), document),
             control=site.control,
             ros_master=addresses[master] if master and _runs_ros1(profiles[names[role]]) else "",
         )
         for role in sort_roles(names)
     }
+
+
+def _links_of(
+    name: str, profile: RobotProfile, addresses: Mapping[str, str], document: Document | None
+) -> dict[str, RobotLink]:
+    where = document.where(("robots", name)) if document else ""
+    further = profile.further_links
+    for link in addresses:
+        if link not in further:
+            raise ConfigurationError(
+                f"{name} has an address on the link {link!r}, which its profile {profile.name} does not have",
+                where=where,
+                remedy=did_you_mean(link, further, f"further links of the profile: {', '.join(further) or 'none'}"),
+            )
+    missing = [link for link in further if link not in addresses]
+    if missing:
+        raise ConfigurationError(
+            f"{name} has no address on the link {missing[0]!r} of its profile {profile.name}",
+            where=where,
+            remedy=f"add links: {{{missing[0]}: ADDRESS}} to it",
+        )
+    return {link: RobotLink(interface=further[link], address=address) for link, address in addresses.items()}
 
 
 def _runs_ros1(profile: RobotProfile) -> bool:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, 
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
+from fieldkit.analysis import expectations
 from fieldkit.campaign import order
 from fieldkit.campaign.order import PlannedTrial
 from fieldkit.config import schema
@@ -13,10 +14,10 @@ from fieldkit.config.schema import AfterValidator, Document, Duration, Field, In
 from fieldkit.core import laptop_files
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.model import Protocol, Topology
-from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.procedure import Procedure, Repeats, load_procedure, with_expectation
-from fieldkit.trial.sources import Note
+from fieldkit.trial.procedure import Procedure, Repeats, load_procedure
+from fieldkit.trial.stored import plans
+from fieldkit.trial.stored.sources import Note
 
 CAMPAIGN_FILE: Final = laptop_files.CAMPAIGN
 
@@ -112,8 +113,23 @@ def load_procedures(campaign: CampaignFile, document: Document) -> tuple[Procedu
             procedures.append(load_procedure(name))
     for index, text in enumerate(campaign.expect):
         with document.locating_errors("expect", index):
-            procedures = with_expectation(procedures, text)
+            procedures = _with_expectation(procedures, text)
     return tuple(procedures)
+
+
+def _with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
+    """Return the procedures, with the expectation added to each procedure that measures its figure.
+
+    Raises:
+        ConfigurationError: The text is not an expectation, or no procedure measures the figure.
+    """
+    quantity = expectations.parse(text, (figure for procedure in procedures for figure in procedure.figures)).quantity
+    return [
+        procedure.model_copy(update={"expect": (*procedure.expect, text)})
+        if quantity in {figure.name for figure in procedure.figures}
+        else procedure
+        for procedure in procedures
+    ]
 
 
 def trials_of(
@@ -264,7 +280,7 @@ def _subfolders(path: Path) -> list[Path]:
 
 def _unmeasured_trials(folder: Path, sources: Collection[str]) -> Iterator[str]:
     plans = [
-        store.read_plan(Path(source))
+        plans.read_plan(Path(source))
         for source in sources
         if Path(source).absolute().parent == folder.absolute() and (Path(source) / PLAN_FILE).is_file()
     ]

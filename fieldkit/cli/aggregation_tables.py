@@ -9,6 +9,7 @@ from fieldkit.analysis import paper_tables, result_tables, table_lines, wording
 from fieldkit.analysis.cells import Cell, aggregate
 from fieldkit.analysis.comparable import MIXTURE_COLUMNS, mixtures
 from fieldkit.analysis.expectations import Expectation
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement, judge_by_trial
 from fieldkit.analysis.quantities import PER_UNIT, Quantity, parse_amount, symbols
 from fieldkit.analysis.repeats import SOURCE, Repeats
@@ -22,8 +23,8 @@ from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.executors import Workers
 from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_quantity
-from fieldkit.trial import sources
-from fieldkit.trial.sources import Sources
+from fieldkit.trial.stored import sources
+from fieldkit.trial.stored.sources import Sources
 
 _AdditionalRepeats = Sequence[Mapping[str, int]]
 """For each cell, the number of additional repeats per quantity; empty unless `--width` is given."""
@@ -191,7 +192,7 @@ def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequenc
     differing, _ = wording.varying_and_common(by, cells)
     rows = []
     for judgement in judgements:
-        expected, _, *judged = wording.judgement_texts(judgement)
+        expected, _, *judged = judgement_texts(judgement)
         rows.append(
             (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in differing), *judged)
         )

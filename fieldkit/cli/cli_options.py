@@ -10,13 +10,12 @@ from typing import Final, TextIO
 from fieldkit.backends.protocols import Backend, Relocating
 from fieldkit.backends.registry import load_backend
 from fieldkit.cli.sites import backend_name, lab_site
-from fieldkit.cli.terminal import Terminal
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core import permissions
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.model import Distance, Protocol, Topology
-from fieldkit.core.prompts import Operator, Script, Unattended
+from fieldkit.core.prompts import Operator, Unattended
 from fieldkit.core.units import parse_duration_s
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest
@@ -54,7 +53,10 @@ def operator(arguments: argparse.Namespace, sink: Sink) -> Iterator[Operator]:
     """
     if arguments.yes:
         yield Unattended()
-    elif arguments.answers is None:
+        return
+    from fieldkit.cli.operators import Script, Terminal  # noqa: PLC0415 (not needed with --yes)
+
+    if arguments.answers is None:
         yield Terminal(sink)
     elif arguments.answers == _STANDARD_INPUT:
         yield Script(sys.stdin, "standard input", sink)

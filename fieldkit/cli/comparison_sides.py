@@ -13,8 +13,8 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.cli.display import show_note
 from fieldkit.core.columns import cell
 from fieldkit.core.errors import ConfigurationError, did_you_mean, shell_command
-from fieldkit.trial import sources
-from fieldkit.trial.sources import Sources
+from fieldkit.trial.stored import sources
+from fieldkit.trial.stored.sources import Sources
 
 _DISTANCE: Final = frozenset({"distance", "distance_m"})
 _OF_SETTINGS: Final = frozenset({"procedure_sha256", "profiles_sha256"})

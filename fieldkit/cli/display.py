@@ -23,7 +23,6 @@ from typing_extensions import override
 
 from fieldkit.cli.event_words import event_words
 from fieldkit.cli.hints import completed
-from fieldkit.cli.progress import ProgressBar
 from fieldkit.core.events import Event, Finding, Sink
 from fieldkit.core.model import Verdict
 from fieldkit.core.text import json_text, sanitized
@@ -275,6 +274,8 @@ class _LiveLine:
     """The line at the bottom of the terminal that shows the progress."""
 
     def __init__(self) -> None:
+        from fieldkit.cli.progress import ProgressBar  # noqa: PLC0415 (only a terminal has a live line)
+
         self.progress = ProgressBar()
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:

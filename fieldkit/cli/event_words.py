@@ -5,9 +5,7 @@ from typing import Final
 
 from rich.cells import cell_len
 
-from fieldkit.cli.progress import Words
 from fieldkit.core import prompts
-from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent
 from fieldkit.core.errors import shell_command
 from fieldkit.core.events import (
     NOTHING_ARRIVED,
@@ -20,10 +18,10 @@ from fieldkit.core.events import (
     Request,
     TrialEnded,
     TrialStopped,
+    Words,
 )
 from fieldkit.core.model import Status, Verdict
-from fieldkit.core.sweep_events import SweepEnded, SweepPlanned, SweepRunEnded
-from fieldkit.core.units import TimeEstimate, format_bytes, format_count
+from fieldkit.core.units import TimeEstimate
 
 _INDENT: Final = 8
 _STYLE: Final = {Status.VALID: "green", Status.VOID: "yellow", Status.FAILED: "red"}
@@ -61,51 +59,9 @@ def event_words(event: Event, width: int | None = None) -> Words:
         case TrialStopped(folder, done, total):
             command = f"to continue: {shell_command('fieldkit', 'resume', folder)}"
             words = ((f"stopped, {done} of {total} repeats are done; {command}", "bold"),)
-        case CampaignPlanned() | CampaignTrial() | CampaignWent() | CampaignEnded():
-            words = _campaign_words(event)
         case _:
-            words = _sweep_words(event)
+            words = event.words
     return words
-
-
-def _campaign_words(event: CampaignPlanned | CampaignTrial | CampaignWent | CampaignEnded) -> Words:
-    if isinstance(event, CampaignTrial):
-        return ((f"trial {event.number} of {event.total}: {event.trial}", "bold"),)
-    done = f"campaign: {event.done} of {event.total} trials are done"
-    match event:
-        case CampaignPlanned(trials=()):
-            return ((done, ""),)
-        case CampaignPlanned():
-            names = (f"\n{number:5d}  {name}" for number, name in enumerate(event.trials, start=event.done + 1))
-            disk = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
-            duration = TimeEstimate(event.left_s, event.left_most_s)
-            dead_links = " if links are dead" if not duration.is_certain else ""
-            cost = f"{event.walk_m:.0f} m to walk with robots, about {duration}{dead_links}; at most {disk}"
-            return ((f"{done}; {cost}{''.join(names)}", ""),)
-        case CampaignWent():
-            duration = TimeEstimate(event.left_s, event.left_most_s)
-            left = f", about {duration} left" if event.done < event.total else ""
-            return ((f"{done}{left}", ""),)
-        case CampaignEnded():
-            hint = "" if event.done == event.total else "; to continue, run the same command again"
-            return ((f"{done}{hint}: {event.folder}", "bold"),)
-
-
-def _sweep_words(event: Event) -> Words:
-    """Return the texts of an event of a sweep; empty for others, and for finished runs, as there may be thousands."""
-    match event:
-        case SweepPlanned():
-            done = f"; {event.done:,} are done" if event.done else ""
-            factors = f"{format_count(event.settings, 'setting')} with {format_count(event.seeds, 'seed')}"
-            return ((f"{event.total:,} runs: {factors}{done}", ""),)
-        case SweepRunEnded() if event.reason:
-            remedy = f"\n{' ' * _INDENT}remedy: {event.remedy}" if event.remedy else ""
-            head = f"{event.settings}, seed {event.seed}: " if event.settings else f"seed {event.seed}: "
-            return ((head, ""), (f"failed (attempt {event.attempt}): ", "red"), (event.reason, ""), (remedy, ""))
-        case SweepEnded():
-            failed = f", {event.failed:,} failed" if event.failed else ""
-            return ((f"{event.done:,} of {event.total:,} runs are done{failed}: {event.folder}", "bold"),)
-    return ()
 
 
 def _repeat_words(event: RepeatEnded, width: int | None) -> Words:

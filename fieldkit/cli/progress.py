@@ -3,7 +3,6 @@
 import time
 from typing import Final
 
-from fieldkit.core.campaign_events import CampaignEnded, CampaignTrial
 from fieldkit.core.events import (
     Answered,
     Asked,
@@ -13,15 +12,10 @@ from fieldkit.core.events import (
     Progress,
     RepeatEnded,
     Request,
-    TrialEnded,
     TrialStarted,
-    TrialStopped,
+    Words,
 )
-from fieldkit.core.sweep_events import SweepEnded
 from fieldkit.core.units import format_duration
-
-Words = tuple[tuple[str, str], ...]
-"""Texts with their styles, in order."""
 
 _BARS: Final = {100: 24, 60: 12, 0: 6}
 """Width of the bar by the minimum width of the line. Fixed widths keep the bar from moving when texts change."""
@@ -57,6 +51,7 @@ class ProgressBar:
         # Other threads may send events while the operator types.
         is_question = isinstance(event, Request | Asked)
         self._is_asking = is_question or (self._is_asking and not isinstance(event, Answered | Entered))
+        self._trial = event.part or self._trial
         match event:
             case PhaseStarted():
                 self._phase, self._phase_start_s = event, time.monotonic()
@@ -65,14 +60,12 @@ class ProgressBar:
                     self._phase, self._phase_start_s = PhaseStarted(event.what), time.monotonic()
                 self._done, self._total, self._unit = event.done, event.total, f" {event.unit}"
                 self._end_s = None if event.left_s is None else time.monotonic() + event.left_s
-            case CampaignTrial():
-                self._trial = f"trial {event.number} of {event.total}"
             case TrialStarted():
                 self._done, self._total, self._end_s = event.done, event.total, None
             case RepeatEnded():
                 self._done, self._total = event.done, event.total
                 self._end_s = time.monotonic() + event.left_s
-            case TrialEnded() | TrialStopped() | CampaignEnded() | SweepEnded():
+            case _ if event.ends_progress:
                 self._phase, self._done, self._total, self._end_s = PhaseStarted(""), 0, 0, None
 
     def words(self, width: int) -> Words:

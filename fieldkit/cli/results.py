@@ -4,11 +4,10 @@ import argparse
 import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from fieldkit.analysis import table_lines, wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli.display import fits, print_folded, show_error, table
 from fieldkit.cli.hints import completed
@@ -18,6 +17,9 @@ from fieldkit.core.text import print_text
 from fieldkit.core.units import format_count
 from fieldkit.trial import store
 from fieldkit.trial.running.runner import Outcome
+
+if TYPE_CHECKING:
+    from fieldkit.analysis.judgements import Judgement
 
 Row = tuple[str, ...]
 _SummaryTable = tuple[Row, list[Row]]
@@ -135,10 +137,12 @@ def write_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
         ) from error
 
 
-def expectation_table(judgements: Sequence[Judgement]) -> None:
+def expectation_table(judgements: "Sequence[Judgement]") -> None:
     """Print a row for each expectation with its judgement. Without expectations, print nothing."""
     if judgements:
-        rows = [wording.judgement_texts(judgement) for judgement in judgements]
+        from fieldkit.analysis.judgement_words import judgement_texts  # noqa: PLC0415 (few procedures have expectations)
+
+        rows = [judgement_texts(judgement) for judgement in judgements]
         table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 

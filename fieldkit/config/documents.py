@@ -5,7 +5,6 @@ This is the only module that imports PyYAML.
 
 import codecs
 import math
-import os
 import re
 import stat
 from collections.abc import Iterator
@@ -31,6 +30,11 @@ _MAX_DIGITS: Final = 100
 """Maximum number of characters of a number. The time of Python's conversion grows with the square of the length."""
 _INVALID_CHARACTERS: Final = re.compile("[\0\ud800-\udfff]")
 """Characters that an escape sequence can produce, but that file names, arguments and UTF-8 files cannot contain."""
+
+Node = yaml.Node
+"""A value in the syntax tree of a document."""
+MappingNode = yaml.MappingNode
+CollectionNode = yaml.CollectionNode
 
 Location = tuple[str | int, ...]
 """Keys and indices from the root of a document to a value."""
@@ -180,6 +184,19 @@ class Document:
             existing = (*existing, part) if (*existing, part) in self.lines else existing
         return existing
 
+    def has_key(self, key: str) -> bool:
+        """Return True if any mapping of the document has this key."""
+        remaining = [self.data]
+        while remaining:
+            value = remaining.pop()
+            if isinstance(value, dict):
+                if key in value:
+                    return True
+                remaining += value.values()
+            elif isinstance(value, list):
+                remaining += value
+        return False
+
     @contextmanager
     def locating_errors(self, *location: str | int) -> Iterator[None]:
         """Add `file:line` of a location to errors that the body raises without a place."""
@@ -308,51 +325,14 @@ def to_text(data: object) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=110)
 
 
-def with_value(text: str, location: tuple[str, ...], value: str) -> str:
-    """Return a document with one key of a mapping set to a plain text; every other character is unchanged.
-
-    A new key is added at the end of its mapping. The caller must check the result, because not every layout of YAML
-    can be edited in this way.
-
-    Args:
-        text: The document.
-        location: Keys that lead to the value; the mapping that contains the last key exists and is not empty.
-        value: Written without quotes.
+def compose(text: str) -> yaml.Node | None:
+    """Return the syntax tree of a document, with the position of each value; None if the document is empty.
 
     Raises:
         ValueError: The document is not valid YAML.
     """
-    *parents, key = location
     try:
-        node = _Loader(text).get_single_node()
+        root: yaml.Node | None = _Loader(text).get_single_node()
     except yaml.YAMLError as error:
         raise ValueError(str(error)) from error
-    for parent in parents:
-        node = _value(node, parent)
-    old_node = _value(node, key)
-    if old_node is not None:
-        start, end = old_node.start_mark.index, old_node.end_mark.index
-        return f"{text[:start]}{'' if start < end else ' '}{value}{text[end:]}"
-    assert isinstance(node, yaml.MappingNode)
-    insert_at = _end_index(node.value[-1][1])
-    if node.flow_style:
-        return f"{text[:insert_at]}, {key}: {value}{text[insert_at:]}"
-    line_end = re.compile(r"\r?\n|\Z").search(text, insert_at)
-    assert line_end is not None
-    insert_at = line_end.start()
-    column = node.value[-1][0].start_mark.column
-    return f"{text[:insert_at]}{line_end[0] or os.linesep}{' ' * column}{key}: {value}{text[insert_at:]}"
-
-
-def _value(mapping: yaml.Node | None, key: str) -> yaml.Node | None:
-    """Return the value of a key, or None if the mapping does not have it."""
-    assert isinstance(mapping, yaml.MappingNode)
-    return next((value for name, value in mapping.value if name.value == key), None)
-
-
-def _end_index(node: yaml.Node) -> int:
-    """Return the index after a node. For a block collection, the end mark of PyYAML is the start of the next node."""
-    while isinstance(node, yaml.CollectionNode) and not node.flow_style:
-        last = node.value[-1]
-        node = last[1] if isinstance(node, yaml.MappingNode) else last
-    return node.end_mark.index
+    return root

@@ -18,11 +18,8 @@ from typing import Any, Final
 
 from fieldkit.config.documents import Document, Location
 from fieldkit.core.errors import ConfigurationError, did_you_mean
+from fieldkit.core.model import LOOP, MAX_STEPS
 
-MAX_STEPS: Final = 1000
-"""Maximum number of steps of a file after its loops are expanded."""
-
-_LOOP: Final = "for"
 _KEYS: Final = ("each", "during")
 _VARIABLE: Final = re.compile(r"[a-z][a-z0-9_]{0,30}")
 _BRACES: Final = re.compile(r"\{\{|\}\}|\{(?P<name>[a-z][a-z0-9_]{0,30})\}")
@@ -82,12 +79,12 @@ class _Expander:
     def _append(self, result: list[Any], items: list[Any], at: Location, to: Location, values: Values) -> None:
         for index, item in enumerate(items):
             key_path = (*at, index)
-            if isinstance(item, dict) and _LOOP in item:
+            if isinstance(item, dict) and LOOP in item:
                 if len(item) > 1:
                     raise self._problem(
                         "for: must be the only key of its entry", key_path, "start another entry with - for:"
                     )
-                self._append_loop(result, item[_LOOP], (*key_path, _LOOP), to, values)
+                self._append_loop(result, item[LOOP], (*key_path, LOOP), to, values)
                 continue
             self._steps += 1
             if self._steps > MAX_STEPS:

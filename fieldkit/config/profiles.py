@@ -230,6 +230,14 @@ class Tools(Strict):
     capture_right: Annotated[str, Field(pattern="^(direct|sudo)$")] = "direct"
 
 
+InterfaceName = Annotated[
+    str, pattern_field(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, such as wlan0")
+]
+LinkName = Annotated[
+    str, pattern_field(r"^[a-z][a-z0-9-]{0,15}$", "a name of at most 16 lower-case letters, digits and -")
+]
+
+
 class Radio(Strict):
     """The robot's radio.
 
@@ -243,9 +251,7 @@ class Radio(Strict):
         phy: Physical layer of 802.11n, ac or ax, for the emulated radio.
     """
 
-    interface: Annotated[
-        str, pattern_field(r"^[a-z][a-z0-9._-]{0,14}$", "the name of a network interface, such as wlan0")
-    ]
+    interface: InterfaceName
     standard: str
     access_point: schema.Bool = False
     tx_power_dbm: Number | Int
@@ -312,6 +318,8 @@ class RobotProfile(catalog.Named, Sectioned):
         kind: `ugv` (ground), `uav` (air) or `usv` (water).
         computer: The on-board computer, for information only.
         radio: The radio under test.
+        links: Network interface by the name of a link, for a robot with [several links](links.md): `{wifi: wlan0,
+            cell: wwan0}`. The link with the interface of `radio` is the default of steps.
         tools: Programs on the robot, each a name or a path.
         ros: Its ROS settings; a robot without them records nothing.
         limits: Limits of the robot.
@@ -323,6 +331,7 @@ class RobotProfile(catalog.Named, Sectioned):
     kind: Annotated[str, Field(pattern="^(ugv|uav|usv)$")]
     computer: str
     radio: Radio
+    links: dict[LinkName, InterfaceName] = Field(default_factory=dict, exclude_if=schema.is_empty)
     tools: Tools = Tools.defaults()
     ros: Ros | None = None
     limits: Limits
@@ -337,6 +346,17 @@ class RobotProfile(catalog.Named, Sectioned):
         """Its sections of installed packages, by key."""
         extra = self.model_extra or {}
         return {key: section for key, section in extra.items() if isinstance(section, ProfileSection)}
+
+    @schema.model_validator(mode="after")
+    def _has_different_interfaces(self) -> "RobotProfile":
+        if len(set(self.links.values())) < len(self.links):
+            raise schema.validation_error("two links have the same interface", "links")
+        return self
+
+    @property
+    def further_links(self) -> Mapping[str, str]:
+        """Interface of each link besides the radio, by its name."""
+        return {name: interface for name, interface in self.links.items() if interface != self.radio.interface}
 
     @schema.model_validator(mode="after")
     def _has_consistent_sections(self) -> "RobotProfile":

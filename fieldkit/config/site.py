@@ -53,6 +53,7 @@ class SiteRobot(Strict):
             `keyring` reads it from the system's keyring. The password itself is never written into the file.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
         address: Its IPv4 address on the radio under test; without it, `host`.
+        links: Its IPv4 address on each further link of its profile, by the name of the link.
     """
 
     profile: str
@@ -63,6 +64,7 @@ class SiteRobot(Strict):
     password: Annotated[str | None, BeforeValidator(_no_plain_password)] = None
     host_key: str | None = None
     address: Annotated[str, AfterValidator(_ipv4)] | None = None
+    links: dict[str, Annotated[str, AfterValidator(_ipv4)]] = Field(default_factory=dict, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
     def _has_one_login_method(self) -> "SiteRobot":

@@ -1,5 +1,7 @@
 """Creation and changes of site files: a commented template, and the host keys of robots."""
 
+import os
+import re
 from importlib import resources
 from pathlib import Path
 from typing import Any, Final
@@ -63,7 +65,7 @@ def pin_host_key(path: Path, robot: str, host_key: str) -> None:
 def _with_key(text: str, robot: str, host_key: str) -> str:
     """Return the file with the key, or unchanged if it cannot be edited."""
     try:
-        return documents.with_value(text, ("robots", robot, _KEY), host_key)
+        return _with_value(text, ("robots", robot, _KEY), host_key)
     except ValueError:
         return text
 
@@ -75,3 +77,50 @@ def _is_pinned(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa:
         return bool(documents.parse(text, source="").data == expected)
     except ConfigurationError:
         return False
+
+
+def _with_value(text: str, location: tuple[str, ...], value: str) -> str:
+    """Return a document with one key of a mapping set to a plain text; every other character is unchanged.
+
+    A new key is added at the end of its mapping. The caller must check the result, because not every layout of YAML
+    can be edited in this way.
+
+    Args:
+        text: The document.
+        location: Keys that lead to the value; the mapping that contains the last key exists and is not empty.
+        value: Written without quotes.
+
+    Raises:
+        ValueError: The document is not valid YAML.
+    """
+    *parents, key = location
+    node = documents.compose(text)
+    for parent in parents:
+        node = _value(node, parent)
+    old_node = _value(node, key)
+    if old_node is not None:
+        start, end = old_node.start_mark.index, old_node.end_mark.index
+        return f"{text[:start]}{'' if start < end else ' '}{value}{text[end:]}"
+    assert isinstance(node, documents.MappingNode)
+    insert_at = _end_index(node.value[-1][1])
+    if node.flow_style:
+        return f"{text[:insert_at]}, {key}: {value}{text[insert_at:]}"
+    line_end = re.compile(r"\r?\n|\Z").search(text, insert_at)
+    assert line_end is not None
+    insert_at = line_end.start()
+    column = node.value[-1][0].start_mark.column
+    return f"{text[:insert_at]}{line_end[0] or os.linesep}{' ' * column}{key}: {value}{text[insert_at:]}"
+
+
+def _value(mapping: documents.Node | None, key: str) -> documents.Node | None:
+    """Return the value of a key, or None if the mapping does not have it."""
+    assert isinstance(mapping, documents.MappingNode)
+    return next((value for name, value in mapping.value if name.value == key), None)
+
+
+def _end_index(node: documents.Node) -> int:
+    """Return the index after a node. For a block collection, the end mark of PyYAML is the start of the next node."""
+    while isinstance(node, documents.CollectionNode) and not node.flow_style:
+        last = node.value[-1]
+        node = last[1] if isinstance(node, documents.MappingNode) else last
+    return node.end_mark.index

@@ -2,9 +2,14 @@
 
 from dataclasses import dataclass
 
+from typing_extensions import override
+
+from fieldkit.core.events import Event, Words
+from fieldkit.core.units import TimeEstimate, format_bytes
+
 
 @dataclass(frozen=True)
-class CampaignPlanned:
+class CampaignPlanned(Event):
     """The remaining work of a campaign.
 
     Attributes:
@@ -29,9 +34,22 @@ class CampaignPlanned:
     free_bytes: int
     left_most_s: float = 0.0
 
+    @property
+    @override
+    def words(self) -> Words:
+        done = _done_text(self.done, self.total)
+        if not self.trials:
+            return ((done, ""),)
+        names = (f"\n{number:5d}  {name}" for number, name in enumerate(self.trials, start=self.done + 1))
+        disk = f"{format_bytes(self.needed_bytes)} of disk ({format_bytes(self.free_bytes)} free)"
+        duration = TimeEstimate(self.left_s, self.left_most_s)
+        dead_links = " if links are dead" if not duration.is_certain else ""
+        cost = f"{self.walk_m:.0f} m to walk with robots, about {duration}{dead_links}; at most {disk}"
+        return ((f"{done}; {cost}{''.join(names)}", ""),)
+
 
 @dataclass(frozen=True)
-class CampaignTrial:
+class CampaignTrial(Event):
     """A campaign starts a trial.
 
     Attributes:
@@ -44,9 +62,19 @@ class CampaignTrial:
     number: int
     total: int
 
+    @property
+    @override
+    def words(self) -> Words:
+        return ((f"{self.part}: {self.trial}", "bold"),)
+
+    @property
+    @override
+    def part(self) -> str:
+        return f"trial {self.number} of {self.total}"
+
 
 @dataclass(frozen=True)
-class CampaignWent:
+class CampaignWent(Event):
     """A trial of a campaign is finished, or was postponed.
 
     Attributes:
@@ -63,9 +91,15 @@ class CampaignWent:
     left_s: float
     left_most_s: float = 0.0
 
+    @property
+    @override
+    def words(self) -> Words:
+        left = f", about {TimeEstimate(self.left_s, self.left_most_s)} left" if self.done < self.total else ""
+        return ((f"{_done_text(self.done, self.total)}{left}", ""),)
+
 
 @dataclass(frozen=True)
-class CampaignEnded:
+class CampaignEnded(Event):
     """The campaign is finished or was stopped; the same command continues it.
 
     Attributes:
@@ -74,6 +108,18 @@ class CampaignEnded:
         total: Number of all trials.
     """
 
+    ends_progress = True
+
     folder: str
     done: int
     total: int
+
+    @property
+    @override
+    def words(self) -> Words:
+        hint = "" if self.done == self.total else "; to continue, run the same command again"
+        return ((f"{_done_text(self.done, self.total)}{hint}: {self.folder}", "bold"),)
+
+
+def _done_text(done: int, total: int) -> str:
+    return f"campaign: {done} of {total} trials are done"

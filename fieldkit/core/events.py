@@ -1,16 +1,39 @@
-"""Events of a trial, and all events, which the display, the log and `--json` receive."""
+"""Events of a trial, and the base class of all events, which the display, the log and `--json` receive."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
-from fieldkit.core.campaign_events import CampaignEnded, CampaignPlanned, CampaignTrial, CampaignWent
 from fieldkit.core.model import Status, Verdict
-from fieldkit.core.sweep_events import SweepEnded, SweepPlanned, SweepRunEnded
+
+Words = tuple[tuple[str, str], ...]
+"""Texts with their styles, in order."""
 
 
 @dataclass(frozen=True)
-class Note:
+class Event:
+    """Something that happened during a command.
+
+    The display has the texts of a trial's events. Events of other commands define their own texts, so that a trial
+    need not import them.
+    """
+
+    ends_progress: ClassVar[bool] = False
+    """Whether the work has ended whose progress is shown."""
+
+    @property
+    def words(self) -> Words:
+        """Displayed texts of an event that does not belong to a trial; empty if it is not displayed."""
+        return ()
+
+    @property
+    def part(self) -> str:
+        """Part of the work that starts, for example a trial of a campaign; empty for other events."""
+        return ""
+
+
+@dataclass(frozen=True)
+class Note(Event):
     """A message for the operator.
 
     Attributes:
@@ -21,7 +44,7 @@ class Note:
 
 
 @dataclass(frozen=True)
-class Request:
+class Request(Event):
     """The operator must do something; the trial waits for the answer.
 
     Attributes:
@@ -34,7 +57,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Answered:
+class Answered(Event):
     """The operator answered the last request.
 
     Attributes:
@@ -47,7 +70,7 @@ class Answered:
 
 
 @dataclass(frozen=True)
-class Asked:
+class Asked(Event):
     """The operator must enter a number or a word; the trial waits for the answer.
 
     Attributes:
@@ -60,7 +83,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Entered:
+class Entered(Event):
     """The operator answered the last question.
 
     Attributes:
@@ -71,7 +94,7 @@ class Entered:
 
 
 @dataclass(frozen=True)
-class Placed:
+class Placed(Event):
     """The robots are at their positions of the trial, or the operator postponed placing them.
 
     Attributes:
@@ -86,7 +109,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class PhaseStarted:
+class PhaseStarted(Event):
     """A phase of work started.
 
     Attributes:
@@ -101,7 +124,7 @@ class PhaseStarted:
 
 
 @dataclass(frozen=True)
-class Progress:
+class Progress(Event):
     """A computation has made progress.
 
     Attributes:
@@ -120,7 +143,7 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class CommandPlanned:
+class CommandPlanned(Event):
     """A command that a repeat would run, reported by a dry run.
 
     Attributes:
@@ -143,7 +166,7 @@ class CommandPlanned:
 
 
 @dataclass(frozen=True)
-class Finding:
+class Finding(Event):
     """The outcome of one check.
 
     Attributes:
@@ -166,7 +189,7 @@ NOTHING_ARRIVED: Final = "NOTHING ARRIVED"
 
 
 @dataclass(frozen=True)
-class RepeatEnded:
+class RepeatEnded(Event):
     """A repeat ended.
 
     Attributes:
@@ -195,7 +218,7 @@ class RepeatEnded:
 
 
 @dataclass(frozen=True)
-class TrialStarted:
+class TrialStarted(Event):
     """A trial started or was resumed.
 
     Attributes:
@@ -210,7 +233,7 @@ class TrialStarted:
 
 
 @dataclass(frozen=True)
-class ExpectationJudged:
+class ExpectationJudged(Event):
     """An expectation of a trial was evaluated for the repeats of one protocol.
 
     Attributes:
@@ -237,7 +260,7 @@ class ExpectationJudged:
 
 
 @dataclass(frozen=True)
-class TrialEnded:
+class TrialEnded(Event):
     """The trial is finished; its folder is complete.
 
     Attributes:
@@ -247,6 +270,8 @@ class TrialEnded:
         failed: Number of failed repeats.
     """
 
+    ends_progress = True
+
     folder: str
     valid: int
     void: int
@@ -254,7 +279,7 @@ class TrialEnded:
 
 
 @dataclass(frozen=True)
-class TrialStopped:
+class TrialStopped(Event):
     """The trial stopped before its end; `fieldkit resume FOLDER` continues it.
 
     Attributes:
@@ -263,33 +288,11 @@ class TrialStopped:
         total: Number of planned repeats.
     """
 
+    ends_progress = True
+
     folder: str
     done: int
     total: int
 
 
-Event = (
-    Note
-    | Request
-    | Answered
-    | Asked
-    | Entered
-    | Placed
-    | PhaseStarted
-    | Progress
-    | CommandPlanned
-    | Finding
-    | RepeatEnded
-    | TrialStarted
-    | ExpectationJudged
-    | TrialEnded
-    | TrialStopped
-    | CampaignPlanned
-    | CampaignTrial
-    | CampaignWent
-    | CampaignEnded
-    | SweepPlanned
-    | SweepRunEnded
-    | SweepEnded
-)
 Sink = Callable[[Event], None]

@@ -110,6 +110,11 @@ class Status(StrEnum):
 MAX_REPEATS: Final = 100_000
 """Maximum number of repeats per protocol of one trial. This number of repeats would take weeks."""
 
+LOOP: Final = "for"
+"""Key of a loop in a list of steps."""
+MAX_STEPS: Final = 1000
+"""Maximum number of steps of a procedure's file after its loops are expanded."""
+
 ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """Final states of an attempt."""
 
@@ -171,12 +176,14 @@ class Fault:
         role: Role of the affected robot.
         duration_s: Duration in seconds; 0 for a reboot or a kill, whose duration is not controlled.
         process: Name of the process that is killed; empty for the other kinds.
+        link: Name of the link that is down; empty for the radio under test and the other kinds.
     """
 
     kind: FaultKind
     role: Role
     duration_s: float = 0.0
     process: str = ""
+    link: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,11 @@
-"""Questions to the operator: one interface for a person at a terminal, for answers from a file, and for `--yes`."""
+"""Questions to the operator, and the operator with `--yes`; `fieldkit.cli.operators` has those that read answers."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Protocol
 
 from typing_extensions import override
 
-from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
 from fieldkit.core.text import sanitized
 
 SKIP: Final = "s"
@@ -112,63 +109,6 @@ class Unattended(Operator):
 
 
 UNATTENDED: Final = Unattended()
-
-
-class Script(Operator):
-    """Operator whose answers are lines of a file or pipe, one per request.
-
-    An empty line means done, `s` means postponed, and `n TEXT` means done with a note. A line is read only after its
-    request was reported, so that a program at the other end of a pipe can answer it.
-
-    Args:
-        lines: The answers.
-        source: Source of the lines, for messages.
-        sink: Receives each request and its answer.
-    """
-
-    def __init__(self, lines: Iterator[str], source: str, sink: Sink) -> None:
-        self._lines = lines
-        self._source = source
-        self._sink = sink
-        self._line_number = 0
-
-    @override
-    def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        self._sink(Request(request, may_skip))
-        line = self._next(request)
-        answer = parse(line, may_skip=may_skip)
-        if answer is None:
-            raise self._no_answer(line, request, answer_hint(may_skip=may_skip))
-        self._sink(Answered(answer.skip, answer.note))
-        return answer
-
-    @override
-    def enter(self, question: Question) -> str:
-        self._sink(Asked(question.text, question.answer_hint))
-        line = self._next(question.text)
-        answer = question.read(line)
-        if answer is None:
-            raise self._no_answer(line, question.text, question.answer_hint)
-        self._sink(Entered(answer))
-        return answer
-
-    def _next(self, request: str) -> str:
-        self._line_number += 1
-        line = next(self._lines, None)
-        if line is None:
-            raise ConfigurationError(
-                f"no answer left to: {request}", where=self._where, remedy="add a line per request"
-            )
-        return line
-
-    def _no_answer(self, line: str, request: str, remedy: str) -> ConfigurationError:
-        return ConfigurationError(
-            f"{line.strip()!r} is not an answer to: {request}", where=self._where, remedy=remedy
-        )
-
-    @property
-    def _where(self) -> str:
-        return f"{self._source}:{self._line_number}"
 
 
 def answer_hint(*, may_skip: bool) -> str:

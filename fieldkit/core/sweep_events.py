@@ -1,10 +1,18 @@
 """Events of a sweep of simulations."""
 
 from dataclasses import dataclass
+from typing import Final
+
+from typing_extensions import override
+
+from fieldkit.core.events import Event, Words
+from fieldkit.core.units import format_count
+
+_INDENT: Final = " " * 8
 
 
 @dataclass(frozen=True)
-class SweepPlanned:
+class SweepPlanned(Event):
     """A sweep of simulations starts or continues.
 
     Attributes:
@@ -21,9 +29,16 @@ class SweepPlanned:
     settings: int
     seeds: int
 
+    @property
+    @override
+    def words(self) -> Words:
+        done = f"; {self.done:,} are done" if self.done else ""
+        factors = f"{format_count(self.settings, 'setting')} with {format_count(self.seeds, 'seed')}"
+        return ((f"{self.total:,} runs: {factors}{done}", ""),)
+
 
 @dataclass(frozen=True)
-class SweepRunEnded:
+class SweepRunEnded(Event):
     """An attempt at a run of a sweep ended.
 
     Attributes:
@@ -46,9 +61,18 @@ class SweepRunEnded:
     done: int
     total: int
 
+    @property
+    @override
+    def words(self) -> Words:
+        if not self.reason:
+            return ()  # there may be thousands of finished runs
+        remedy = f"\n{_INDENT}remedy: {self.remedy}" if self.remedy else ""
+        head = f"{self.settings}, seed {self.seed}: " if self.settings else f"seed {self.seed}: "
+        return ((head, ""), (f"failed (attempt {self.attempt}): ", "red"), (self.reason, ""), (remedy, ""))
+
 
 @dataclass(frozen=True)
-class SweepEnded:
+class SweepEnded(Event):
     """A sweep is finished or was stopped; the same command continues it.
 
     Attributes:
@@ -58,7 +82,15 @@ class SweepEnded:
         total: Number of all runs.
     """
 
+    ends_progress = True
+
     folder: str
     done: int
     failed: int
     total: int
+
+    @property
+    @override
+    def words(self) -> Words:
+        failed = f", {self.failed:,} failed" if self.failed else ""
+        return ((f"{self.done:,} of {self.total:,} runs are done{failed}: {self.folder}", "bold"),)

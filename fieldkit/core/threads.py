@@ -4,6 +4,8 @@ from collections.abc import Callable, Collection
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from fieldkit.core.errors import FieldkitError
+
 if TYPE_CHECKING:
     from concurrent.futures import Future
 
@@ -60,7 +62,8 @@ def run_parallel(
         on_interrupt: Ends the waits of the calls after Ctrl-C, for example by closing connections. The threads then
             have 10 s to return, so that they no longer write to files. Without it, Ctrl-C does not wait for them.
         end_others: Ends the waits of all calls after one has failed. It is called repeatedly until all threads have
-            returned, and their errors are ignored. Without it, all calls run to their end.
+            returned. Their `FieldkitError`s are consequences and are ignored. Another exception is a mistake in the
+            code of a call, and is raised instead of the first error. Without it, all calls run to their end.
     """
     from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (logging, 5 ms)
 
@@ -84,7 +87,14 @@ def run_parallel(
             on_interrupt()
             wait(running, _INTERRUPT_WAIT_S)
         raise
+    if failed is not None:
+        failed = next((future for future in futures if is_mistake(future.exception())), failed)
     return [future.result() for future in ([failed] if failed else futures)]
+
+
+def is_mistake(error: BaseException | None) -> bool:
+    """Return True for an exception that no code of a step expects, so that it must not be hidden by another error."""
+    return isinstance(error, Exception) and not isinstance(error, FieldkitError)
 
 
 def _run_call(future: "Future[T]", call: Callable[[Item], T], item: Item) -> None:

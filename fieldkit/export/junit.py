@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree as ET
 
-from fieldkit.analysis import judgements, table_files, wording
+from fieldkit.analysis import judgements, table_files
 from fieldkit.analysis.cells import aggregate
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.analysis.quantities import quantities
 from fieldkit.core import files
@@ -19,6 +20,7 @@ from fieldkit.core.text import sanitized
 from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans
 
 _SEPARATOR: Final = "."
 """Separator of class names, by which servers group cases."""
@@ -52,7 +54,7 @@ def text(folders: Iterable[Path]) -> bytes:
 
 
 def _suite(folder: Path) -> ET.Element:
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     cases = [*_repeat_cases(plan, journal.history(folder, plan)), *map(_expectation_case, _judgements(folder, plan))]
     group = _SEPARATOR.join(("fieldkit", plan.procedure.name, plan.distance.replace(_SEPARATOR, "_"), plan.topology))
     for case in cases:
@@ -99,7 +101,7 @@ def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
 
 
 def _expectation_case(judgement: Judgement) -> ET.Element:
-    expected, subject, measured, interval, ruling = wording.judgement_texts(judgement)
+    expected, subject, measured, interval, ruling = judgement_texts(judgement)
     case = ET.Element("testcase", name=f"{expected} ({subject})" if subject else expected, time="0")
     if not judgement.holds:
         _add(case, "failure", f"{ruling}: {measured} {interval}".rstrip())

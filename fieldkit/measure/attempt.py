@@ -22,10 +22,16 @@ class AttemptEvidence:
 
     Args:
         folder: The attempt's folder.
+
+    Attributes:
+        folder: The attempt's folder.
+        unexpected_errors: Name of each file whose reader raised another exception than its documented ones, and this
+            exception.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.unexpected_errors: list[tuple[str, Exception]] = []
         self._read: dict[Hashable, Any] = {}
         self._failed: dict[Hashable, EvidenceError] = {}
         self._cached: dict[Hashable, Any] = {}
@@ -55,6 +61,7 @@ class AttemptEvidence:
             except MemoryError:  # not cached, because it is not caused by the file
                 raise
             except Exception as error:  # a reader's unexpected error is caused by the file's content
+                self.unexpected_errors.append((name or "its files", error))
                 reason = f"cannot be read: {type(error).__name__}: {error}"
                 self._failed[key] = EvidenceError(reason, where=str(self.folder / name))
                 raise self._failed[key] from error

@@ -13,7 +13,7 @@ import pytest
 from fieldkit.backends.protocols import Backend, Cast, Testbed
 from fieldkit.cli import cli_options as command_line
 from fieldkit.cli import sites
-from fieldkit.cli.terminal import Terminal
+from fieldkit.cli.operators import Terminal
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Asked, Event, Request, Sink
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Scenario, Topology

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Final
 
-from fieldkit.analysis import wording
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement
 from fieldkit.api.trials import Trials, load
 from fieldkit.backends.protocols import simulators_of
@@ -115,8 +115,6 @@ def _load_checked(outcome: Outcome) -> Trials:
 
 def _require_expected(judgements: Sequence[Judgement]) -> None:
     __tracebackhide__ = True
-    unmet = [
-        " ".join(filter(None, wording.judgement_texts(judgement))) for judgement in judgements if not judgement.holds
-    ]
+    unmet = [" ".join(filter(None, judgement_texts(judgement))) for judgement in judgements if not judgement.holds]
     if unmet:
         raise ExpectationError("; ".join(unmet))

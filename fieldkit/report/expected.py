@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.expectations import Expectation
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement, Ruling, judge_by_trial
-from fieldkit.analysis.wording import judgement_texts
 from fieldkit.report import wording
 from fieldkit.report.trial_folders import Evidence
 

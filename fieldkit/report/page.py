@@ -5,6 +5,8 @@ This is the only module that imports jinja2.
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -15,11 +17,15 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from fieldkit import __version__
 from fieldkit.analysis.wording import counts, label, tally
+from fieldkit.core import files
+from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.text import sanitized
 from fieldkit.report import figures, theme, wording
 from fieldkit.report.charts import Panel
 from fieldkit.report.contents import Contents
 
+DEFAULT_NAME: Final = "report.html"
+_START: Final = b"<!DOCTYPE html>"
 _TEMPLATE: Final = "report.html"
 _SVG: Final = "http://www.w3.org/2000/svg"
 _XLINK: Final = "http://www.w3.org/1999/xlink"
@@ -33,6 +39,49 @@ _LOCAL_URL: Final = re.compile(r"url\(#")
 
 ET.register_namespace("", _SVG)
 ET.register_namespace("xlink", _XLINK)
+
+
+def write(contents: Contents, out: Path) -> None:
+    """Write the page; raises as `explaining_write_errors`."""
+    with explaining_write_errors(out, "-o"):
+        files.write(out, render(contents, out).encode())
+
+
+def require_writable(out: Path) -> None:
+    """Raise an error before the work if no page can be written there. Only a report may be overwritten."""
+    if not out.parent.is_dir():
+        raise ConfigurationError(
+            "there is no such folder", where=str(out.parent), remedy=shell_command("mkdir", "-p", out.parent)
+        )
+    if out.is_dir():
+        raise ConfigurationError(
+            "this is a folder", where=str(out), remedy=f"name a file: {shell_command('-o', out / DEFAULT_NAME)}"
+        )
+    if out.exists() and not _is_page(out):
+        raise ConfigurationError(
+            "this file is not a report, and is not overwritten",
+            where=str(out),
+            remedy="choose another -o",
+        )
+
+
+def _is_page(out: Path) -> bool:
+    """Return True if a file is a report or empty. A pipe is not read, because that would block."""
+    if not out.is_file():
+        return False
+    with explaining_write_errors(out, "-o"), out.open("rb") as file:
+        return file.read(len(_START)) in {b"", _START}
+
+
+@contextmanager
+def explaining_write_errors(path: Path, option: str) -> Iterator[None]:
+    """Turn an OSError of the body into a ConfigurationError with the path and the option."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigurationError(
+            f"cannot be written: {error.strerror}", where=str(path), remedy=f"choose another {option}"
+        ) from error
 
 
 def render(contents: Contents, out: Path) -> str:

@@ -19,8 +19,10 @@ from fieldkit.core.errors import FieldkitError
 from fieldkit.core.model import Status
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import ping
-from fieldkit.trial import manifest, planned_evidence, store
+from fieldkit.trial import planned_evidence, store
 from fieldkit.trial.plan import PLAN_FILE, Plan
+from fieldkit.trial.stored import plans as stored_plans
+from fieldkit.trial.stored import verification
 
 MAX_TRIALS: Final = 300
 """Maximum number of trials whose evidence is compared with the manifest and shown."""
@@ -159,15 +161,15 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
         if (Path(source) / PLAN_FILE).is_file():
             try:
-                plans[source] = store.read_plan(Path(source))
+                plans[source] = stored_plans.read_plan(Path(source))
             except FieldkitError as error:
                 unread.append(error.located)
     first = [repeats.texts["source"][repeats.row(attempt)]] if attempt else []
     chosen = _chosen(repeats, plans, first)
     for source in chosen:
         try:
-            if differences := manifest.differences(Path(source)):
-                summary = manifest.summarize(differences)
+            if differences := verification.differences(Path(source)):
+                summary = verification.summarize(differences)
                 unread.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
                 changed |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:

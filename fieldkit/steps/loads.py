@@ -6,10 +6,11 @@ Only options of iperf3 3.1 are used.
 from typing import Annotated, Final
 
 from fieldkit.config import schema
-from fieldkit.config.schema import Bits, Field, Int, Strict
+from fieldkit.config.schema import Bits, Field, Int
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.transfers.deliveries import FlowSchedule
 from fieldkit.measure.transfers.iperf3_load import COOKIE_BYTES, LoadStreams
+from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import GOOD_BIT_S, Flow, Scene, frames
 
 PROGRAM: Final = "iperf3"
@@ -21,7 +22,7 @@ _BLOCK_BYTES: Final = 8192
 """Block size of TCP with a rate. With iperf3's default of 128 KiB, 2 Mbit/s would be two bursts per second."""
 
 
-class LoadOptions(Strict):
+class LoadOptions(OverLink):
     """A load from one robot to another.
 
     Attributes:
@@ -62,7 +63,7 @@ class LoadOptions(Strict):
         udp = self.carried_by(scene.protocol) is Protocol.UDP
         rate = self.rate or (DEFAULT_UDP_BIT_S if udp else None)
         return (
-            *(PROGRAM, "-c", scene.robot(self.receiver).address, "-p", str(self.port)),
+            *(PROGRAM, "-c", scene.link(self.receiver, self.over).address, "-p", str(self.port)),
             *(("-u", "-l", str(self.payload_bytes)) if udp else ()),
             *(() if udp or not rate else ("-l", str(_BLOCK_BYTES))),
             *(("-b", str(round(rate))) if rate else ()),
@@ -95,7 +96,7 @@ class LoadOptions(Strict):
             lasts_s: As `FlowSchedule.lasts_s`.
             until_ns: As `FlowSchedule.until_ns`.
         """
-        ends = [scene.robot(role).address for role in (self.sender, self.receiver)]
+        ends = [scene.link(role, self.over).address for role in (self.sender, self.receiver)]
         source, destination = reversed(ends) if reverse else ends
         carrier = self.carried_by(scene.protocol)
         return LoadStreams(
@@ -125,4 +126,4 @@ class LoadOptions(Strict):
         """Return the traffic of `size_bytes` of the load on the radio, in repeats of a protocol."""
         carrier = self.carried_by(protocol)
         frame_count = frames(carrier, size_bytes, self.payload_bytes)
-        return Flow(self.sender, self.receiver, self.port, frame_count, carrier)
+        return Flow(self.sender, self.receiver, self.port, frame_count, carrier, link=self.over)

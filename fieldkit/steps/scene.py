@@ -5,12 +5,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import ClassVar, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
-from fieldkit.backends.protocols import Cast, Robot
-from fieldkit.config.program_files import LabProgram
+from fieldkit.backends.protocols import Cast, Robot, RobotLink
 from fieldkit.core import geometry
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import ConfigurationError, RobotError, did_you_mean
 from fieldkit.core.model import Placement, Protocol, Role, Vector, Verdict
 from fieldkit.core.threads import StopSignal
 from fieldkit.measure.evidence.endings import Cause
@@ -19,6 +18,9 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
 from fieldkit.steps.motions import Motions
 from fieldkit.steps.variants import Tool, Variants
+
+if TYPE_CHECKING:
+    from fieldkit.config.program_files import LabProgram
 
 Shells = Mapping[Role, Shell]
 Announce = Callable[[str, float | None], None]
@@ -96,6 +98,24 @@ class Scene:
         """Return the robot in `role`."""
         return self.cast[role]
 
+    def link(self, role: Role, name: str = "") -> RobotLink:
+        """Return the robot's end of a link, of the radio under test if the name is empty.
+
+        Raises:
+            ConfigurationError: The robot has no such link.
+        """
+        robot = self.cast[role]
+        link = robot.link(name)
+        if link is None:
+            profile = robot.profile
+            raise ConfigurationError(
+                f"{robot.name} ({role}) has no link {name!r}",
+                remedy=did_you_mean(
+                    name, profile.links, f"links of profile {profile.name}: {', '.join(profile.links) or 'none'}"
+                ),
+            )
+        return link
+
     def tools(self, role: Role) -> Variants:
         """Return the detected tools of the robot in `role`, or the tools that are expected from its profile."""
         return self.variants.get(role) or variants.expected(self.cast[role].profile)
@@ -126,7 +146,7 @@ class PutProgram:
     """
 
     role: Role
-    program: LabProgram
+    program: "LabProgram"
     at: str
 
 
@@ -244,6 +264,7 @@ class Flow:
         protocol: Transport protocol; None for the protocol under test.
         group: A multicast group to which either of them also sends; None without multicast.
         served: Whether a program that the step does not start listens on the source.
+        link: Name of the link that carries them; empty for the radio under test.
     """
 
     source: Role
@@ -253,6 +274,7 @@ class Flow:
     protocol: Protocol | None = None
     group: str | None = None
     served: bool = False
+    link: str = ""
 
 
 @dataclass(frozen=True)

@@ -4,14 +4,11 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Annotated, Final
 
 from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Number, Strict
-from fieldkit.core import files
 from fieldkit.core.columns import Column, Figure, Kind
 
 MAX_COLUMNS: Final = 2000
@@ -61,44 +58,6 @@ def _require_unique_names(columns: tuple[FrozenColumn, ...]) -> tuple[FrozenColu
 
 
 Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MAX_COLUMNS), AfterValidator(_require_unique_names)]
-
-
-class _PlanColumns(Strict):
-    """The part of a plan that lists its columns."""
-
-    columns: Columns | None = None
-
-
-def read(path: Path) -> tuple[Column, ...]:
-    """Return the columns listed in a `trial.yaml`, without loading the step kinds of its procedure.
-
-    Raises:
-        ConfigurationError: The file cannot be read, or an entry is not a valid column.
-    """
-    document = schema.read(path)
-    if not isinstance(document.data, dict) or "columns" not in document.data:
-        return ()
-    plan = schema.validate(replace(document, data={"columns": document.data["columns"]}), _PlanColumns)
-    return tuple(frozen.column for frozen in plan.columns or ())
-
-
-class _ProcedureExpectations(Strict):
-    """The part of a procedure that lists its expectations."""
-
-    expect: tuple[str, ...] = ()
-
-
-def expected(path: Path) -> tuple[str, ...]:
-    """Return the expectations of the procedure in a `trial.yaml`, without loading its step kinds.
-
-    Raises:
-        ConfigurationError: The file cannot be read, or its expectations are invalid.
-    """
-    if b"expect:" not in files.read(path):  # a fast test: most plans have no expectations, and need not be parsed
-        return ()
-    procedure = schema.read(path).part("procedure")
-    data = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}
-    return schema.validate(replace(procedure, data=data), _ProcedureExpectations).expect
 
 
 def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:

@@ -31,7 +31,7 @@ class EvidenceVerdict:
         problems: Reasons why the evidence is incomplete or contradictory, so that the attempt is void; one sentence
             each.
         measured: The values that could be measured nevertheless.
-        step_errors: Tracebacks of the exceptions that steps raised on the evidence.
+        step_errors: Tracebacks of the exceptions that steps and readers of files raised on the evidence.
     """
 
     problems: tuple[str, ...]
@@ -49,8 +49,8 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
 
     The evidence of steps inside a fault may be incomplete, because the fault disturbs it. Each column that a step
     declares must have a value or a reason why it is missing; if it has neither, a value was lost and the attempt is
-    void. The attempt is also void if a step raises an exception on its evidence: a trial must continue, and must be
-    resumable and rebuildable for any content of its files.
+    void. The attempt is also void if a step or the reader of a file raises an unexpected exception: a trial must
+    continue, and must be resumable and rebuildable for any content of its files.
 
     Raises:
         MemoryError: This machine has too little memory; this is not a problem of the evidence.
@@ -90,6 +90,10 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
             result = Measured.all_missing(columns, reason)
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
+    # Otherwise an optional file would count as missing, and the error of its reader would be lost.
+    problems += (
+        step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
+    )
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks))
 
 

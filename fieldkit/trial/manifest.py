@@ -6,7 +6,6 @@ It has the format of `sha256sum`.
 import hashlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Final
 
@@ -14,14 +13,12 @@ from fieldkit.core import files, laptop_files
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.text import sanitized
 from fieldkit.trial import store
-from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.store import MANIFEST_FILE
 
 Sums = Mapping[str, str]
 """Checksum of each file by its name relative to the trial's folder."""
 
-_MAX_LISTED: Final = 5
 _LIMIT_BYTES: Final = 1 << 28
 _HEX_DIGITS: Final = frozenset("0123456789abcdef")
 
@@ -43,7 +40,7 @@ class Manifest:
         self._folder = folder
         previous = read(folder) if (folder / MANIFEST_FILE).exists() else {}
         self._top_level = {name: digest for name, digest in previous.items() if "/" not in name}
-        self._lines = {attempt: _lines(sums) for attempt, sums in _by_attempt(previous).items()}
+        self._lines = {attempt: _lines(sums) for attempt, sums in by_attempt(previous).items()}
 
     def __contains__(self, attempt: str) -> bool:
         """Return True if the evidence of an attempt has checksums; `attempt` is the name of its folder."""
@@ -54,7 +51,7 @@ class Manifest:
 
         An append-only file may have more lines now. The result is 0 for a file without a checksum.
         """
-        return _unchanged_lines(self._folder / name, self._top_level[name]) if name in self._top_level else 0
+        return count_unchanged_lines(self._folder / name, self._top_level[name]) if name in self._top_level else 0
 
     def add(self, attempt: Path) -> None:
         """Add the checksums of a stored attempt; its evidence is never written again, so this is done once."""
@@ -73,7 +70,7 @@ class Manifest:
 
         The plan never changes, so its first checksum is kept.
         """
-        top_level = {path.name: _sha256(path) for path in self._folder.iterdir() if _is_top_level(path)}
+        top_level = {path.name: sha256(path) for path in self._folder.iterdir() if _is_top_level(path)}
         if PLAN_FILE in self._top_level:
             top_level[PLAN_FILE] = self._top_level[PLAN_FILE]
         self._top_level = top_level
@@ -81,7 +78,7 @@ class Manifest:
 
     def renew(self, names: Iterable[str]) -> None:
         """Compute the checksums of the top-level files `names` again; all other checksums are kept."""
-        self._top_level |= {name: _sha256(self._folder / name) for name in names}
+        self._top_level |= {name: sha256(self._folder / name) for name in names}
         self._save()
 
     def renew_positions(self) -> None:
@@ -118,65 +115,12 @@ def read(folder: Path) -> Sums:
         ) from error
 
 
-def verify(folder: Path) -> list[str]:
-    """Compare a trial's files with its manifest.
-
-    Returns:
-        One sentence per difference, sorted by file; empty when all agree.
-
-    Raises:
-        EvidenceError: There is no manifest, or it cannot be read.
-    """
-    listed = read(folder)
-    unexpected = {str(path.relative_to(folder)): kind for path, kind in store.unexpected_files(folder)}
-    present = {_name(folder, path): path for path in _plain_files(folder)}
-    present.pop(MANIFEST_FILE, None)
-    return _sentences(_file_differences(listed.keys() - unexpected.keys(), listed, present) | unexpected)
-
-
-def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[str, str]:
-    """Return the changes of evidence since its checksums were made, by file; files without a checksum are ignored.
-
-    Args:
-        folder: The trial's folder; without a manifest there are no differences.
-        attempts: Names of the attempts' folders; None for all attempts, plan, journals and position files.
-
-    Raises:
-        EvidenceError: The manifest cannot be read.
-    """
-    if not (folder / MANIFEST_FILE).exists():
-        return {}
-    sums = read(folder)
-    summed = _by_attempt(sums)
-    top_level = _top_level_differences(folder, sums) if attempts is None else {}
-    selected = summed.keys() if attempts is None else summed.keys() & set(attempts)
-
-    def compare(attempt: str) -> dict[str, str]:
-        present = {_name(folder, path): path for path in _plain_files(store.attempt_folder(folder, attempt))}
-        return _file_differences(summed[attempt].keys(), summed[attempt], present)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return top_level | {
-            name: change for changes in pool.map(compare, selected) for name, change in changes.items()
-        }
-
-
-def _top_level_differences(folder: Path, sums: Sums) -> dict[str, str]:
-    """Return the changes of the plan and the journals; journals may have grown since their checksums were made."""
-    changed = {PLAN_FILE: PLAN_FILE in sums and _sha256(folder / PLAN_FILE) != sums[PLAN_FILE]}
-    for name in (JOURNAL_FILE, laptop_files.MOTION):
-        changed[name] = name in sums and _unchanged_lines(folder / name, sums[name]) is None
-    for name in filter(is_positions, sums.keys() | {path.name for path in folder.iterdir()}):
-        changed[name] = not (folder / name).is_file() or _sha256(folder / name) != sums.get(name)
-    return {name: "changed" for name, is_changed in changed.items() if is_changed}
-
-
 def is_positions(name: str) -> bool:
     """Return True if a top-level file of a trial contains positions of robots."""
     return name == laptop_files.POSITIONS or name.startswith(store.POSITIONS)
 
 
-def _unchanged_lines(path: Path, digest: str) -> int | None:
+def count_unchanged_lines(path: Path, digest: str) -> int | None:
     """Return the number of leading lines of a file that have this checksum, or None if there is no such number."""
     hasher, count = hashlib.sha256(), 0
     try:
@@ -190,40 +134,22 @@ def _unchanged_lines(path: Path, digest: str) -> int | None:
     return None
 
 
-def summarize(problems: Mapping[str, str]) -> str:
-    """Return a sentence with the first differences and the number of further ones."""
-    sentences = _sentences(problems)
-    more = len(sentences) - _MAX_LISTED
-    return "; ".join(sentences[:_MAX_LISTED]) + (f"; and {more} more: fieldkit verify lists them" if more > 0 else "")
-
-
-def _file_differences(names: Iterable[str], listed: Sums, present: Mapping[str, Path]) -> dict[str, str]:
-    listed_names = set(names)
-    problems = dict.fromkeys(listed_names - present.keys(), "missing")
-    problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")
-    problems |= {name: "changed" for name in listed_names & present.keys() if _sha256(present[name]) != listed[name]}
-    return problems
-
-
-def _sentences(problems: Mapping[str, str]) -> list[str]:
-    return [f"{sanitized(name).replace(chr(10), '?')}: {what}" for name, what in sorted(problems.items())]
-
-
-def _by_attempt(sums: Sums) -> dict[str, dict[str, str]]:
-    by_attempt: dict[str, dict[str, str]] = {}
+def by_attempt(sums: Sums) -> dict[str, dict[str, str]]:
+    """Return the checksums of the evidence of each attempt, by the name of its folder."""
+    sums_by_attempt: dict[str, dict[str, str]] = {}
     for name, digest in sums.items():
         place, _, rest = name.partition("/")
         attempt, _, file = rest.partition("/")
         if place == store.REPEATS and file:
-            by_attempt.setdefault(attempt, {})[name] = digest
-    return by_attempt
+            sums_by_attempt.setdefault(attempt, {})[name] = digest
+    return sums_by_attempt
 
 
 def _sums(folder: Path, attempt: Path) -> Sums:
-    return {_name(folder, path): _sha256(path) for path in _plain_files(attempt)}
+    return {relative_name(folder, path): sha256(path) for path in plain_files(attempt)}
 
 
-def _plain_files(folder: Path) -> Iterator[Path]:
+def plain_files(folder: Path) -> Iterator[Path]:
     """Yield the plain files at any depth below a folder, except hidden ones (unfinished, or made by a desktop)."""
     for where, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
@@ -231,7 +157,8 @@ def _plain_files(folder: Path) -> Iterator[Path]:
         yield from (path for path in paths if not files.unexpected_type(path))
 
 
-def _name(folder: Path, path: Path) -> str:
+def relative_name(folder: Path, path: Path) -> str:
+    """Return the name of a file in a manifest: its path below the trial's folder."""
     return path.relative_to(folder).as_posix()
 
 
@@ -265,6 +192,7 @@ def _unescaped(name: str) -> str:
     return "".join(plain.get(next(parts, ""), "?") if char == "\\" else char for char in parts)
 
 
-def _sha256(path: Path) -> str:
+def sha256(path: Path) -> str:
+    """Return the checksum of a plain file; raises OSError if the file cannot be read or is of another type."""
     with os.fdopen(files.open_plain(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,26 +1,26 @@
 """Procedures (`procedures/*.yaml`): the steps of a trial, which refer to robots by role."""
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from typing_extensions import override
 
-from fieldkit.analysis import expectations
-from fieldkit.analysis.expectations import Expectation
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.backends.protocols import Cast
-from fieldkit.config import catalog, loops, schema
+from fieldkit.config import catalog, schema
 from fieldkit.config.schema import Bool, Field, Int
 from fieldkit.config.sections import Sectioned
 from fieldkit.core import laptop_files, plugins
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import (
     FIXED_ROLES,
+    LOOP,
     MAX_REPEATS,
+    MAX_STEPS,
     Post,
     Protocol,
     Role,
@@ -45,6 +45,9 @@ from fieldkit.steps.scene import RecordedFile, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import columns, step_errors
 from fieldkit.trial.procedure_section import ProcedureSection
+
+if TYPE_CHECKING:
+    from fieldkit.analysis.expectations import Expectation
 
 Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 """Number of repeats per protocol."""
@@ -111,6 +114,11 @@ class Procedure(catalog.Named, Sectioned):
     @override
     def expanded(cls, document: schema.Document) -> schema.Document:
         """Return the document with every `for:` expanded."""
+        # Few procedures have loops. A document with few values is also below the maximum number of steps.
+        if len(document.lines) <= MAX_STEPS and not document.has_key(LOOP):
+            return document
+        from fieldkit.config import loops  # noqa: PLC0415
+
         return loops.expand_loops(document, "steps")
 
     @schema.model_validator(mode="after")
@@ -185,7 +193,7 @@ class Procedure(catalog.Named, Sectioned):
         return {key: section for key, section in extra.items() if isinstance(section, ProcedureSection)}
 
     @property
-    def expectations(self) -> tuple[Expectation, ...]:
+    def expectations(self) -> "tuple[Expectation, ...]":
         """The expectations of its figures."""
         return tuple(map(self._expectation, range(len(self.expect))))
 
@@ -194,7 +202,9 @@ class Procedure(catalog.Named, Sectioned):
         """The figures that can be aggregated from the columns of its steps."""
         return quantities(columns.filled_by(placed.step for placed in self.walk()))
 
-    def _expectation(self, index: int) -> Expectation:
+    def _expectation(self, index: int) -> "Expectation":
+        from fieldkit.analysis import expectations  # noqa: PLC0415 (few procedures have expectations)
+
         return expectations.parse(self.expect[index], self.figures)
 
     def walk(self) -> Iterator["PlacedStep"]:
@@ -356,22 +366,3 @@ def read_procedure(path: Path) -> Procedure:
         ConfigurationError: The file cannot be read, or has an error.
     """
     return catalog.validate_named(schema.read(path), Procedure, path.stem)
-
-
-def with_expectation(procedures: Sequence[Procedure], text: str) -> list[Procedure]:
-    """Return the procedures, with the expectation added to each procedure that measures its figure.
-
-    Args:
-        procedures: The procedures.
-        text: The expectation.
-
-    Raises:
-        ConfigurationError: The text is not an expectation, or no procedure measures the figure.
-    """
-    quantity = expectations.parse(text, (figure for procedure in procedures for figure in procedure.figures)).quantity
-    return [
-        procedure.model_copy(update={"expect": (*procedure.expect, text)})
-        if quantity in {figure.name for figure in procedure.figures}
-        else procedure
-        for procedure in procedures
-    ]

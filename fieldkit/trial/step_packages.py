@@ -1,14 +1,14 @@
 """Packages of step kinds that do not ship with fieldkit; their versions and code hashes are part of a plan."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
 from fieldkit.config.schema import Strict
 from fieldkit.core import plugins
-from fieldkit.steps import base, kinds
+from fieldkit.steps import kinds
 
 _HASH_DIGITS: Final = 16
 
@@ -37,40 +37,6 @@ def of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
         for point in plugins.entry_points(plugins.STEPS)
         if point.name in others and point.dist is not None
     }
-
-
-def changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
-    """Yield a sentence for each kind of step whose code differs from the plan although the version is equal."""
-    for kind, current in of_kinds(planned).items():
-        frozen = planned[kind]
-        if (frozen.package, frozen.version) == (
-            current.package,
-            current.version,
-        ) and frozen.code_sha256 != current.code_sha256:
-            yield (
-                f"the code of the step {kind} ({current.package} {current.version}) has changed since the trial "
-                "started: its repeats are measured by two versions of it"
-            )
-
-
-def missing(document: object) -> str | None:
-    """Return a sentence that names the kinds of step of a frozen plan that are not installed; None if all are.
-
-    Args:
-        document: The plan as plain data, before it is validated.
-    """
-    packages = document.get("step_packages") if isinstance(document, dict) else None
-    if not isinstance(packages, dict):
-        return None
-    absent = [kind for kind in packages if kind not in base.step_types()]
-    if not absent:
-        return None
-    sources = (packages[kind] if isinstance(packages[kind], dict) else {} for kind in absent)
-    descriptions = (
-        f"step kind `{kind}` from {source.get('package', 'an unknown package')} {source.get('version', '')}".strip()
-        for kind, source in zip(absent, sources, strict=True)
-    )
-    return f"{', '.join(descriptions)} {'is' if len(absent) == 1 else 'are'} not installed"
 
 
 def _code_hash(module: str) -> str:

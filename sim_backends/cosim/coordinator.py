@@ -4,7 +4,6 @@ It keeps the payloads; the network gets identities, sizes and times only. It rec
 """
 
 import copy
-import time
 from collections.abc import Callable, Mapping, Sequence
 from itertools import islice, repeat
 from operator import index
@@ -22,6 +21,7 @@ from sim_backends.cosim.federates import (
 )
 from sim_backends.cosim.packet_ledger import ABSENT, PacketLedger, fixed_emitters_m, transmitters
 from sim_backends.cosim.policies.sync_policy import (
+    EmptyWindows,
     LookingAhead,
     Pair,
     PolicyError,
@@ -30,18 +30,12 @@ from sim_backends.cosim.policies.sync_policy import (
     missing_members,
 )
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
-from sim_backends.cosim.wall_time import WallTime
+from sim_backends.cosim.wall_time import Progress, WallTime, rate_limited
 from sim_backends.network.packets import Arrival, Drop, Packet, Received
 from sim_backends.world.motion import DeadReckoned, State
 
-_MAX_EMPTY_WINDOWS: Final = 1000
-"""Number of successive windows of length 0 after which the policy has failed."""
-_PROGRESS_EVERY_S: Final = 0.2
 _NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
 """The results of `Coordinator._enter` for a window without packets, and the fates decided in the window."""
-
-Progress = Callable[[int, float], None]
-"""Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
 
 
 class Coordinator:
@@ -103,7 +97,7 @@ class Coordinator:
         self._active = in_pairs | {*other_agents}
         self._pairs, self._other_agents = tuple(pairs), other_agents
         self._deferred: Sequence[Sent] = ()
-        self._stalled_ns = self._empty_windows = 0
+        self._empty_windows = EmptyWindows()
         self._digest = EventDigest()
         self._extrapolates = getattr(network, "extrapolates", False)
         self._wall_time = WallTime(
@@ -241,7 +235,7 @@ class Coordinator:
         if end_ns > to_ns:
             return to_ns
         if end_ns <= begin_ns:
-            self._count_empty_window(begin_ns, end_ns)
+            self._empty_windows.add(self.policy.name, begin_ns, end_ns)
         return end_ns
 
     def _look_ahead(
@@ -299,22 +293,6 @@ class Coordinator:
         self._select_present()
         is_pending = sent or self._deferred or self._agents.has_undelivered
         situation.next_send_ns = now_ns if is_pending else self._agents.next_send_ns()
-
-    def _count_empty_window(self, begin_ns: int, end_ns: int) -> None:
-        """Count a window in which time does not advance; a limited number is allowed.
-
-        Raises:
-            PolicyError: There are too many, or time would run backwards.
-        """
-        if begin_ns != self._stalled_ns:
-            self._stalled_ns, self._empty_windows = begin_ns, 0
-        self._empty_windows += 1
-        if end_ns < begin_ns or self._empty_windows > _MAX_EMPTY_WINDOWS:
-            raise PolicyError(
-                f"time does not advance beyond {begin_ns} ns",
-                where=self.policy.name,
-                remedy="use another policy, or correct it",
-            )
 
     def _enter(
         self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
@@ -411,17 +389,3 @@ class Coordinator:
 
 def _window_text(begin_ns: int) -> str:
     return f"the window that begins at {seconds_text(begin_ns)}"
-
-
-def rate_limited(progress: Progress) -> Callable[[int], None]:
-    """Return a function of the simulated time that calls `progress` at most every 0.2 s of wall time."""
-    started_s = reported_s = time.perf_counter()
-
-    def report(now_ns: int) -> None:
-        nonlocal reported_s
-        wall_s = time.perf_counter()
-        if wall_s - reported_s >= _PROGRESS_EVERY_S:
-            reported_s = wall_s
-            progress(now_ns, wall_s - started_s)
-
-    return report

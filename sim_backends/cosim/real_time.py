@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from fieldkit.core.errors import EvidenceError
-from sim_backends.cosim.coordinator import Progress, rate_limited
 from sim_backends.cosim.federates import seconds_text
 from sim_backends.cosim.scenario.build import Simulation
+from sim_backends.cosim.wall_time import Progress, rate_limited
 
 LATE_BOUND_S: Final = 0.1
 """Default of the largest lateness; equal to the default of `late_bound` of emulated robots."""

@@ -1,4 +1,4 @@
-"""Wall time of a run by part, and the fault `stalled-federate`, which makes a federate answer late."""
+"""Wall time of a run by part, reports of its progress, and the fault `stalled-federate`: a federate answers late."""
 
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -6,6 +6,11 @@ from functools import partial
 from typing import Any, Final, Literal, Protocol, TypeVar, cast, runtime_checkable
 
 from sim_backends.cosim.federates import AnswerTimeoutError, NetworkFederate, PhysicsFederate, Program
+
+_PROGRESS_EVERY_S: Final = 0.2
+
+Progress = Callable[[int, float], None]
+"""Called with the simulated nanoseconds so far, and the wall seconds since the start of `advance`."""
 
 
 @runtime_checkable
@@ -148,3 +153,17 @@ def stalled(federate: Federate, stall: Stall) -> Federate:
         stall: When it stalls, and for how long.
     """
     return cast("Federate", _Stalled(federate, stall))
+
+
+def rate_limited(progress: Progress) -> Callable[[int], None]:
+    """Return a function of the simulated time that calls `progress` at most every 0.2 s of wall time."""
+    started_s = reported_s = time.perf_counter()
+
+    def report(now_ns: int) -> None:
+        nonlocal reported_s
+        wall_s = time.perf_counter()
+        if wall_s - reported_s >= _PROGRESS_EVERY_S:
+            reported_s = wall_s
+            progress(now_ns, wall_s - started_s)
+
+    return report

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from fieldkit.backends.protocols import CLOCK, INSTRUCTIONS, Cast, Robot, Testbed
-from fieldkit.backends.registry import cast_of
+from fieldkit.backends.registry import cast_of, profiles_of
 from fieldkit.config.profiles import Ros
 from fieldkit.config.schema import Document
 from fieldkit.config.site import Site, load_site
@@ -24,6 +24,7 @@ from sim_backends.emulated.provisioning import (
     NETWORK,
     RobotKey,
     drives_by_topic,
+    link_addresses,
     sensors_of,
 )
 from sim_backends.emulated.robot.spec import unsupported_paths
@@ -151,10 +152,19 @@ class EmulatedBackend:
 
     def cast(self, topology: Topology) -> Cast:
         """Implement `Backend.cast`; robots get addresses in their order in the site file."""
-        cast = cast_of(self._site, self._document, topology, self._addresses)
+        cast = cast_of(self._site, self._document, topology, self._addresses, self._link_addresses(topology))
         self._check_profiles(cast)
         return {
             role: robot.model_copy(update={"abilities": self._abilities(robot, cast)}) for role, robot in cast.items()
+        }
+
+    def _link_addresses(self, topology: Topology) -> dict[str, dict[str, str]]:
+        """Return the addresses on further links of the robots of a topology."""
+        profiles = profiles_of(self._site, self._document, self._site.roles.get(topology, {}).values())
+        return {
+            name: link_addresses(profile, self._addresses[name], self._options)
+            for name, profile in profiles.items()
+            if profile.further_links
         }
 
     def _abilities(self, robot: Robot, cast: Cast) -> frozenset[str]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 from fieldkit.config import schema
+from fieldkit.config.profiles import LinkName
 from fieldkit.config.schema import Bool, Document, Duration, Field, Length, Strict
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.robot.spec import HELLO_S, NETCATS, Netcat, Ping, SshServer, Userland
@@ -145,6 +146,8 @@ class EmulatedOptions(Strict):
             `baylands`, `open`). See [world file](reference/world-file.md).
         radio: The radio between the robots: Wi-Fi in that world, unless one of `loss`, `delay`, `rate` and `jitter`
             fixes the links.
+        links: The medium of each [further link](links.md) of the profiles, by the link's name, with the keys of
+            `radio`: `{cell: {rate: 20Mbit/s, delay: 40ms, loss: 1%}}`.
         late_bound: A repeat is void if a packet was delayed by the emulator itself by more than this in total, before
             and after the radio model.
         record_air: True to write every transmission attempt and ACK to `air.pcap` and `air.csv` of each repeat;
@@ -166,6 +169,7 @@ class EmulatedOptions(Strict):
     robots: dict[str, RobotOptions] = Field(default_factory=dict)
     world: str = "lawn"
     radio: RadioOptions = RadioOptions.defaults()
+    links: dict[LinkName, RadioOptions] = Field(default_factory=dict, exclude_if=schema.is_empty)
     late_bound: Annotated[Duration, Field(gt=0)] = LATE_BOUND_S
     record_air: Bool = False
     boot: Annotated[Duration, Field(ge=0)] = BOOT_S
@@ -191,6 +195,8 @@ class EmulatedOptions(Strict):
             raise schema.validation_error(
                 "`sync` needs a co-simulation; write for example `physics: kinematic`", "sync"
             )
+        if self.links and self.is_cosimulated:
+            raise schema.validation_error("a co-simulation has one network; remove `links`", "links")
         return self
 
     def with_wifi(self, kind: str) -> "EmulatedOptions":
@@ -212,6 +218,7 @@ class EmulatedOptions(Strict):
             "network": self.network,
             "mesh": self.mesh,
             "record_air": self.record_air,
+            "links": self.links,
             "radio": self.radio.fixed,
         }
         for key, value in excluded.items():

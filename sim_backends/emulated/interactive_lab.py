@@ -58,7 +58,7 @@ class EmulatedLab:
         self._lock = threading.RLock()
         for name in members:
             self._assign_place(name, self._places_m[name])
-        up.medium.place(self._places_m)
+        up.media.place(self._places_m)
         up.places.write(self._places_m)
         self._first_stats = up.medium.stats() if options.is_cosimulated else None
         self.members = members
@@ -74,7 +74,7 @@ class EmulatedLab:
 
     def place_m(self, name: str) -> Vector:
         """Implement `Lab.place_m`."""
-        self._running.medium.check_alive()
+        self._running.media.check_alive()
         if self._watch is not None:
             self._watch.check()
         with self._lock:
@@ -88,7 +88,7 @@ class EmulatedLab:
             # As in a trial, the robot is updated before the medium, whose physics refuses a place in an obstacle.
             self._assign_place(name, place_m)
             try:
-                self._running.medium.place(places_m)
+                self._running.media.place(places_m)
             except RobotError:
                 self._assign_place(name, self._places_m[name])
                 raise
@@ -121,7 +121,7 @@ class EmulatedLab:
                 self._states = states
                 self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
-                self._running.medium.place(self._places_m, velocities_m_s=velocities_m_s)
+                self._running.media.place(self._places_m, velocities_m_s=velocities_m_s)
                 self._running.places.write(self._places_m)
         return WATCH_S
 

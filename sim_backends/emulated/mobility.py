@@ -6,14 +6,13 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import MappingProxyType, TracebackType
-from typing import Final, Self
+from typing import Final, Protocol, Self
 
 from fieldkit.backends.protocols import Cast
 from fieldkit.core import geometry
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Move, Placement, Role, TrackPoint, Vector
 from sim_backends.emulated import placement as places
-from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
@@ -95,12 +94,25 @@ def self_steered(
     }
 
 
+class PlacesRobots(Protocol):
+    """A medium, or several."""
+
+    def place(
+        self,
+        positions_m: Mapping[str, Vector],
+        *,
+        relay: str | None = None,
+        velocities_m_s: Mapping[str, Vector] = ...,
+    ) -> None:
+        """Place the robots; see `MediumClient.place`."""
+
+
 class Mobility:
     """Places robots, moves them, and moves one out of range.
 
     Args:
         cast: The robot of each role.
-        medium: The medium that carries the robots' packets.
+        media: The media that carry the robots' packets.
         world: The world around the robots.
         laptop: The operator's laptop, placed beside the robots; None if it is not on the air.
         robots: Handles of the robots, which get their paths and report their motion if they steer themselves.
@@ -110,7 +122,7 @@ class Mobility:
     def __init__(
         self,
         cast: Cast,
-        medium: MediumClient,
+        media: PlacesRobots,
         world: World,
         laptop: Laptop | None,
         robots: Mapping[Role, EmulatedRobot] = MappingProxyType({}),
@@ -120,7 +132,7 @@ class Mobility:
         self._write_positions = write_positions
         self._robots = robots
         self._cast = cast
-        self._medium = medium
+        self._media = media
         self._world = world
         self._laptop = laptop
         self._placement: Placement | None = None
@@ -248,7 +260,7 @@ class Mobility:
             self._write_positions({name: state.position_m for name, state in states.items() if name != absent})
             if absent is not None:
                 states = {} if absent == relay else {name: state for name, state in states.items() if name != absent}
-            self._medium.place(
+            self._media.place(
                 {name: state.position_m for name, state in states.items()},
                 relay=relay if relay in states else None,
                 velocities_m_s={name: state.velocity_m_s for name, state in states.items()},

@@ -18,6 +18,7 @@ from fieldkit.lab.robots import LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
 from sim_backends.emulated.medium.framing import ETHERNET, IP, Framing
+from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.process import namespaces
 from sim_backends.emulated.process.worker import REPLY_S, Worker
@@ -156,6 +157,7 @@ class EmulatedRobot(Node):
         physics_fds: Descriptors for a physics that moves it, after `build`: the record of its motion, the file of its
             assigned paths, and the record of its commanded velocity, or of its autopilot's commands and of its
             flight; empty if no such physics moves it.
+        link_fds: Descriptor of the TUN device of each further link, by its name, after `open_links`.
 
     Raises:
         ConfigurationError: As `Node`.
@@ -167,6 +169,7 @@ class EmulatedRobot(Node):
         self._places_fd = places_fd
         self._record: SteeredRecord | None = None
         self.physics_fds: Sequence[int] = ()
+        self.link_fds: dict[str, int] = {}
 
     def build(self) -> None:
         """Give the robot its host name and its file system. Errors as `open_radio`."""
@@ -190,13 +193,31 @@ class EmulatedRobot(Node):
         """Start the robot's programs and return when they are ready. Errors as `open_radio`."""
         self._worker.request({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
 
-    def switch_off(self) -> None:
-        """Take the radio interface down. Errors as `open_radio`."""
-        self._worker.request({"do": "switch off", "interface": self.spec.interface})
+    def open_links(self) -> None:
+        """Bring up the interfaces of its further links. Errors as `open_radio`."""
+        for name, (interface, address) in self.spec.links.items():
+            mesh = self.spec.mesh_hello_s is not None
+            _, fds = self._worker.request(
+                {"do": "open link", "interface": interface, "address": address, "mesh": mesh}
+            )
+            if fds:
+                (self.link_fds[name],) = fds
 
-    def switch_on(self) -> None:
-        """Bring the radio interface up again. Errors as `open_radio`."""
-        self._worker.request({"do": "switch on", "interface": self.spec.interface})
+    def switch_off(self, link: str = "") -> None:
+        """Take the interface of a further link down, or of the radio. Errors as `open_radio`."""
+        interface, _ = self.spec.links.get(link, (self.spec.interface, ""))
+        self._worker.request({"do": "switch off", "interface": interface})
+
+    def switch_on(self, link: str = "") -> None:
+        """Bring the interface of a further link up again, or of the radio. Errors as `open_radio`."""
+        if link in self.spec.links:
+            self._worker.request({"do": "switch link on", "interface": self.spec.links[link][0]})
+        else:
+            self._worker.request({"do": "switch on", "interface": self.spec.interface})
+
+    @property
+    def _interfaces(self) -> list[str]:
+        return [self.spec.interface, *(self.spec.links[name][0] for name in self.link_fds)]
 
     def kill(self, process: str) -> None:
         """Kill every process of this name. Errors as `open_radio`; it is also an error if there is none."""
@@ -208,11 +229,11 @@ class EmulatedRobot(Node):
 
     def halt(self) -> None:
         """Cut the power: all processes except init are killed, and memory is lost. Errors as `open_radio`."""
-        self._worker.request({"do": "halt", "interface": self.spec.interface})
+        self._worker.request({"do": "halt", "interfaces": self._interfaces})
 
     def boot(self) -> None:
         """Boot after `halt`: the interface is up and the programs are starting. Errors as `open_radio`."""
-        self._worker.request({"do": "boot", "interface": self.spec.interface, "robot": asdict(self.spec)})
+        self._worker.request({"do": "boot", "interfaces": self._interfaces, "robot": asdict(self.spec)})
 
     @override
     def close(self) -> None:
@@ -220,9 +241,10 @@ class EmulatedRobot(Node):
         if self._record is not None:
             self._record.close()
             self._record = None
-        for fd in self.physics_fds[1:]:  # the first descriptor belongs to the record
+        for fd in (*self.physics_fds[1:], *self.link_fds.values()):  # the first one belongs to the record
             os.close(fd)
         self.physics_fds = ()
+        self.link_fds = {}
 
     def connect(self, timeout_s: float) -> socket.socket:
         """Return a TCP connection to the robot's SSH server over its loopback, which bypasses the radio.
@@ -256,11 +278,12 @@ _MAX_PARALLEL_STARTS: Final = 16
 
 @dataclass(frozen=True)
 class RunningRobots(Generic[RobotKey]):
-    """Running robots on one medium, without places yet.
+    """Running robots on their media, without places yet.
 
     Attributes:
         robots: The robots.
-        medium: The medium that carries their packets.
+        medium: The medium of the radio under test.
+        media: This medium and those of further links.
         places: Writer of the robots' places, for the lasers of the other robots.
         host_keys: Public host key of each robot.
         private_key: Private key that logs in on all robots, OpenSSH PEM.
@@ -268,6 +291,7 @@ class RunningRobots(Generic[RobotKey]):
 
     robots: Mapping[RobotKey, EmulatedRobot]
     medium: MediumClient
+    media: Media
     places: PlacesWriter
     host_keys: Mapping[RobotKey, str]
     private_key: str = field(repr=False)
@@ -307,6 +331,13 @@ def running_robots(
             medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
         else:
             medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
+        used = {name for robot in robots.values() for name in robot.profile.further_links}
+        links = {
+            name: stack.enter_context(MediumClient(link_options, world, seed=seed, framing=framing))
+            for name, link_options in options.links.items()
+            if name in used
+        }
+        media = Media(medium, links)
         places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
         # The pool is left after the robots: a request that waits for a robot fails only when the robot exits.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
@@ -325,11 +356,13 @@ def running_robots(
         for key, robot in running.items():
             radio, fd = robots[key].profile.radio, robot.radio_fd if robot.has_device else None
             medium.attach(robot.name, robot.address, radio, fd, physics_fds=robot.physics_fds)
+            for name, link_fd in robot.link_fds.items():
+                links[name].attach(robot.name, robot.spec.links[name][1], radio, link_fd)
         if any(robot.spec.waits_for_another for robot in running.values()):
-            medium.place(placement.side_by_side_m(robot.name for robot in running.values()))
+            media.place(placement.side_by_side_m(robot.name for robot in running.values()))
         list(started)
         yield RunningRobots(
-            running, medium, places, {key: pair.public for key, pair in host_keys.items()}, login.private
+            running, medium, media, places, {key: pair.public for key, pair in host_keys.items()}, login.private
         )
         for robot in running.values():
             robot.request_exit()
@@ -358,3 +391,4 @@ def _build(robot: EmulatedRobot, radios: "Mapping[str, HwsimRadio]") -> None:
         robot.open_wifi(radio.interface)
         return
     robot.open_radio(mesh=robot.spec.mesh_hello_s is not None)
+    robot.open_links()

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.util import find_spec
-from ipaddress import IPv4Network
+from ipaddress import IPv4Address, IPv4Network
 from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 from fieldkit.backends.protocols import Robot
@@ -15,6 +15,7 @@ from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.emulated_options import HOST_TOOLS, EmulatedOptions, RosChoice, uses_debian_ros
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
+from sim_backends.emulated.robot import network
 from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
 from sim_backends.emulated.ros import static_frames
 from sim_backends.emulated.ros.sensor_specs import (
@@ -35,6 +36,8 @@ NETWORK: Final = IPv4Network("10.42.0.0/24")
 LAPTOP_ADDRESS: Final = NETWORK[-2]
 """Address of the laptop; robots have lower addresses."""
 LAPTOP_NAME: Final = "laptop"
+MAX_LINKS: Final = 200
+"""Number of further links that have addresses: 10.42.N.0/24 is the network of the Nth."""
 
 _DEFAULTS: Final = EmulatedOptions.defaults()
 
@@ -129,8 +132,11 @@ def neighbour(number: int, profile: RobotProfile) -> Neighbour:
 
     A profile whose body is not in the table has the body of the paper's robot of its kind.
     """
-    from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER  # noqa: PLC0415 (numpy takes 60 ms)
-    from sim_backends.physics.robot_limits import BODIES, quadrotor  # noqa: PLC0415
+    from sim_backends.physics.robot_limits import (  # noqa: PLC0415 (a dry run makes no robots)
+        BODIES,
+        TURTLEBOT3_BURGER,
+        quadrotor,
+    )
 
     default = quadrotor(profile.name) if profile.kind == "uav" else TURTLEBOT3_BURGER
     body = BODIES.get(profile.name, default)
@@ -181,6 +187,41 @@ def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
         return ""
     package = {"dds": "cyclonedds"}.get(ros.middleware, ros.middleware)
     return ros.middleware if find_spec(package) else ""
+
+
+def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions) -> dict[str, str]:
+    """Return a robot's address on each further link that the lab emulates, by the link's name.
+
+    Args:
+        profile: The robot's profile.
+        address: Its address on the radio; its addresses have the same last byte.
+        options: The lab's options.
+
+    Raises:
+        ConfigurationError: The lab does not emulate a link of the profile.
+    """
+    last_byte = int(IPv4Address(address)) - int(NETWORK.network_address)
+    networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
+    for name, interface in profile.further_links.items():
+        if interface == network.LOOPBACK and options.mesh is not None:
+            networks[name] = network.SHARED_NETWORK.network_address
+        if name not in networks:
+            has_address_only = interface == network.LOOPBACK
+            example = (
+                "mesh: {daemon: babeld, hello: 0.5s}"
+                if has_address_only
+                else f"links: {{{name}: {{rate: 20Mbit/s, delay: 40ms}}}}"
+            )
+            raise ConfigurationError(
+                f"profile {profile.name} has the link {name!r}, which the lab does not emulate",
+                where="emulated",
+                remedy=f"write for example emulated: {{{example}}}",
+            )
+    return {name: str(networks[name] + last_byte) for name in profile.further_links}
+
+
+def _prefix_length(interface: str) -> int:
+    return 32 if interface == network.LOOPBACK else NETWORK.prefixlen
 
 
 def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:
@@ -282,6 +323,10 @@ def robot_spec(
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,
         ros2=ros2_over_radio,
         bridge=_bridge(robot),
+        links={
+            name: (interface := robot.profile.further_links[name], f"{address}/{_prefix_length(interface)}")
+            for name, address in link_addresses(robot.profile, robot.address, options).items()
+        },
         routes_zenoh=options.ros2.router == robot.name,
         **tools.model_dump(),
     )

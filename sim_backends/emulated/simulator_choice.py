@@ -23,8 +23,7 @@ from sim_backends.federates.named import (
     default_options,
     named,
 )
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
-from sim_backends.physics.robot_limits import BODIES, quadrotor
+from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, quadrotor
 
 _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
 """Default for a network in another process: an exchange at each of its events would take too long for real time.

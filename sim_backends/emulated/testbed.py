@@ -29,7 +29,7 @@ from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import PATIENCE_S, SshShell
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.emulated_options import EmulatedOptions, MeshOptions, RosChoice
-from sim_backends.emulated.medium.medium_client import MediumClient
+from sim_backends.emulated.medium.media import Media
 from sim_backends.emulated.mobility import Mobility
 from sim_backends.emulated.nodes import LAPTOP_RADIO, Laptop, Node, RunningRobots, running_robots
 from sim_backends.emulated.provisioning import LAPTOP_ADDRESS, NETWORK, RobotKey
@@ -44,16 +44,15 @@ class EmulatedOracle:
 
     Args:
         names: Name of each robot.
-        medium: The medium that carries the robots' packets.
+        media: The media that carry the robots' packets.
         mobility: The object that places the robots in the medium.
         options: The lab's options, with the limit of lateness and the option that records transmissions.
     """
 
-    def __init__(
-        self, names: Mapping[Role, str], medium: MediumClient, mobility: Mobility, options: EmulatedOptions
-    ) -> None:
+    def __init__(self, names: Mapping[Role, str], media: Media, mobility: Mobility, options: EmulatedOptions) -> None:
         self._names = names
-        self._medium = medium
+        self._media = media
+        self._medium = media.radio
         self._mobility = mobility
         self._late_bound_s = options.late_bound
         self._records_air = options.record_air
@@ -63,15 +62,16 @@ class EmulatedOracle:
         """Implement `Oracle.track` from the places that the medium received."""
         return self._mobility.track(since_utc_ns)
 
-    def delays(self, source: Role, destination: Role, protocol: Protocol, port: int) -> DelayParts:
+    def delays(self, source: Role, destination: Role, protocol: Protocol, port: int, *, link: str = "") -> DelayParts:
         """Implement `Oracle.delays`."""
-        return self._medium.delays(self._names[source], self._names[destination], _IP_PROTOCOL[protocol], port)
+        return self._media.of(link).delays(
+            self._names[source], self._names[destination], _IP_PROTOCOL[protocol], port
+        )
 
     def lateness(self) -> Lateness:
         """Implement `Oracle.lateness`."""
-        stats = self._medium.stats()
-        windows = stats.late_windows if self._has_windows else None
-        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=stats.late, windows=windows)
+        windows = self._medium.stats().late_windows if self._has_windows else None
+        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._media.late(), windows=windows)
 
     def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
         """Implement `Oracle.links`."""
@@ -111,14 +111,15 @@ class EmulatedTestbed:
         self.operator = operator
         self.robots = running.robots
         self.medium = running.medium
+        self._media = running.media
         self._laptop = laptop
         self._shells = shells
         self._boot_s = options.boot
         self._mobility = Mobility(
-            cast, running.medium, world, laptop, running.robots, write_positions=running.places.write
+            cast, running.media, world, laptop, running.robots, write_positions=running.places.write
         )
         names = {role: robot.name for role, robot in running.robots.items()}
-        self._oracle = EmulatedOracle(names, running.medium, self._mobility, options)
+        self._oracle = EmulatedOracle(names, running.media, self._mobility, options)
 
     @property
     def shells(self) -> Mapping[Role, Shell]:
@@ -132,7 +133,7 @@ class EmulatedTestbed:
 
     def check_alive(self) -> None:
         """Implement `Transient.check_alive`."""
-        self.medium.check_alive()
+        self._media.check_alive()
         nodes: list[Node] = [*self.robots.values()]
         for node in nodes if self._laptop is None else [*nodes, self._laptop]:
             node.check_alive()
@@ -147,7 +148,8 @@ class EmulatedTestbed:
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:
-                return _apply_for(fault.duration_s, robot.switch_off, robot.switch_on)
+                down, up = partial(robot.switch_off, fault.link), partial(robot.switch_on, fault.link)
+                return _apply_for(fault.duration_s, down, up)
             case FaultKind.OUT_OF_RANGE:
                 remove = partial(self._mobility.set_out_of_range, fault.role)
                 return _apply_for(fault.duration_s, remove, partial(self._mobility.set_out_of_range, None))
@@ -223,7 +225,7 @@ def bring_up(
         running = stack.enter_context(running_robots(cast, options=options, world=world, ros=ros, seed=seed))
         laptop = stack.enter_context(laptop_on_air(running, options.mesh)) if control is Control.RADIO else None
         if laptop is not None:  # it connects to the robots before they have places
-            running.medium.place(
+            running.media.place(
                 places.side_by_side_m([*(robot.name for robot in running.robots.values()), laptop.name])
             )
         shells: dict[Role, Shell] = {}

@@ -9,8 +9,7 @@ from fieldkit.config.schema import Bool, Field, Location
 from fieldkit.core.units import parse_duration_s
 from sim_backends.federates.simulator_options import SimulatorOptions
 from sim_backends.gazebo.sdf import VERSIONS, model_sdf
-from sim_backends.physics.differential_drive import DriveLimits
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 from sim_backends.world.obstacles import Coordinate, Real
 
 Positive = Annotated[Real, Field(gt=0, le=1e6)]

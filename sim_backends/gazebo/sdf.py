@@ -10,9 +10,8 @@ from typing import Final, Literal, get_args
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fieldkit.core.model import Vector
-from sim_backends.physics.body import GRAVITY_M_S2
-from sim_backends.physics.differential_drive import HUSKY_A200, TURTLEBOT3_BURGER, DriveLimits
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import HUSKY_A200, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits
+from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.obstacles import Obstacle, Ramp
 from sim_backends.world.shapes import Box, Cylinder, Shape
 from sim_backends.world.world import World

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
-from sim_backends.physics.quadrotor import IRIS, QuadrotorLimits
+from sim_backends.physics.robot_limits import IRIS, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits
 from sim_backends.world.shapes import Box
 
 

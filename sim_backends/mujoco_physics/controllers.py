@@ -10,8 +10,9 @@ from typing import Final, Protocol
 from sim_backends.mujoco_physics.chassis import Wheels
 from sim_backends.mujoco_physics.mjcf import quaternion
 from sim_backends.physics.body import Velocity
-from sim_backends.physics.differential_drive import DriveLimits, checked_twist
-from sim_backends.physics.quadrotor import FlightTarget, Quadrotor, QuadrotorLimits, VelocityController
+from sim_backends.physics.differential_drive import checked_twist
+from sim_backends.physics.quadrotor import FlightTarget, Quadrotor, VelocityController
+from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 
 TICK_NS: Final = 10_000_000
 """Period of the controllers: PX4's velocity controller runs at 100 Hz."""

@@ -12,8 +12,8 @@ from xml.etree import ElementTree as ET
 
 from fieldkit.core.model import Vector
 from sim_backends.mujoco_physics.chassis import CASTER_RADIUS_M, Chassis, quadrotor_inertia_kg_m2
-from sim_backends.physics.body import GRAVITY_M_S2
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import QuadrotorLimits
+from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.obstacles import Raised, Ramp
 from sim_backends.world.shapes import Box, Shape
 from sim_backends.world.world import World

@@ -14,9 +14,10 @@ from typing_extensions import override
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.federates.answering import FederateService
-from sim_backends.federates.handshake import AgentStart, Hello
+from sim_backends.federates.handshake import Hello
 from sim_backends.federates.protocols import FederateError, seconds_text
-from sim_backends.mujoco_physics.chassis import Chassis, chassis
+from sim_backends.mujoco_physics.agent_models import agent_limits, agent_model
+from sim_backends.mujoco_physics.chassis import Chassis
 from sim_backends.mujoco_physics.controllers import (
     TICK_NS,
     Controller,
@@ -24,12 +25,10 @@ from sim_backends.mujoco_physics.controllers import (
     Registers,
     WheelController,
 )
-from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, Model, model_xml, quaternion
+from sim_backends.mujoco_physics.mjcf import SENSED_NUMBERS, Model, model_xml
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DriveLimits
-from sim_backends.physics.ground import Ground
-from sim_backends.physics.quadrotor import FlightStatus, QuadrotorLimits
-from sim_backends.physics.robot_limits import BODIES, quadrotor
+from sim_backends.physics.quadrotor import FlightStatus
+from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
 
@@ -113,9 +112,9 @@ class MujocoPhysics:
         configuration = json.loads(hello.configuration)
         world = World.model_validate(configuration["world"]) if "world" in configuration else None
         bodies = configuration.get("robots", {})
-        limits = [_limits(agent, bodies.get(agent.name, {}).get("body")) for agent in hello.agents]
+        limits = [agent_limits(agent, bodies.get(agent.name, {}).get("body")) for agent in hello.agents]
         self._agents, self._limits, self._world = hello.agents, limits, world
-        robots = [_model(agent, limit, world) for agent, limit in zip(hello.agents, limits, strict=True)]
+        robots = [agent_model(agent, limit, world) for agent, limit in zip(hello.agents, limits, strict=True)]
         text = model_xml(robots, world, hello.step_ns / self._substeps / 1e9)
         self.model = mujoco.MjModel.from_xml_string(text)
         self._controllers = [
@@ -204,7 +203,7 @@ class MujocoPhysics:
         agent = self._agents[row]
         e, n, u = place_m
         start = State((e, n, u + agent.antenna_m), heading_rad=heading_rad)
-        robot = _model(replace(agent, start=start), self._limits[row], self._world)
+        robot = agent_model(replace(agent, start=start), self._limits[row], self._world)
         self._set_pose(row, (*robot.place_m, *robot.quaternion))
         self._pending.pop(name, None)
         self._controllers[row] = self._controller(row, robot, self._limits[row])
@@ -362,42 +361,6 @@ def _changes(lifetimes: Mapping[int, Lifetime], step_ns: int) -> Iterator[_Prese
 
 
 _OF_MUJOCO: Final = {"model", "data", "_sensors", "_registers"}
-
-
-def _limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:
-    """Return the limits of an agent: the limits in the configuration, otherwise the limits of its profile.
-
-    Raises:
-        ConfigurationError: The configuration has other limits than its kind of robot.
-    """
-    if body is not None:
-        values: dict[str, Any] = {
-            name: tuple(value) if isinstance(value, list) else value for name, value in body.items()
-        }
-        try:
-            return QuadrotorLimits(**values) if agent.flies else DriveLimits(**values)
-        except TypeError as error:
-            raise ConfigurationError(
-                f"the body of {agent.name} is invalid: {error}", remedy="use the configuration of a scenario"
-            ) from error
-    if agent.flies:
-        return quadrotor(agent.profile)
-    built_in_limits = BODIES.get(agent.profile)
-    return built_in_limits if isinstance(built_in_limits, DriveLimits) else TURTLEBOT3_BURGER
-
-
-def _model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:
-    """Return an agent at its start; a robot on wheels is upright on the ground below it."""
-    e, n, u = agent.start.position_m
-    place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
-    if isinstance(limits, QuadrotorLimits):
-        return Model(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
-    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
-    east, north = Ground(world, math.inf).surface(e, n).grade
-    forward, left = east * cos + north * sin, north * cos - east * sin
-    roll_rad = math.asin(left / math.hypot(1.0, forward, left))
-    upright = quaternion(heading_rad, -math.atan(forward), roll_rad)
-    return Model(place_m, upright, agent.antenna_m, limits.friction, chassis(agent.profile, limits))
 
 
 _WARNINGS: Final[list[str]] = []

@@ -9,14 +9,13 @@ the list expires.
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.model import Vector
 from sim_backends.physics.body import NEVER, Body, Pose, Snapshot, Track
-from sim_backends.physics.collisions import Footprint, cylinder_footprint, move, overlaps
+from sim_backends.physics.collisions import Collision, Footprint, cylinder_footprint, move, overlaps
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import HORIZON_S, CellGrid, ContactCandidates, Neighbours
 from sim_backends.physics.paths import STEP_NS
@@ -27,21 +26,6 @@ from sim_backends.world.world import World
 _SUPPORT_M: Final = 1e-3
 """Maximum distance between a quadrotor and the ground or obstacle that supports it."""
 _ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
-
-
-@dataclass(frozen=True, slots=True)
-class Collision:
-    """The start of a contact.
-
-    Attributes:
-        at_ns: Its time.
-        body: The moving body.
-        obstacle: Name of the obstacle or body that it touched, or of the ground.
-    """
-
-    at_ns: int
-    body: str
-    obstacle: str
 
 
 class Bodies:

@@ -13,9 +13,6 @@ from fieldkit.core.model import Vector
 from sim_backends.physics.collisions import ContactStop, Surface
 from sim_backends.world.motion import State
 
-GRAVITY_M_S2: Final = 9.80665
-"""Standard acceleration of gravity (CGPM 1901)."""
-
 
 @dataclass(frozen=True, slots=True)
 class Twist:

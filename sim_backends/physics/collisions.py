@@ -20,6 +20,21 @@ _PASSES: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
+class Collision:
+    """The start of a contact.
+
+    Attributes:
+        at_ns: Its time.
+        body: The moving body.
+        obstacle: Name of the obstacle or body that it touched, or of the ground.
+    """
+
+    at_ns: int
+    body: str
+    obstacle: str
+
+
+@dataclass(frozen=True, slots=True)
 class Footprint:
     """The outline of an upright obstacle.
 

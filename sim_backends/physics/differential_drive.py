@@ -18,8 +18,10 @@ from typing import Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
-from sim_backends.physics.body import GRAVITY_M_S2, Twist
+from sim_backends.physics.body import Twist
 from sim_backends.physics.collisions import TOUCH_M, ContactStop, Surface
+from sim_backends.physics.robot_limits import DriveLimits
+from sim_backends.world.motion import GRAVITY_M_S2
 
 _LEVEL: Final = (0.0, 0.0)
 _REACHED: Final = 1e-12
@@ -27,40 +29,6 @@ _REACHED: Final = 1e-12
 
 _NO_GRIP_M_S2: Final = 1e-9
 """Below this acceleration the speed cannot be changed on a slope: the remaining friction is a rounding error."""
-
-
-@dataclass(frozen=True)
-class DriveLimits:
-    """Limits and size of a robot with a differential drive.
-
-    Attributes:
-        speed_m_s: Maximum speed in both directions.
-        acceleration_m_s2: Maximum acceleration and deceleration.
-        turn_rad_s: Maximum yaw rate.
-        turn_acceleration_rad_s2: Maximum change of the yaw rate per second.
-        radius_m: Radius of the upright cylinder that contains it.
-        height_m: Height of that cylinder.
-        friction: Coefficient of friction of its tires; it has grip on slopes with a smaller rise over run.
-    """
-
-    speed_m_s: float
-    acceleration_m_s2: float
-    turn_rad_s: float
-    turn_acceleration_rad_s2: float
-    radius_m: float
-    height_m: float
-    friction: float = 0.8
-
-
-HUSKY_A200: Final = DriveLimits(1.0, 3.0, 2.0, 6.0, radius_m=0.6, height_m=0.39, friction=1.0)
-"""Clearpath Husky A200: 1.0 m/s, 990 mm x 670 mm x 390 mm, climbs 45 degrees (data sheet); accelerations and rate of
-turn from `husky_control/config/control.yaml` (github.com/husky/husky)."""
-
-TURTLEBOT3_BURGER: Final = DriveLimits(0.22, 2.5, 2.84, 3.2, radius_m=0.113, height_m=0.192)
-"""ROBOTIS TurtleBot3 Burger: 0.22 m/s, 2.84 rad/s, 138 mm x 178 mm x 192 mm (e-Manual, specifications); accelerations
-from `turtlebot3_navigation2/param/burger.yaml` (github.com/ROBOTIS-GIT/turtlebot3); friction of rubber on dry ground,
-our estimate.
-"""
 
 
 class DrivePose(NamedTuple):

@@ -6,7 +6,6 @@ from operator import ne
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from typing_extensions import override
 
 from fieldkit.config.wifi_phy import DscpMapping
@@ -19,9 +18,10 @@ from sim_backends.radio.error_rates import packet_error
 from sim_backends.radio.firmware_rate import FirmwareRate
 from sim_backends.radio.frames import decibel
 from sim_backends.radio.high_throughput import common_modes, mode_groups
+from sim_backends.radio.link_caches import GainCache, LinkRow
 from sim_backends.radio.minstrel_ht import MinstrelHt
 from sim_backends.radio.modes import OFDM_MODES
-from sim_backends.radio.propagation import Echoes, Fades, Fading, Shadowing
+from sim_backends.radio.propagation import Fading, Shadowing
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.random_streams import PacketDraws
 from sim_backends.radio.rate_control import FixedRate, Minstrel, RateControl
@@ -37,56 +37,6 @@ _SLOWEST_M_S: Final = 1e-6
 # Computing this number of links costs little more than one, about 0.3 ms among trees, and the next sender may need
 # them.
 _BATCH_LINKS: Final = 100
-
-
-class _Row:
-    """The links of one station to all others, by index, valid until a station moves.
-
-    Args:
-        revision: Revision of the positions for which it was computed.
-        mean_mw: Received power of the station at each other station, without fading, in mW.
-
-    Attributes:
-        linked: True for each station that receives it and is received by it, without fading; None before the first
-            use.
-        slot: Number of the time slot (of the validity of a gain) for which `powers_mw` was computed; -1 for none.
-        powers_mw: Received power of the station at each other station in that slot; without fading if `slot` is -1.
-    """
-
-    __slots__ = ("linked", "mean_mw", "powers_mw", "revision", "slot")
-
-    def __init__(self, revision: int, mean_mw: Floats) -> None:
-        self.revision = revision
-        self.mean_mw = mean_mw
-        self.linked: list[bool] | None = None
-        self.slot = -1
-        self.powers_mw: list[float] = mean_mw.tolist()
-
-
-class _GainCache:
-    """The gains of some links, valid until a station moves or the time slot ends.
-
-    Args:
-        links: Indices of the links.
-        ends: Indices of their first ends, and of their second ends.
-        echoes: Their echoes.
-
-    Attributes:
-        revision: Revision of the positions for which `fades` was computed.
-        fades: Gains over time since then.
-        slot: Time slot for which `gains` was computed.
-        gains: Gains in that slot, in the order of `links`.
-    """
-
-    __slots__ = ("echoes", "ends", "fades", "gains", "links", "revision", "slot")
-
-    def __init__(self, links: NDArray[np.int64], ends: NDArray[np.int64], echoes: Echoes) -> None:
-        self.links = links
-        self.ends = ends
-        self.echoes = echoes
-        self.revision = self.slot = -1
-        self.fades: Fades | None = None
-        self.gains = np.empty(0)
 
 
 class WorldChannel(RadioChannel):
@@ -133,7 +83,7 @@ class WorldChannel(RadioChannel):
         self._link_of[tuple(self._ends)] = self._link_of[tuple(self._ends[::-1])] = np.arange(self._ends.shape[1])
         self._own_links = [np.delete(links_of, station) for station, links_of in enumerate(self._link_of)]
         self._others = [np.delete(np.arange(count), station) for station in range(count)]
-        self._gain_caches: list[_GainCache | None] = [None] * count
+        self._gain_caches: list[GainCache | None] = [None] * count
         self._fading = Fading(
             seed,
             self.names,
@@ -236,15 +186,15 @@ class WorldChannel(RadioChannel):
         self._loss_db = loss_db
         self._k = np.zeros(loss_db.shape)
         self._stale = np.zeros(self._ends.shape[1], dtype=bool)
-        self._rows: list[_Row | None] = [None] * len(loss_db)
+        self._rows: list[LinkRow | None] = [None] * len(loss_db)
 
-    def _row(self, station: int) -> _Row:
+    def _row(self, station: int) -> LinkRow:
         """Return the links of a station, computed again if one of their ends has moved."""
         row = self._rows[station]
         if row is not None and row.revision == self._revision:
             return row
         self._update_links(station)
-        row = _Row(self._revision, _milliwatts(self._tx_powers_dbm[station] - self._loss_db[station]))
+        row = LinkRow(self._revision, _milliwatts(self._tx_powers_dbm[station] - self._loss_db[station]))
         self._rows[station] = row
         return row
 
@@ -264,13 +214,13 @@ class WorldChannel(RadioChannel):
         gains[self._others[station]] = cache.gains if cache.links is own_links else cache.gains[own_links]
         return gains
 
-    def _gain_cache(self, station: int) -> _GainCache:
+    def _gain_cache(self, station: int) -> GainCache:
         cache = self._gain_caches[station]
         if cache is None:
             # An ACK needs the same gain as its data frame, so if there are few links they are computed together.
             all_links = self._ends.shape[1] <= _BATCH_LINKS
             links = np.arange(self._ends.shape[1]) if all_links else self._own_links[station]
-            cache = _GainCache(links, self._ends[:, links], self._fading.echoes(links))
+            cache = GainCache(links, self._ends[:, links], self._fading.echoes(links))
             if all_links:
                 self._gain_caches = [cache] * len(self.names)
             else:

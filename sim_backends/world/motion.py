@@ -13,6 +13,9 @@ from fieldkit.core.model import Vector
 
 STILL: Final[Vector] = (0.0, 0.0, 0.0)
 
+GRAVITY_M_S2: Final = 9.80665
+"""Standard acceleration of gravity (CGPM 1901)."""
+
 
 class State(NamedTuple):
     """Position and velocity of a robot; a tuple, which is faster to create than a frozen dataclass.

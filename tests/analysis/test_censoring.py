@@ -11,16 +11,17 @@ from hypothesis import strategies as st
 
 from fieldkit.analysis import expectations, judgements, paper_tables, result_tables, wording
 from fieldkit.analysis.cells import Cell, aggregate
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Judgement, Ruling
 from fieldkit.analysis.quantities import Quantity, quantities
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.statistics import medians
 from fieldkit.core.columns import Column, Figure, Kind, columns, with_step_name
 from fieldkit.core.model import ENDED
-from fieldkit.measure.evidence import ping
+from fieldkit.measure.evidence import ping, ping_gaps
 
 BY = ("protocol",)
-GAP = (*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS)
+GAP = (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)
 RTT = tuple(column for column in (*ping.COLUMNS, *ping.SENT_COLUMNS) if "median" in column.name)
 NAN = math.nan
 
@@ -105,7 +106,7 @@ def test_missing_repeats_are_counted_in_all_outputs() -> None:
     cell = gaps([0.2] * 8, missing=2)
     result = judge_text("rtt_gap_s < 2 s", cell)
     assert (result.ruling, result.why) == (Ruling.OPEN, "2 of 10 repeats have no value")
-    assert wording.judgement_texts(result)[2] == "200 ms (8 of 10)"
+    assert judgement_texts(result)[2] == "200 ms (8 of 10)"
     quantities = [Quantity.of(column) for column in GAP]
     markdown = paper_tables.to_markdown(BY, [cell], [quantity for quantity in quantities if quantity])
     assert "(8 of 10)" in markdown

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldkit.analysis import expectations, judgements, wording
+from fieldkit.analysis import expectations, judgements
 from fieldkit.analysis.cells import Cell, Estimate, aggregate
 from fieldkit.analysis.expectations import Scope
+from fieldkit.analysis.judgement_words import judgement_texts
 from fieldkit.analysis.judgements import Ruling
 from fieldkit.analysis.quantities import Quantity
 from fieldkit.core.columns import Kind
@@ -156,7 +157,7 @@ def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     assert ruling("ip_loss <= 2 % of all packets", losses(25, 25, 25, 25, 25, 25)) is Ruling.OPEN
     assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
     (few,) = judgements.judge([expectations.parse(gate, QUANTITIES)], [losses(0, 0, sent=100)])
-    assert wording.judgement_texts(few)[2:] == (
+    assert judgement_texts(few)[2:] == (
         "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, at least 1498 are needed",
     )  # fmt: skip
 
@@ -192,7 +193,7 @@ def test_every_repeat_and_a_share_of_them(lost: list[int], every: Ruling, share:
 def test_the_measured_value_is_shown_for_each_scope() -> None:
     cells = losses(0, 0, 0, 50)
     values = {
-        text: wording.judgement_texts(judgements.judge([expectations.parse(text, QUANTITIES)], [cells])[0])[2:]
+        text: judgement_texts(judgements.judge([expectations.parse(text, QUANTITIES)], [cells])[0])[2:]
         for text in ("max ip_loss < 5 %", "90 % of ip_loss < 5 %", "ip_loss < 5 % of all packets")
     }
     assert values == {
@@ -212,7 +213,7 @@ def test_only_one_protocol_is_judged_and_a_missing_figure_is_undecided() -> None
     assert single.holds
     both = judgements.judge([expectations.parse("rtt_median_s < 5 ms", QUANTITIES)], cells)
     assert [item.ruling for item in both] == [Ruling.HOLDS, Ruling.OPEN]
-    assert [wording.judgement_texts(item)[1:] for item in both] == [
+    assert [judgement_texts(item)[1:] for item in both] == [
         ("TCP", "2.00 ms", "[1.00, 3.00]", "holds"),
         ("UDP", "nothing", "", "undecided: 0 of 5 repeats have a value"),
     ]

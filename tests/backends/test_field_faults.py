@@ -4,7 +4,7 @@ import pytest
 
 from fieldkit.backends.field import FieldTestbed
 from fieldkit.backends.protocols import Robot
-from fieldkit.core.errors import RobotError
+from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import Fault, FaultKind, Leg, Move, Role
 from fieldkit.core.prompts import DONE, Answer, Question
 from tests.helpers.casts import CAST
@@ -89,3 +89,18 @@ def test_robot_is_brought_back_after_error_but_not_after_ctrl_c(error: BaseExcep
         raise error
     back = ["bring turtlebot-1 back to its place"] if isinstance(error, Exception) else []
     assert operator.prompts == [START_REQUEST.format("turtlebot-2"), *back]
+
+
+def test_a_failed_move_is_reported_even_if_the_operator_does_not_bring_the_robot_back() -> None:
+    class Leaving(RecordingOperator):
+        def ask(self, request: str, *, may_skip: bool = False) -> Answer:
+            if request.startswith("bring"):
+                raise ConfigurationError(f"no answer left to: {request}")
+            return super().ask(request, may_skip=may_skip)
+
+    with pytest.raises(ConfigurationError) as caught, FieldTestbed(CAST, {}, Leaving()).moving(MOVE):
+        raise RobotError("its wheel is blocked", remedy="y")
+    assert caught.value.what.startswith(
+        "no answer left to: bring turtlebot-1 back to its place; before, the move failed"
+    )
+    assert "its wheel is blocked" in caught.value.what

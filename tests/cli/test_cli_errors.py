@@ -9,7 +9,7 @@ import pytest
 
 from fieldkit import __version__
 from fieldkit.cli import main
-from fieldkit.cli.terminal import Terminal
+from fieldkit.cli.operators import Terminal
 from fieldkit.core.errors import ConfigurationError
 from tests.helpers.runs import fieldkit
 

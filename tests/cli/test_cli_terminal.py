@@ -24,7 +24,7 @@ import sys
 from threading import Thread
 from fieldkit.cli import INTERRUPTED
 from fieldkit.cli.display import showing_events
-from fieldkit.cli.terminal import Terminal
+from fieldkit.cli.operators import Terminal
 from fieldkit.core.events import Event, Note, PhaseStarted, Request
 def forward(event: Event) -> None:
     sink(event)

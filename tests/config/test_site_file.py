@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.config import profiles
-from fieldkit.config.documents import with_value
 from fieldkit.config.site import load_site
-from fieldkit.config.site_edits import create_site_file, pin_host_key
+from fieldkit.config.site_edits import _with_value, create_site_file, pin_host_key
 from fieldkit.core.errors import ConfigurationError
 
 KEY = "ssh-ed25519 AAAAC3NzaC1lZDI1NTE5AAAAIJcfoHM2b/TjeUycyd/kMkG5id0whvOnW10xYBLAo4SR"
@@ -71,13 +70,13 @@ def test_pinning_adds_one_line_to_a_robot_in_block_style(
 ) -> None:
     text = f"# {comment}\nrobots:\n" + "".join(blocks(name, comment, blank, indent) for name in names)
     robot = data.draw(st.sampled_from(names))
-    old, new = text.splitlines(), with_value(text, ("robots", robot, "host_key"), KEY).splitlines()
+    old, new = text.splitlines(), _with_value(text, ("robots", robot, "host_key"), KEY).splitlines()
     (added,) = [line for line in new if KEY in line]
     assert added == f"{' ' * (indent + 2)}host_key: {KEY}"
     new.remove(added)
     assert new == old
     # `BaseLoader` reads all scalars as text: a robot may be named `on`, a boolean in YAML 1.1.
-    read = yaml.load(with_value(text, ("robots", robot, "host_key"), KEY), Loader=yaml.BaseLoader)
+    read = yaml.load(_with_value(text, ("robots", robot, "host_key"), KEY), Loader=yaml.BaseLoader)
     assert read["robots"][robot] == {"profile": "x", "host_key": KEY}
 
 

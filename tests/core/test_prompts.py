@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fieldkit.cli.operators import Script
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.events import Answered, Event, Request
-from fieldkit.core.prompts import DONE, Answer, Script, parse
+from fieldkit.core.prompts import DONE, Answer, parse
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.stored import plans
 from tests.helpers import labs, lawns, recorded, tables
 from tests.helpers.paths import ROOT
 from tests.helpers.tables import RepeatRow, replace
@@ -281,7 +282,7 @@ def with_changed_trial(command: str, change: Callable[[Path], object]) -> Setup:
 
     def setup(lab: Path) -> str:
         folder = recorded.make(lab / "made").rename(lab / "a")
-        Ledger(store.read_plan(folder), folder, Stop()).summarize()
+        Ledger(plans.read_plan(folder), folder, Stop()).summarize()
         change(folder)
         return command
 

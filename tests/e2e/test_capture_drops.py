@@ -10,6 +10,7 @@ from fieldkit.core.columns import Measured
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans
 from tests.helpers.labs import built_in_ros
 from tests.helpers.runs import only_trial, run_here
 from tests.helpers.texts import procedure
@@ -48,7 +49,7 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     run = run_here(home, "trial", "stream", "5m", "--yes")
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     (entry,) = journal.ended(journal.history(trial, plan))
     return plan, store.attempt_folder(trial, entry.folder), entry
 

@@ -9,6 +9,7 @@ import pytest
 from fieldkit.agent.messaging import records
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.trial import gates, journal, store
+from fieldkit.trial.stored import plans
 from tests.helpers.runs import only_trial, run_here
 from tests.helpers.texts import procedure
 
@@ -45,7 +46,7 @@ def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
     run = run_here(tmp_path, "trial", "stream", "5m", "--yes")
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     (attempt,) = journal.ended(journal.history(trial, plan))
     folder = store.attempt_folder(trial, attempt.folder)
     for name in ("dds", "zenoh"):

@@ -12,8 +12,9 @@ from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.captures.headers import TCP, UDP
 from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.trial import gates, planned_evidence, store
+from fieldkit.trial import gates, planned_evidence
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans
 from tests.helpers.dissected import Row, dissected
 from tests.helpers.labs import write_procedure
 from tests.helpers.runs import only_trial, rows, run_here
@@ -62,7 +63,7 @@ def trial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def attempts(trial: Path, protocol: Protocol) -> list[tuple[Plan, Path, Values]]:
     """Return the plan, folder and measured values of each valid attempt."""
-    plan, results = store.read_plan(trial), []
+    plan, results = plans.read_plan(trial), []
     for row in rows(trial):
         if row["protocol"] != protocol or row["status"] != "valid":
             continue

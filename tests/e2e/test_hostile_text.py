@@ -24,7 +24,7 @@ from tests.helpers.tables import ROW, RepeatRow, replace, write
 HOSTILE = "=a\x1b[31mb\x07\x7f\x9b5m\u202ec\u2066\u200fd\u2028e"
 TEXTS = ("procedure", "scenario", "backend", "distance", "sender", "reason")
 WRITTEN_TO_FILES = "export"
-BARE_PRINT = {"fieldkit/cli/display.py", "fieldkit/cli/terminal.py", "fieldkit/cli/commands/completion.py"}
+BARE_PRINT = {"fieldkit/cli/display.py", "fieldkit/cli/operators.py", "fieldkit/cli/commands/completion.py"}
 """Modules that may print: the one that escapes texts, fieldkit's prompts, and the script of a shell."""
 
 

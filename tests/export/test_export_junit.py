@@ -13,6 +13,7 @@ from fieldkit.export import junit
 from fieldkit.trial import store
 from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import plans
 from tests.helpers.stored_trials import TRIALS
 
 pytestmark = pytest.mark.ros  # the stored trial records bags
@@ -42,7 +43,7 @@ def edited(path: Path, edit: Callable[[str], str]) -> None:
 
 
 def test_each_repeat_is_a_case_with_its_time(trial: Path) -> None:
-    element, plan = suite(trial), store.read_plan(trial)
+    element, plan = suite(trial), plans.read_plan(trial)
     assert [case.get("name") for case in element] == [str(repeat) for repeat in plan.order()]
     assert element.get("tests") == str(len(element))
     assert element.get("failures") == element.get("skipped") == "0"
@@ -61,7 +62,7 @@ def test_a_repeat_that_failed_is_a_failure_with_its_reason(trial: Path) -> None:
     element = suite(trial)
     (name,) = cases(element, "failure")
     assert element.get("failures") == "1"
-    assert name == str(list(store.read_plan(trial).order())[-1])
+    assert name == str(list(plans.read_plan(trial).order())[-1])
 
 
 def test_a_repeat_that_has_not_ended_is_skipped(trial: Path) -> None:
@@ -74,7 +75,7 @@ def test_an_expectation_is_a_case_that_fails_unless_it_holds(trial: Path) -> Non
     edited(trial / PLAN_FILE, lambda text: text.replace("  steps:\n", f"{expect}  steps:\n", 1))
     element = suite(trial)
     failed = cases(element, "failure")
-    protocols = [str(protocol).upper() for protocol in store.read_plan(trial).protocols]
+    protocols = [str(protocol).upper() for protocol in plans.read_plan(trial).protocols]
     assert failed == [f"rtt_median_s < 1 us ({protocol})" for protocol in protocols]
     assert element.get("tests") == str(len(element))
 

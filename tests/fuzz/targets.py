@@ -42,18 +42,19 @@ from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.motion.logs import tlog, tlog_positions
 from fieldkit.remote import archive, fetching, jobs, script
 from fieldkit.remote.command import printable
-from fieldkit.ros.bags import bag
+from fieldkit.ros.bags import bag, recorded_topics
 from fieldkit.ros.streams import topic_captures, topic_checks, topic_columns, topic_samples
 from fieldkit.ros.streams.topic_captures import CapturedTopic
 from fieldkit.ros.streams.topic_checks import TopicPlan
 from fieldkit.ros.streams.topic_columns import TopicTraffic
 from fieldkit.steps.scene import CommandResult
 from fieldkit.steps.view import View
-from fieldkit.trial import columns, journal, manifest, plan, rebuild, store
+from fieldkit.trial import columns, journal, plan
 from fieldkit.trial.check import probe, radio, software, system, tools
 from fieldkit.trial.check.report import Report
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.running import locks
+from fieldkit.trial.stored import plans, rebuild, verification
 from tests.fuzz.federate_targets import federate_targets
 from tests.fuzz.harness import Target
 from tests.fuzz.motion_targets import motion_targets
@@ -100,7 +101,7 @@ def _read_file(read: Callable[[Path], object], name: str, data: bytes, place: Pa
 def _read_bag(path: Path) -> None:
     bag.read(path)
     bag.battery_share(path, TOPIC)
-    bag.topic_stats(path)
+    recorded_topics.topic_stats(path)
 
 
 @cache
@@ -245,7 +246,7 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
 
 @cache
 def _plan() -> plan.Plan:
-    return store.read_plan(LOS)
+    return plans.read_plan(LOS)
 
 
 def _rebuild_trial(name: str, data: bytes, place: Path) -> None:
@@ -263,7 +264,7 @@ def _read_csv(data: bytes, place: Path) -> None:
 
 
 def _verify_manifest(path: Path) -> None:
-    manifest.verify(path.parent)
+    verification.verify(path.parent)
 
 
 def _load_site(path: Path) -> None:

@@ -11,9 +11,10 @@ from pathlib import Path
 from fieldkit.core.columns import Value
 from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import gates, store
+from fieldkit.trial import gates
 from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans
 from tests.helpers.paths import DATA
 
 ATTEMPTS = tuple(
@@ -87,7 +88,7 @@ class StoredAttempt:
 
 
 def load_attempt(trial: Path, protocol: Protocol) -> StoredAttempt:
-    plan, repeat = store.read_plan(trial), RepeatId(protocol, 1)
+    plan, repeat = plans.read_plan(trial), RepeatId(protocol, 1)
     folder = trial / "repeats" / f"{protocol}-01"
     return StoredAttempt(plan, repeat, folder, gates.judge(plan, repeat, AttemptEvidence(folder)))
 

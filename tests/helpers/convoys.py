@@ -18,7 +18,8 @@ from sim_backends.cosim.programs.wrappers import CombinedProgram
 from sim_backends.cosim.studies.intervals import Floats
 from sim_backends.network.disc import Disc
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.robot_limits import DriveLimits
 from sim_backends.world.motion import State
 
 MS = 1_000_000

@@ -20,7 +20,7 @@ from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.own_motion import AssignedPath, append_path
 from sim_backends.emulated.ros.steered import Steered, SteeredRecord
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
+from sim_backends.physics.robot_limits import TURTLEBOT3_BURGER
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 

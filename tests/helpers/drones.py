@@ -20,7 +20,7 @@ from sim_backends.emulated.autopilot.autopilot import Autopilot
 from sim_backends.emulated.autopilot.firmware import Firmware
 from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.quadrotor import DUCKIEDRONE
+from sim_backends.physics.robot_limits import DUCKIEDRONE
 from tests.helpers.ground_station import LIMITS
 
 SYSTEM: Final = 7

@@ -13,7 +13,7 @@ from sim_backends.emulated.autopilot.mavlink_frames import Message
 from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameters
 from sim_backends.emulated.autopilot.px4 import PX4
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.quadrotor import DUCKIEDRONE
+from sim_backends.physics.robot_limits import DUCKIEDRONE
 from sim_backends.world.world import World
 
 SYSTEM: Final = 7

@@ -5,9 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from fieldkit.core.model import Protocol, Status
-from fieldkit.trial import journal, rebuild, store
+from fieldkit.trial import journal, store
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import rebuild
 from tests.helpers.captures import Frame, file_bytes, ipv4
 from tests.helpers.casts import CAST, los_plan, plain_plan
 

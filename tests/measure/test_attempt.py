@@ -121,6 +121,7 @@ def test_any_error_of_a_reader_becomes_an_evidence_error(tmp_path: Path, error: 
     with pytest.raises(EvidenceError, match=f"cannot be read: {error.__name__}") as caught:
         evidence.read(raises, "a.txt")
     assert caught.value.where == str(tmp_path / "a.txt")
+    assert [(name, type(raised)) for name, raised in evidence.unexpected_errors] == [("a.txt", error)]
 
 
 def test_a_memory_error_is_not_an_evidence_error(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from fieldkit.analysis.repeats import Repeats
 from fieldkit.analysis.table_files import read
 from fieldkit.core.columns import fault_column_name
 from fieldkit.core.model import FaultKind
-from fieldkit.measure.evidence import outage_columns, ping
+from fieldkit.measure.evidence import outage_columns, ping_gaps
 from fieldkit.report import distance, distribution, dots, figures
 from fieldkit.report.charts import Chart, EdgeMark, Panel, Series
 from fieldkit.report.contents import build_contents
@@ -205,7 +205,7 @@ def test_a_cross_is_drawn_with_its_text(lanes: tuple[str, ...], is_high: bool) -
 
 
 def test_lower_bound_is_an_open_marker_that_breaks_the_line(tmp_path: Path) -> None:
-    columns = trial_columns((*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS))
+    columns = trial_columns((*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS))
     rows = [
         {
             **row,

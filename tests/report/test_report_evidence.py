@@ -18,8 +18,9 @@ from fieldkit.report import distribution, packet_rasters, page, timeline, trial_
 from fieldkit.report.contents import build_contents, repeat_to_draw
 from fieldkit.report.series import Identities
 from fieldkit.report.trial_folders import load_evidence
-from fieldkit.trial import sources, store
+from fieldkit.trial import store
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import plans, sources
 from tests.helpers import recorded
 from tests.report.test_report_page import HOSTILE, Elements
 
@@ -152,7 +153,7 @@ def test_repeat_of_the_time_line_can_be_selected(trial: Path) -> None:
 
 def test_texts_of_the_operator_are_escaped(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(trial.parent.parent)
-    plan = store.read_plan(trial).model_copy(update={"notes": HOSTILE, "versions": {HOSTILE: HOSTILE}})
+    plan = plans.read_plan(trial).model_copy(update={"notes": HOSTILE, "versions": {HOSTILE: HOSTILE}})
     (trial / PLAN_FILE).write_text(schema.dump(plan), encoding="utf-8")
     assert main(["report", "trials"]) == 0
     text = Path("report.html").read_text(encoding="utf-8")

@@ -10,8 +10,8 @@ from fieldkit.config import schema
 from fieldkit.report.coverage import everything_lost
 from fieldkit.report.headlines import Headline, headlines
 from fieldkit.report.trial_folders import Evidence, load_evidence
-from fieldkit.trial import sources, store
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import plans, sources
 from tests.helpers import lawns, recorded
 from tests.helpers.tables import RepeatRow, parsed
 
@@ -109,7 +109,7 @@ def test_quantity_without_its_own_loss_uses_the_other_losses() -> None:
 def evidence_with(folder: Path, *expected: str) -> Evidence:
     """Return the evidence of a synthetic trial with expectations."""
     trial = recorded.make_plain(folder)
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     changed = plan.procedure.model_copy(update={"expect": expected})
     (trial / PLAN_FILE).write_text(schema.dump(plan.model_copy(update={"procedure": changed})), encoding="utf-8")
     return load_evidence(sources.find([trial], print).read())

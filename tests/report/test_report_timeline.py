@@ -16,8 +16,9 @@ from fieldkit.report.charts import Panel
 from fieldkit.report.contents import repeat_to_draw
 from fieldkit.report.trial_folders import load_evidence
 from fieldkit.ros.streams import topic_samples
-from fieldkit.trial import procedure, sources, store
+from fieldkit.trial import procedure
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import plans, sources
 from tests.helpers import recorded
 
 BEGAN_NS = recorded.START_NS + 10 * recorded.SECOND_NS
@@ -111,7 +112,7 @@ def test_a_ping_without_any_reply_shows_all_its_losses(trial: Path) -> None:
 
 def add_step(trial: Path, text: str) -> None:
     """Add a step to the trial's procedure."""
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     extra = procedure.Procedure.model_validate(
         {"name": "los", "summary": "s", "scenario": "los", "topology": "master", "protocols": ["udp"], "repeats": 1}
         | {"steps": [json.loads(text)]}

@@ -15,11 +15,12 @@ from fieldkit.core import files, jsonl
 from fieldkit.core.columns import Measured
 from fieldkit.core.errors import ConfigurationError, EvidenceError
 from fieldkit.core.model import Protocol, RepeatId, Status
-from fieldkit.trial import journal, manifest, store
+from fieldkit.trial import journal, store
 from fieldkit.trial.journal import JournalEntry
-from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.stored import plans, verification
+from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers import recorded
 from tests.helpers.casts import los_plan
 
@@ -37,7 +38,7 @@ def foreign_file(tmp_path: Path) -> Path:
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A trial of one repeat, with its manifest; tests must not change it."""
     folder = recorded.make(tmp_path_factory.mktemp("trials"))
-    Ledger(store.read_plan(folder), folder, Stop()).summarize()
+    Ledger(plans.read_plan(folder), folder, Stop()).summarize()
     return folder
 
 
@@ -101,7 +102,7 @@ def test_files_that_could_block_a_reader_are_rejected(trial: Path, place: str, m
     with pytest.raises(EvidenceError, match="not a regular file") as caught:
         rebuild(trial)
     assert caught.value.where == str(trial / place)
-    assert any(line.startswith(f"{place}: it is a ") for line in manifest.verify(trial))
+    assert any(line.startswith(f"{place}: it is a ") for line in verification.verify(trial))
 
 
 def test_a_pipe_as_a_table_does_not_block(
@@ -118,13 +119,13 @@ def test_a_link_to_another_folder_is_not_a_folder_of_the_trial(trial: Path, tmp_
     (trial / name).rename(tmp_path / "elsewhere")
     (trial / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(EvidenceError, match="it is a symbolic link"):
-        store.read_plan(trial)
+        plans.read_plan(trial)
 
 
 def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
     (trial / "repeats/udp-01/a/b").mkdir(parents=True)
     with pytest.raises(EvidenceError, match="a folder, deeper than evidence can be"):
-        store.read_plan(trial)
+        plans.read_plan(trial)
 
 
 def test_a_journal_with_a_second_name_is_not_written(trial: Path, foreign_file: Path) -> None:
@@ -163,13 +164,13 @@ def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> Non
     for name in strange:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
     Path(os.fsdecode(os.fsencode(trial / "repeats/udp-01") + b"/\xff.txt")).write_text("x", encoding="utf-8")
-    lines = manifest.verify(trial)
+    lines = verification.verify(trial)
     assert len(lines) == len(strange) + 1
     assert all(line.isprintable() and line.endswith(": not in the manifest") for line in lines)
     (trial / store.MANIFEST_FILE).unlink()
-    ledger = Ledger(store.read_plan(trial), trial, Stop())
+    ledger = Ledger(plans.read_plan(trial), trial, Stop())
     ledger.summarize()
-    assert manifest.verify(trial) == []
+    assert verification.verify(trial) == []
     assert os.system(f"cd '{trial}' && sha256sum --check --quiet MANIFEST.sha256") == 0
 
 
@@ -196,7 +197,7 @@ def test_a_contradictory_journal_is_reported_with_its_line(
     trial: Path, entries: list[tuple[int, int, Status]], reason: str
 ) -> None:
     lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
-    for read in (rebuild, lambda folder: Ledger(store.read_plan(folder), folder, Stop())):
+    for read in (rebuild, lambda folder: Ledger(plans.read_plan(folder), folder, Stop())):
         with pytest.raises(EvidenceError, match=f"impossible entry: {reason}") as caught:
             read(trial)
         assert caught.value.where == f"{trial / journal.JOURNAL_FILE}:6"

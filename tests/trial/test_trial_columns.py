@@ -14,10 +14,11 @@ from fieldkit.core.columns import Column, Figure, Kind, Value, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps import kinds
 from fieldkit.steps.base import step_types
-from fieldkit.trial import frozen, rows, store, tables
+from fieldkit.trial import frozen, rows
 from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
+from fieldkit.trial.stored import plans, tables
 from tests.helpers import meter, vendor_trials
 from tests.helpers.casts import los_plan
 from tests.helpers.outside_packages import write_package
@@ -74,8 +75,8 @@ def test_any_valid_column_is_read_back_from_plan_and_table(
     plan = los_plan().model_copy(update={"columns": freeze(columns) or None})
     folder = tmp_path_factory.mktemp("trial")
     (folder / "trial.yaml").write_text(schema.dump(plan), encoding="utf-8")
-    assert [*frozen.read(folder / "trial.yaml")] == columns
-    assert store.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
+    assert [*plans.read_columns(folder / "trial.yaml")] == columns
+    assert plans.read_plan(folder).table == plan.table == (*trial_columns(), *columns)
     read = repeats.parse(rows.to_csv([row], plan.table).encode(), plan.table)
     # A cell has nine digits of a number; a bound may have more.
     values = [float(f"{value:.9g}") if isinstance(value, float) else value for value in row.values()]
@@ -302,7 +303,7 @@ def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns
     path = table.with_name("trial.yaml")
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
-    for read in (lambda: tables.declared_in([table]), lambda: store.read_plan(path.parent)):
+    for read in (lambda: tables.declared_in([table]), lambda: plans.read_plan(path.parent)):
         with pytest.raises(ConfigurationError) as caught:
             read()
         assert caught.value.where is not None

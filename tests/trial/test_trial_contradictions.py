@@ -11,17 +11,18 @@ import pytest
 
 from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import hosts, store
+from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.step_errors import StepErrors
+from fieldkit.trial.stored import plans
 from tests.helpers.paths import DATA
 from tests.helpers.plans import problems
 
 LOSSLESS, LOSSY = (
     next((DATA / "fieldkit" / "4" / "trials").glob(f"{began}*")) for began in ("20261122T010946", "20261122T013134")
 )
-PLAN = store.read_plan(LOSSLESS)
+PLAN = plans.read_plan(LOSSLESS)
 
 BOOT = "a81d06aa-f870-44cd-b602-2c81365a2e18"
 BEFORE_S, AFTER_S = 1_000, 1_100
@@ -114,7 +115,7 @@ def of(protocol: Protocol, folder: Path, trial: Path = LOSSLESS) -> Attempt:
 @pytest.mark.parametrize("trial", [LOSSLESS, LOSSY], ids=["lossless", "lossy"])
 @pytest.mark.parametrize("protocol", Protocol)
 def test_complete_evidence_has_no_contradictions(protocol: Protocol, trial: Path, tmp_path: Path) -> None:
-    assert of(protocol, tmp_path, trial).problems(store.read_plan(trial)) == ()
+    assert of(protocol, tmp_path, trial).problems(plans.read_plan(trial)) == ()
 
 
 def demand(attempt: Attempt, *reasons: str) -> None:

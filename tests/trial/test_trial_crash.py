@@ -13,22 +13,23 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fieldkit.cli.terminal import interruptible
+from fieldkit.cli.interrupts import interruptible
 from fieldkit.config import schema
 from fieldkit.config.schema import parse, validate
 from fieldkit.core import plugins
 from fieldkit.core.model import Protocol
 from fieldkit.core.units import parse_distance
-from fieldkit.trial import journal, manifest, store
+from fieldkit.trial import journal, store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
-from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running import preflight
 from fieldkit.trial.running.resumption import resume_trial
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import run_trial
+from fieldkit.trial.stored import verification
+from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.nightly import mark_nightly
@@ -178,7 +179,7 @@ def trial_of(out: Path) -> Path:
 
 def demand_agreement(folder: Path) -> None:
     """Check that a trial's files are consistent."""
-    assert manifest.verify(folder) == []
+    assert verification.verify(folder) == []
     before = {name: (folder / name).read_bytes() for name in ("trial.csv", "summary.csv")}
     rebuild(folder)
     assert {name: (folder / name).read_bytes() for name in before} == before

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldkit.core.model import Protocol
-from fieldkit.trial import store
+from fieldkit.trial.stored import plans
 from tests.helpers.plans import problems
 from tests.helpers.stored_trials import TRIALS
 from tests.trial.test_trial_contradictions import LOSSLESS, Attempt, Packet, of
@@ -74,7 +74,7 @@ def _reasons(attempt: Attempt) -> list[str]:
 
 @pytest.mark.parametrize("path", REPEATS, ids=lambda path: f"{path.parents[1].name[:16]} {path.name}")
 def test_stored_repeats_stay_valid(path: Path) -> None:
-    assert problems(store.read_plan(path.parents[1]), Protocol(path.name.split("-")[0]), path) == ()
+    assert problems(plans.read_plan(path.parents[1]), Protocol(path.name.split("-")[0]), path) == ()
 
 
 @pytest.mark.parametrize("count", [1, 10])

@@ -9,7 +9,7 @@ import pytest
 from fieldkit.core.columns import Measured
 from fieldkit.core.model import Protocol
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import track
+from fieldkit.measure.evidence import oracle_delays, track
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.view import View
 from fieldkit.trial import gates
@@ -159,6 +159,23 @@ def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, mon
     assert "in measure" in traceback
     assert verdict.has_failed
     assert verdict.measured.values["sent_bytes"] == (folder / "scan.bag").stat().st_size
+
+
+def test_an_exception_of_a_reader_of_an_optional_file_is_logged(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without this, the file would count as missing."""
+
+    def read_lateness(path: Path) -> None:
+        raise KeyError(path.name)
+
+    monkeypatch.setattr(oracle_delays, "read_lateness", read_lateness)
+    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    (reason,) = verdict.problems
+    assert reason.startswith("lateness.txt cannot be read: KeyError: 'lateness.txt' (test_trial_gates.py, line")
+    (traceback,) = verdict.step_errors
+    assert "in read_lateness" in traceback
+    assert verdict.has_failed
 
 
 @pytest.mark.parametrize("method", ["check", "output_columns", "jobs"])

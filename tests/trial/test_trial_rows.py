@@ -4,7 +4,7 @@ from pathlib import Path
 
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.rebuild import rebuild
+from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers.recorded import make_plain
 from tests.helpers.runs import rows
 

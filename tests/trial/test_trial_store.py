@@ -9,6 +9,7 @@ from fieldkit.core.model import Protocol, RepeatId
 from fieldkit.trial import manifest, store
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans, verification
 from tests.helpers.casts import los_plan, plain_plan
 
 
@@ -27,8 +28,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_plan_is_written_and_read_back(folder: Path) -> None:
-    assert store.read_plan(folder) == plain_plan()
-    assert schema.dump(store.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
+    assert plans.read_plan(folder) == plain_plan()
+    assert schema.dump(plans.read_plan(folder)) == (folder / "trial.yaml").read_text(encoding="utf-8")
 
 
 @pytest.mark.ros
@@ -48,12 +49,12 @@ def test_a_plan_with_an_invalid_folder_name_is_rejected(folder: Path, name: str)
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(f"trial: {plain_plan().trial}", f"trial: '{name}'"), encoding="utf-8")
     with pytest.raises(ConfigurationError, match=r"in trial: ") as caught:
-        store.read_plan(folder)
+        plans.read_plan(folder)
     assert caught.value.where.startswith(str(path))
 
 
 def test_an_untouched_trial_verifies_and_sha256sum_agrees(folder: Path) -> None:
-    assert manifest.verify(folder) == []
+    assert verification.verify(folder) == []
     subprocess.run(("sha256sum", "--check", "--quiet", store.MANIFEST_FILE), cwd=folder, check=True)
 
 
@@ -62,13 +63,13 @@ def test_one_flipped_byte_is_found(folder: Path, name: str) -> None:
     content = bytearray((folder / name).read_bytes())
     content[len(content) // 2] ^= 1
     (folder / name).write_bytes(content)
-    assert manifest.verify(folder) == [f"{name}: changed"]
+    assert verification.verify(folder) == [f"{name}: changed"]
 
 
 def test_missing_and_additional_files_are_found(folder: Path) -> None:
     (folder / "repeats/udp-01/ping.txt").unlink()
     (folder / "repeats/udp-01/notes.txt").write_text("x", encoding="utf-8")
-    assert manifest.verify(folder) == [
+    assert verification.verify(folder) == [
         "repeats/udp-01/notes.txt: not in the manifest",
         "repeats/udp-01/ping.txt: missing",
     ]
@@ -77,15 +78,15 @@ def test_missing_and_additional_files_are_found(folder: Path) -> None:
 def test_files_of_an_interrupted_attempt_are_not_in_the_manifest(folder: Path) -> None:
     partial = store.open_attempt(folder, RepeatId(Protocol.TCP, 1))
     (partial / "half.pcap").write_bytes(b"x")
-    assert manifest.verify(folder) == []
+    assert verification.verify(folder) == []
     assert list(store.open_attempt(folder, RepeatId(Protocol.TCP, 1)).iterdir()) == []
 
 
 def test_a_folder_without_a_trial_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"there is no trial\.yaml"):
-        store.read_plan(tmp_path)
+        plans.read_plan(tmp_path)
     with pytest.raises(EvidenceError, match="no readable manifest"):
-        manifest.verify(tmp_path)
+        verification.verify(tmp_path)
 
 
 def test_an_out_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:

@@ -5,8 +5,8 @@ from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, showing_events
+from fieldkit.cli.operators import confirmed
 from fieldkit.cli.parser import Parser
-from fieldkit.cli.terminal import confirmed
 from fieldkit.core import runtime
 from fieldkit.core.errors import FieldkitError, RobotError
 from fieldkit.core.events import Note

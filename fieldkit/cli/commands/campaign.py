@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, showing_events
+from fieldkit.cli.interrupts import interruptible
 from fieldkit.cli.parser import Parser
-from fieldkit.cli.terminal import interruptible
 from fieldkit.core.errors import EvidenceError, FieldkitError, shell_command
 from fieldkit.core.units import format_count
 

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fieldkit.cli.operators import confirmed
 from fieldkit.cli.parser import Parser
-from fieldkit.cli.terminal import confirmed
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, FieldkitError, HostKeyError, did_you_mean, shell_command

@@ -69,7 +69,7 @@ def _parquet(arguments: argparse.Namespace, file: BinaryIO) -> None:
 
 
 def _load(arguments: argparse.Namespace) -> "Repeats":
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     data = sources.find(arguments.paths, show_note, rebuild=arguments.rebuild, use_index=arguments.use_index)
     return data.read(undeclared=True)
@@ -77,7 +77,7 @@ def _load(arguments: argparse.Namespace) -> "Repeats":
 
 def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import mcap, timeline
-    from fieldkit.trial import sources, store
+    from fieldkit.trial.stored import plans, sources
 
     folder: Path = arguments.paths[0]
     if len(arguments.paths) > 1:
@@ -86,14 +86,14 @@ def _mcap(arguments: argparse.Namespace, file: BinaryIO) -> None:
             remedy="one at a time: "
             + shell_command("fieldkit", "export", folder, "--format", "mcap", "-o", f"{folder.name}.mcap"),
         )
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     sources.note_differences(folder, show_note)
     mcap.write(file, timeline.about(plan), timeline.messages(folder, plan))
 
 
 def _junit(arguments: argparse.Namespace, file: BinaryIO) -> None:
     from fieldkit.export import junit
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     # `rebuild=True` includes trials without a table, because a CI server must show all trials.
     trials = sources.find(arguments.paths, show_note, rebuild=True).tables

@@ -10,7 +10,7 @@ from fieldkit.core.text import print_text
 from fieldkit.core.units import parse_duration_s
 
 if TYPE_CHECKING:
-    from fieldkit.trial.positions import AttemptPositions
+    from fieldkit.trial.stored.positions import AttemptPositions
 
 
 def add(parser: Parser) -> None:
@@ -41,7 +41,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Store the given files, and print the distances in each repeat with their source."""
-    from fieldkit.trial import positions
+    from fieldkit.trial.stored import positions
 
     files = dict(map(positions.parse_source, arguments.files))
     if files or arguments.clear:

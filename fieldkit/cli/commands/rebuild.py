@@ -12,7 +12,7 @@ from fieldkit.cli.parser import Parser
 from fieldkit.core.text import print_text
 
 if TYPE_CHECKING:
-    from fieldkit.trial.rebuild import Rebuilt
+    from fieldkit.trial.stored.rebuild import Rebuilt
 
 
 def add(parser: Parser) -> None:
@@ -34,7 +34,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Rebuild the tables; print the names of the changed files, and the summary if there is only one trial."""
-    from fieldkit.trial import rebuild, sources
+    from fieldkit.trial.stored import rebuild, sources
 
     paths: list[Path] = arguments.trial
     folders = [folder for path in paths for folder in sources.trial_folders(path) or [path]]
@@ -60,7 +60,7 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
     from fieldkit.core.events import Progress
     from fieldkit.core.executors import Workers
     from fieldkit.core.tasks import completed
-    from fieldkit.trial import rebuild
+    from fieldkit.trial.stored import rebuild
 
     absolute = [folder.absolute() for folder in folders]  # workers of a cluster have another working directory
     exit_code = 0

@@ -1,16 +1,11 @@
 """`fieldkit report PATH...`: one page with the results of trials, and its figures."""
 
 import argparse
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_note
 from fieldkit.cli.parser import Parser
-from fieldkit.core import files
-from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.text import print_text
 
 
@@ -54,19 +49,15 @@ def add(parser: Parser) -> None:
     parser.set_defaults(run=run)
 
 
-_OUT: Final = Path("report.html")
-_PAGE: Final = b"<!DOCTYPE html>"
-
-
 def run(arguments: argparse.Namespace) -> int:
     """Write the page, and with --figures the figures."""
     # matplotlib takes half a second to import, so other commands must not import it.
     from fieldkit.campaign.plan import unmeasured
     from fieldkit.report import contents, figures, page
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     out, folder = arguments.out, arguments.figures
-    _require_writable(out)
+    page.require_writable(out)
     data = sources.find(
         arguments.paths, show_note, rebuild=arguments.rebuild, use_index=arguments.use_index
     ).with_filter(arguments.where)
@@ -85,52 +76,14 @@ def run(arguments: argparse.Namespace) -> int:
         unmeasured=list(unmeasured(arguments.paths, with_attempts, show_note)),
         sweep=data.sweep_columns,
     )
-    with _explain_os_errors(out, "-o"):
-        files.write(out, page.render(report_contents, out).encode())
+    page.write(report_contents, out)
     print_text(out)
     if folder is not None:
-        with _explain_os_errors(folder, "--figures"):
+        with page.explaining_write_errors(folder, "--figures"):
             folder.mkdir(parents=True, exist_ok=True)
             for path in figures.save(report_contents.charts, folder):
                 print_text(path)
     return 0
-
-
-def _require_writable(out: Path) -> None:
-    """Raise an error before the work if no page can be written there. Only a report may be overwritten."""
-    if not out.parent.is_dir():
-        raise ConfigurationError(
-            "there is no such folder", where=str(out.parent), remedy=shell_command("mkdir", "-p", out.parent)
-        )
-    if out.is_dir():
-        raise ConfigurationError(
-            "this is a folder", where=str(out), remedy=f"name a file: {shell_command('-o', out / _OUT)}"
-        )
-    if out.exists() and not _is_page(out):
-        raise ConfigurationError(
-            "this file is not a report, and is not overwritten",
-            where=str(out),
-            remedy="choose another -o",
-        )
-
-
-def _is_page(out: Path) -> bool:
-    """Return True if a file is a report or empty. A pipe is not read, because that would block."""
-    if not out.is_file():
-        return False
-    with _explain_os_errors(out, "-o"), out.open("rb") as file:
-        return file.read(len(_PAGE)) in {b"", _PAGE}
-
-
-@contextmanager
-def _explain_os_errors(path: Path, option: str) -> Iterator[None]:
-    """Turn an OSError of the body into a ConfigurationError with the path and the option."""
-    try:
-        yield
-    except OSError as error:
-        raise ConfigurationError(
-            f"cannot be written: {error.strerror}", where=str(path), remedy=f"choose another {option}"
-        ) from error
 
 
 def _command(arguments: argparse.Namespace) -> list[str]:

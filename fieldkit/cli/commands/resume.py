@@ -4,8 +4,8 @@ import argparse
 
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import showing_events
+from fieldkit.cli.interrupts import interruptible
 from fieldkit.cli.parser import Parser
-from fieldkit.cli.terminal import interruptible
 
 
 def add(parser: Parser) -> None:

@@ -21,7 +21,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the differences."""
-    from fieldkit.trial.manifest import verify
+    from fieldkit.trial.stored.verification import verify
 
     problems = verify(arguments.trial)
     for problem in problems:

@@ -1,18 +1,15 @@
 """Reading of evidence files, with errors that contain a remedy, and checks that a file is complete."""
 
-import json
 import os
 import re
 import stat
-import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeVar
+from typing import BinaryIO, Final, TypeVar
 
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.text import JSON_ERRORS
 
 T = TypeVar("T")
 
@@ -79,26 +76,6 @@ def text(path: Path) -> str:
     return content.decode(errors="replace")
 
 
-def json_lines(path: Path, parse: Callable[[Any], T], wrong: str) -> list[T]:
-    """Return the parsed JSON lines of a log; an incomplete last line is omitted.
-
-    Args:
-        path: The log.
-        parse: Converts the value of a line; raises one of `JSON_ERRORS` if it is invalid.
-        wrong: Predicate of the message about an invalid line: `is not a sample of a drive`.
-
-    Raises:
-        EvidenceError: As `text`, or a line is invalid.
-    """
-    parsed = []
-    for number, line in enumerate(text(path).split("\n")[:-1], 1):
-        try:
-            parsed.append(parse(json.loads(line)))
-        except JSON_ERRORS:
-            raise EvidenceError(f"line {number} {wrong}", where=str(path)) from None
-    return parsed
-
-
 @contextmanager
 def _open_regular(path: Path) -> Iterator[BinaryIO]:
     """Open a regular file; other types, such as a pipe without a writer or an endless device, are refused."""
@@ -148,37 +125,3 @@ def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: s
     if count and int(count[1]) != len(matches):
         raise EvidenceError(f"has {len(matches)} lines of {count[1]}: truncated", where=str(path))
     return matches
-
-
-_END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
-
-
-def numbered_lines_problem(path: Path) -> str | None:
-    """Return the reason why a log is not complete; None if it is, or if its lines have no numbers.
-
-    Raises:
-        EvidenceError: As `reading.text`.
-    """
-    log_text = text(path)
-    lines = log_text.splitlines(keepends=True)
-    numbers = [_number(line) for line in lines]
-    if all(number is None for number in numbers):
-        return None
-    if numbers != list(range(len(lines))):
-        return "its lines are not numbered without a gap: some are missing or were changed"
-    end = _END.fullmatch(lines[-1].rstrip("\n"))
-    if end is None or not lines[-1].endswith("\n"):
-        return "its last line is missing: its writer was killed"
-    head = "".join(lines[:-1]) + end[1] + "}"
-    return (
-        None if zlib.crc32(head.encode("utf-8", "replace")) == int(end[2]) else "was changed: its checksum is wrong"
-    )
-
-
-def _number(line: str) -> int | None:
-    try:
-        value: Any = json.loads(line)
-    except JSON_ERRORS:
-        return None
-    number = value.get("n") if isinstance(value, dict) else None
-    return number if type(number) is int else None

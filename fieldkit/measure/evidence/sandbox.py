@@ -7,7 +7,6 @@ following ones. It exits after an idle time, and after it ran out of memory.
 """
 
 import json
-import math
 import os
 import resource
 import select
@@ -17,9 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from threading import Lock
 from typing import Any, Final
 
@@ -40,11 +38,9 @@ MAX_CPU_S: Final = 3600
 # The wall-clock limit is needed for a reader that waits without using CPU time, as for a named pipe; it allows for
 # other processes on a busy machine.
 _WALL_PER_CPU_S: Final = 6
-_IDLE_MS: Final = 60_000
-"""Idle time before the process exits: longer than a repeat, so that one process serves a whole trial. It also exits
-with its parent process, because its input is closed then."""
 _EXIT_WAIT_S: Final = 5.0
-_ERROR_KEY: Final = "unanswered"
+ERROR_KEY: Final = "unanswered"
+"""Key of the reason in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
 # Exits that the file did not cause: idle time, out-of-memory killer of the kernel, a person, a service manager.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
@@ -61,7 +57,7 @@ class SandboxedReader:
     """A sandboxed process that answers queries about files.
 
     Args:
-        module: Name of a module that calls `serve` when it is run.
+        module: Name of a module that calls `sandbox_process.serve` when it is run.
     """
 
     def __init__(self, module: str) -> None:
@@ -74,7 +70,7 @@ class SandboxedReader:
         """Return the answer to a query about a file.
 
         Args:
-            question: Argument of the function that the module passed to `serve`.
+            question: Argument of the function that the module passed to `sandbox_process.serve`.
             size_bytes: Size of the file; the limits grow with it.
 
         Raises:
@@ -88,8 +84,8 @@ class SandboxedReader:
                     break
         if not answer:
             raise ReaderError(_exit_reason(code, size_bytes))
-        if _ERROR_KEY in answer:
-            raise ReaderError(answer[_ERROR_KEY])
+        if ERROR_KEY in answer:
+            raise ReaderError(answer[ERROR_KEY])
         return answer
 
     def stop(self) -> None:
@@ -118,7 +114,7 @@ class SandboxedReader:
             raise
         if len(line) > max_bytes:
             self._end(process)
-            return {_ERROR_KEY: "its contents exceed the limit for a file of its size"}, 0
+            return {ERROR_KEY: "its contents exceed the limit for a file of its size"}, 0
         if line.endswith(b"\n"):
             return json.loads(line), 0
         return {}, self._end(process, _EXIT_WAIT_S)
@@ -133,27 +129,6 @@ class SandboxedReader:
             return process.wait()
 
 
-def serve(answer: Callable[[Json], Json]) -> None:
-    """Answer queries from standard input until the idle time has passed, input ends, or memory was exhausted."""
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with suppress(OSError):  # if memory is short, the kernel should kill this process instead of its parent
-        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
-    questions = select.poll()
-    questions.register(sys.stdin.fileno(), select.POLLIN)
-    has_memory = True
-    while has_memory and questions.poll(_IDLE_MS) and (line := sys.stdin.readline()):
-        question, limits, tempfile.tempdir = json.loads(line)
-        _apply_limits(*limits)
-        try:
-            reply = answer(question)
-        except Exception as error:  # noqa: BLE001 (the file may cause any exception)
-            has_memory = not isinstance(error, MemoryError)
-            reply = {_ERROR_KEY: _error_text(error)}
-        _remove(tempfile.tempdir)  # done here, because the parent process may have been killed
-        sys.stdout.write(json.dumps(reply) + "\n")
-        sys.stdout.flush()
-
-
 @contextmanager
 def _temporary_folder() -> Iterator[str | None]:
     """Create a folder for unpacked files, and remove it even if the reader is killed.
@@ -166,10 +141,11 @@ def _temporary_folder() -> Iterator[str | None]:
     try:
         yield folder
     finally:
-        _remove(folder)
+        remove(folder)
 
 
-def _remove(folder: str | None) -> None:
+def remove(folder: str | None) -> None:
+    """Remove a folder of unpacked files, if there is one."""
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -180,27 +156,6 @@ def _limits(size_bytes: int) -> tuple[int, int, int]:
     max_bytes = max(MEMORY_BYTES, int(MEMORY_SHARE * machine_bytes))
     memory_bytes = min(MEMORY_BYTES + MEMORY_PER_BYTE * size_bytes, max_bytes)
     return memory_bytes, DISK_BYTES + DISK_PER_BYTE * size_bytes, _cpu_s(size_bytes)
-
-
-def _apply_limits(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
-    """Limit the resources that this process may use in addition to its present use."""
-    used_bytes = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    limits = {
-        resource.RLIMIT_AS: used_bytes + memory_bytes,
-        resource.RLIMIT_FSIZE: disk_bytes,
-        resource.RLIMIT_CPU: math.ceil(used.ru_utime + used.ru_stime) + cpu_s,
-    }
-    for kind, limit in limits.items():
-        _, hard_limit = resource.getrlimit(kind)
-        soft_limit = limit if hard_limit == resource.RLIM_INFINITY else min(limit, hard_limit)
-        resource.setrlimit(kind, (soft_limit, hard_limit))
-
-
-def _error_text(error: Exception) -> str:
-    if isinstance(error, MemoryError):
-        return "reading it needs more memory than the limit for a file of its size"
-    return f"{type(error).__name__}: {' '.join(str(error)[:1000].split())}"[:300]
 
 
 def _exit_reason(code: int, size_bytes: int) -> str:

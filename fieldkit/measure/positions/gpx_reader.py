@@ -4,7 +4,7 @@ from pathlib import Path
 
 import gpxpy
 
-from fieldkit.measure.evidence import sandbox
+from fieldkit.measure.evidence import sandbox_process
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.measure.positions.samples import utc_ns
 
@@ -31,4 +31,4 @@ def answer(request: Json) -> Json:
 
 
 if __name__ == "__main__":
-    sandbox.serve(answer)
+    sandbox_process.serve(answer)

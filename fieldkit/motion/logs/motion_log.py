@@ -1,11 +1,15 @@
 """Reading and checks that logs of drives and of flights have in common: order of lines, agreement of two clocks."""
 
+import json
+import re
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
 from fieldkit.core.errors import EvidenceError
+from fieldkit.core.text import JSON_ERRORS
 from fieldkit.measure.evidence import reading
 
 LONGEST_M: Final = 1e6
@@ -14,6 +18,9 @@ LAST_NS: Final = 2**62
 """Limits of valid values."""
 _STALL_S: Final = 2.0
 """Longest suspension of the program by a busy robot between reading the two clocks of a line."""
+
+
+_END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
 
 
 class MotionMoment(Protocol):
@@ -34,6 +41,7 @@ class MotionMoment(Protocol):
 
 
 _Moment = TypeVar("_Moment", bound=MotionMoment)
+_Value = TypeVar("_Value")
 
 
 def read(path: Path, parse: Callable[[Mapping[str, Any]], _Moment | None], motion: str) -> tuple[_Moment, ...]:
@@ -47,13 +55,64 @@ def read(path: Path, parse: Callable[[Mapping[str, Any]], _Moment | None], motio
     Raises:
         EvidenceError: The log is missing, empty, or has an invalid line.
     """
-    lines = reading.json_lines(path, parse, f"is not a line of a {motion} log")
+    lines = _json_lines(path, parse, f"is not a line of a {motion} log")
     moments = tuple(moment for moment in lines if moment is not None)
     if any(after.at_s < before.at_s for before, after in pairwise(moments)):
         raise EvidenceError("its lines are not in the order of time", where=str(path))
     if not moments:
         raise EvidenceError(f"contains no position of a {motion}", where=str(path))
     return moments
+
+
+def _json_lines(path: Path, parse: Callable[[Any], _Value], wrong: str) -> list[_Value]:
+    """Return the parsed JSON lines of a log; an incomplete last line is omitted.
+
+    Args:
+        path: The log.
+        parse: Converts the value of a line; raises one of `JSON_ERRORS` if it is invalid.
+        wrong: Predicate of the message about an invalid line: `is not a sample of a drive`.
+
+    Raises:
+        EvidenceError: As `reading.text`, or a line is invalid.
+    """
+    parsed = []
+    for number, line in enumerate(reading.text(path).split("\n")[:-1], 1):
+        try:
+            parsed.append(parse(json.loads(line)))
+        except JSON_ERRORS:
+            raise EvidenceError(f"line {number} {wrong}", where=str(path)) from None
+    return parsed
+
+
+def numbered_lines_problem(path: Path) -> str | None:
+    """Return the reason why a log is not complete; None if it is, or if its lines have no numbers.
+
+    Raises:
+        EvidenceError: As `reading.text`.
+    """
+    log_text = reading.text(path)
+    lines = log_text.splitlines(keepends=True)
+    numbers = [_number(line) for line in lines]
+    if all(number is None for number in numbers):
+        return None
+    if numbers != list(range(len(lines))):
+        return "its lines are not numbered without a gap: some are missing or were changed"
+    end = _END.fullmatch(lines[-1].rstrip("\n"))
+    if end is None or not lines[-1].endswith("\n"):
+        return "its last line is missing: its writer was killed"
+    head = "".join(lines[:-1]) + end[1] + "}"
+    return (
+        None if zlib.crc32(head.encode("utf-8", "replace")) == int(end[2]) else "was changed: its checksum is wrong"
+    )
+
+
+def _number(line: str) -> int | None:
+    try:
+        value: Any = json.loads(line)
+    except JSON_ERRORS:
+        return None
+    number = value.get("n") if isinstance(value, dict) else None
+    return number if type(number) is int else None
 
 
 def time_contradictions(log: Sequence[MotionMoment], window: tuple[int, int] | None) -> Iterator[str]:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common as dialect
 
-from fieldkit.measure.evidence import sandbox, sequence
+from fieldkit.measure.evidence import sandbox_process, sequence
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.motion.logs import periodic, tlog
 from fieldkit.motion.logs.periodic import StreamMessage
@@ -266,4 +266,4 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
 
 
 if __name__ == "__main__":
-    sandbox.serve(answer)
+    sandbox_process.serve(answer)

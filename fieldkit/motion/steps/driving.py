@@ -10,7 +10,7 @@ from fieldkit.agent.driving.drive_plan import DriveTask
 from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.core import geometry
 from fieldkit.core.deadline import Deadline
-from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError
+from fieldkit.core.errors import FieldkitError, LinkError, MotionHeldError, RobotError, describe_exception
 from fieldkit.core.model import Move
 from fieldkit.motion.logs import drive_log
 from fieldkit.motion.origins import RobotMotion, origins_of
@@ -279,8 +279,12 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
         with suppress(LinkError, RobotError):  # each renewal repeats the order
             drive_lease.give_order(drive_plan.OUT)
         yield drive_lease
-    except Exception:
-        bring_back()
+    except Exception as error:
+        try:
+            bring_back()
+        except FieldkitError as second_error:
+            second_error.what += f"; before, the steps failed: {describe_exception(error)}"
+            raise
         raise
     except BaseException:
         _end(shell, job)

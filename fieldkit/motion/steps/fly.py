@@ -15,9 +15,8 @@ from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError, RobotError
 from fieldkit.core.model import Control, Protocol, Role
 from fieldkit.core.units import format_duration
-from fieldkit.measure.evidence import reading
 from fieldkit.motion.abort_actions import OnAbort, abort_of
-from fieldkit.motion.logs import fly_checks, fly_log, motion_sources
+from fieldkit.motion.logs import fly_checks, fly_log, motion_log, motion_sources
 from fieldkit.motion.origins import origins_of
 from fieldkit.motion.profile_sections import flies, mavlink_of
 from fieldkit.motion.steps import piloting
@@ -348,7 +347,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         """Yield a reason if the log of the flight is damaged, or contradicts the plan or the telemetry."""
         try:
             log = view.evidence.read(fly_log.read, self._log)
-            damage = view.evidence.read(reading.numbered_lines_problem, self._log)
+            damage = view.evidence.read(motion_log.numbered_lines_problem, self._log)
         except EvidenceError as error:
             yield f"{self._log}: {error.what}"
             return

@@ -12,9 +12,8 @@ from fieldkit.core import geometry, model
 from fieldkit.core.columns import Column, Measured, Value
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
-from fieldkit.measure.evidence import reading
 from fieldkit.measure.positions import recorded_positions
-from fieldkit.motion.logs import drive_checks, drive_log, motion_sources
+from fieldkit.motion.logs import drive_checks, drive_log, motion_log, motion_sources
 from fieldkit.motion.profile_sections import drive_of, drives
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
@@ -236,7 +235,7 @@ class MoveStep(
             return
         try:
             log = view.evidence.read(drive_log.read, self._log)
-            damage = view.evidence.read(reading.numbered_lines_problem, self._log)
+            damage = view.evidence.read(motion_log.numbered_lines_problem, self._log)
         except EvidenceError as error:
             yield f"{self._log}: {error.what}"
             return

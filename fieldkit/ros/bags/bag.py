@@ -1,7 +1,5 @@
 """Contents of a ROS bag, which the rosbags library reads in a sandboxed process."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -49,7 +47,7 @@ def read(path: Path) -> RecordingContents:
             remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         )
     try:
-        contents = _query(path)
+        contents = query(path)
     except ReaderError as error:
         raise EvidenceError(
             f"the bag cannot be read, it is unindexed, truncated or not a bag: {error}",
@@ -72,38 +70,6 @@ def read(path: Path) -> RecordingContents:
     return RecordingContents(messages, contents["started_utc_ns"], contents["duration_s"], by_topic)
 
 
-@dataclass(frozen=True)
-class TopicStats:
-    """Number and times of the recorded messages of one topic.
-
-    Attributes:
-        messages: Number of messages.
-        first_utc_ns: Time of the first, nanoseconds since 1970 UTC by the recorder's clock.
-        last_utc_ns: Time of the last.
-        gap_ns: Longest time between consecutive messages; 0 if there is only one.
-    """
-
-    messages: int
-    first_utc_ns: int
-    last_utc_ns: int
-    gap_ns: int
-
-
-def topic_stats(path: Path) -> Mapping[str, TopicStats]:
-    """Return number and times of the messages by topic; topics without a message are omitted.
-
-    Raises:
-        EvidenceError: The bag is missing or cannot be read.
-    """
-    if not path.is_file():
-        raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
-    try:
-        topics = _query(path, topic_stats="true")["topics"]
-    except ReaderError as error:
-        raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
-    return {topic: TopicStats(**fields) for topic, fields in topics.items()}
-
-
 def battery_share(path: Path, topic: str) -> float | None:
     """Return the charge in the last `sensor_msgs/BatteryState` of `topic`, between 0 and 1; None if unknown.
 
@@ -114,7 +80,7 @@ def battery_share(path: Path, topic: str) -> float | None:
         EvidenceError: A message of the bag cannot be read.
     """
     try:
-        share: float | None = _query(path, topic=topic)["share"]
+        share: float | None = query(path, topic=topic)["share"]
     except ReaderError as error:
         raise EvidenceError(f"a message of {topic} cannot be read: {error}", where=str(path)) from error
     if share is None or share < 0:
@@ -129,12 +95,13 @@ def positions(path: Path, topic: str, child: str) -> Json:
         EvidenceError: The bag cannot be read, or the type of its messages contains no position.
     """
     try:
-        return _query(path, positions=topic, child=child)
+        return query(path, positions=topic, child=child)
     except ReaderError as error:
         raise EvidenceError(f"the positions of {topic} cannot be read: {error}", where=str(path)) from error
 
 
-def _query(path: Path, **parameters: str) -> Json:
+def query(path: Path, **parameters: str) -> Json:
+    """Return the answer of `bag_reader` to a query about a bag; raises `ReaderError`."""
     # The path must be absolute, because the reader keeps the working directory in which it was started.
     return _READER.query({"path": str(path.absolute()), **parameters}, allocated_bytes(path))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosbags import rosbag1
 
-from fieldkit.measure.evidence import sandbox
+from fieldkit.measure.evidence import sandbox_process
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.ros.bags import bag
 
@@ -194,4 +194,4 @@ def _checked_topic(value: object) -> str:
 
 
 if __name__ == "__main__":
-    sandbox.serve(answer)
+    sandbox_process.serve(answer)

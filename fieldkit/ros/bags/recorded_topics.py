@@ -7,7 +7,7 @@ of rosbag2).
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -15,6 +15,7 @@ from typing import Final
 from fieldkit.core.columns import Figure, Kind, Measured, columns
 from fieldkit.core.errors import EvidenceError
 from fieldkit.measure.evidence import reading
+from fieldkit.measure.evidence.sandbox import ReaderError
 from fieldkit.ros.bags import bag
 
 COLUMNS: Final = columns(
@@ -76,6 +77,38 @@ class RecordingReception:
     gap_s: float | None
 
 
+@dataclass(frozen=True)
+class TopicStats:
+    """Number and times of the recorded messages of one topic.
+
+    Attributes:
+        messages: Number of messages.
+        first_utc_ns: Time of the first, nanoseconds since 1970 UTC by the recorder's clock.
+        last_utc_ns: Time of the last.
+        gap_ns: Longest time between consecutive messages; 0 if there is only one.
+    """
+
+    messages: int
+    first_utc_ns: int
+    last_utc_ns: int
+    gap_ns: int
+
+
+def topic_stats(path: Path) -> Mapping[str, TopicStats]:
+    """Return number and times of the messages by topic; topics without a message are omitted.
+
+    Raises:
+        EvidenceError: The bag is missing or cannot be read.
+    """
+    if not path.is_file():
+        raise EvidenceError("there is no bag", where=str(path), remedy="read the recorder's log: did it start?")
+    try:
+        topics = bag.query(path, topic_stats="true")["topics"]
+    except ReaderError as error:
+        raise EvidenceError(f"the bag cannot be read: {error}", where=str(path)) from error
+    return {topic: TopicStats(**fields) for topic, fields in topics.items()}
+
+
 def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: float) -> RecordingReception:
     """Return the reception of the topics of a recording.
 
@@ -92,7 +125,7 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
     start_ns = subscribed_ns(reading.text(folder / log), topics)
     all_subscribed = start_ns.keys() >= set(topics)
     try:
-        by_topic = bag.topic_stats(folder / file)
+        by_topic = topic_stats(folder / file)
     except EvidenceError:
         # A recorder that cannot reach its master never subscribes and writes no bag.
         return RecordingReception(None if all_subscribed else False, None, None, None)

@@ -271,7 +271,8 @@ def _mcap(file: Path) -> Iterator[SavedMessage]:
                     connections[record.id] = _channel_connection(record, schemas.get(record.schema_id))
                 elif isinstance(record, Message):
                     yield connections[record.channel_id], record.log_time, record.data
-        except (McapError, KeyError, ValueError, RuntimeError, struct.error, EOFError) as error:
+        # OverflowError: a record inside a chunk states a length above what `read` accepts.
+        except (McapError, KeyError, ValueError, RuntimeError, OverflowError, struct.error, EOFError) as error:
             raise DamagedError(f"{type(error).__name__}: {error}".strip(": ")) from error
 
 

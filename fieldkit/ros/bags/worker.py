@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
-from fieldkit.measure.evidence import sandbox
+from fieldkit.measure.evidence import sandbox_process
 from fieldkit.measure.evidence.sandbox import Json
 from fieldkit.ros.bags import bag_paths, salvage
 from fieldkit.ros.bags.formats import BagFiles, BagFormat, find
@@ -233,4 +233,4 @@ def _error_text(error: Exception) -> str:
 
 if __name__ == "__main__":
     bag_paths.allow_any()
-    sandbox.serve(answer)
+    sandbox_process.serve(answer)

@@ -24,7 +24,7 @@ from fieldkit.ros.middlewares.middleware import MiddlewareName
 from fieldkit.ros.recommendation.link_cells import LinkCell, LinkCriterion, figure, link_cell, topic_columns
 from fieldkit.ros.streams.stream_options import StreamOptions
 from fieldkit.steps.base import Step
-from fieldkit.trial import store
+from fieldkit.trial.stored import plans
 
 _RMW: Final = re.compile(r"\brmw_[a-z_]+")
 
@@ -117,7 +117,7 @@ def _attempts_by_step(attempts: Repeats) -> Iterator[tuple[Repeats, StreamOption
         if not folder or not Path(folder).is_dir():
             continue  # a CSV file without its trial does not contain the plan
         rows = attempts.where(attempts.texts[SOURCE] == folder)
-        for placed in store.read_plan(Path(folder)).procedure.walk():
+        for placed in plans.read_plan(Path(folder)).procedure.walk():
             if isinstance(placed.step, StreamOptions) and not placed.disturbed:
                 yield rows, placed.step, placed.step.prefix, _rmw(Path(folder), placed.step)
 

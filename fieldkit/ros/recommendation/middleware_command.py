@@ -67,7 +67,7 @@ def recommend(arguments: argparse.Namespace) -> int:
     from fieldkit.ros.recommendation import candidates
     from fieldkit.ros.recommendation.candidates import Assessment
     from fieldkit.ros.recommendation.link_cells import LinkCriterion
-    from fieldkit.trial import sources
+    from fieldkit.trial.stored import sources
 
     if arguments.repeats < 2:
         raise ConfigurationError("--repeats: one repeat does not show the spread", remedy="write 2 or more")

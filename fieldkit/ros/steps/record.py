@@ -18,7 +18,6 @@ from fieldkit.measure.evidence import recordings
 from fieldkit.remote import jobs
 from fieldkit.remote.command import quote, with_environment
 from fieldkit.remote.jobs import Job
-from fieldkit.ros.bags import recorded_topics
 from fieldkit.ros.steps import ros_master
 from fieldkit.steps import variants
 from fieldkit.steps.base import Step, StepName
@@ -253,12 +252,18 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        return recorded_topics.COLUMNS if self.reception else ()
+        if not self.reception:
+            return ()
+        from fieldkit.ros.bags import recorded_topics  # noqa: PLC0415 (only with `reception: true`)
+
+        return recorded_topics.COLUMNS
 
     @override
     def measure(self, view: View) -> Measured:
         if not self.reception:
             return Measured()
+        from fieldkit.ros.bags import recorded_topics  # noqa: PLC0415 (only with `reception: true`)
+
         arguments = self._log, self.bag(view.scene.robot(self.robot)), self.topics, self.duration
         return recorded_topics.measure(view.evidence.read_or_none(recorded_topics.read, "", *arguments))
 

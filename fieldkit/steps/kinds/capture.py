@@ -28,9 +28,11 @@ from fieldkit.remote.command import quote
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import base
 from fieldkit.steps.base import Step, StepEntry
-from fieldkit.steps.capabilities import HasNeeds, UsesSpace
+from fieldkit.steps.capabilities import ChecksPlacement, HasNeeds, UsesSpace
 from fieldkit.steps.nest import Nest, flows_inside, steps_inside
+from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, CommandResult, Flow, Need, Planned, Scene
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.variants import Tool
 from fieldkit.steps.view import View
 
@@ -58,7 +60,7 @@ STAMP_NS: Final = 1_000
 """Resolution of time stamps: tcpdump truncates them to microseconds."""
 
 
-class CaptureStep(Nest, HasNeeds, UsesSpace):
+class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     """Runs tcpdump on each robot. It starts before the steps in `during` and ends after them.
 
     The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between the robots of these
@@ -109,6 +111,16 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
         return self
 
     @override
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
+        for step in self._leaves():
+            if isinstance(step, OverLink) and step.over != self.over:
+                used, captured = (
+                    f"link {link}" if link else "the radio under test" for link in (step.over, self.over)
+                )
+                return f"a {step.kind_name()} uses {used}, but the capture around it is on {captured}; see `over`"
+        return None
+
+    @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         for role in self.robots:
             yield self._planned(scene, role)
@@ -122,7 +134,14 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
             folder=scene.folder,
             name=self.prefixed_name("capture"),
             argv=(
-                *(profile.tools.capture, "-i", profile.radio.interface, *options, "-w", self._file(role)),
+                *(
+                    profile.tools.capture,
+                    "-i",
+                    scene.link(role, self.over).interface,
+                    *options,
+                    "-w",
+                    self._file(role),
+                ),
                 self._filter(scene),
             ),
             # The limit exceeds the captured jobs, because a capture that was stopped at its limit looks complete.
@@ -154,9 +173,13 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
         """Return the capture filter (pcap-filter(7))."""
         flows = list(flows_inside(self, scene)) or [Flow(Role.SENDER, Role.RECEIVER)]
         pairs = dict.fromkeys(frozenset({flow.source, flow.destination}) for flow in flows)
-        hosts = [" and ".join(f"host {scene.robot(role).address}" for role in sort_roles(pair)) for pair in pairs]
+        hosts = [
+            " and ".join(f"host {scene.link(role, self.over).address}" for role in sort_roles(pair)) for pair in pairs
+        ]
         groups = {(flow.group, role) for flow in flows if flow.group for role in (flow.source, flow.destination)}
-        hosts += [f"src host {scene.robot(role).address} and dst host {group}" for group, role in sorted(groups)]
+        hosts += [
+            f"src host {scene.link(role, self.over).address} and dst host {group}" for group, role in sorted(groups)
+        ]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
         kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
         among = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
@@ -171,8 +194,9 @@ class CaptureStep(Nest, HasNeeds, UsesSpace):
             # A capture with sudo runs the job script as root, so that the script can signal its children.
             prefix = ("sudo", "-n", "sh", "-c", 'exec "$@"', "sh") if names.capture_right == "sudo" else ()
             # The list of link types needs the same permission as a capture, because it opens the interface.
-            argv = (*prefix, names.capture, "-L", "-i", profile.radio.interface)
-            yield Need(role, "right to capture", argv, partial(_judge, profile), required_program=names.capture)
+            argv = (*prefix, names.capture, "-L", "-i", scene.link(role, self.over).interface)
+            name = f"right to capture{f' on {self.over}' if self.over else ''}"
+            yield Need(role, name, argv, partial(_judge, profile), required_program=names.capture)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
+from fieldkit.config.profiles import LinkName
 from fieldkit.config.schema import Duration, Field
 from fieldkit.core import model
 from fieldkit.core.columns import Column, Measured, Value, fault_column_name
@@ -18,7 +19,7 @@ from fieldkit.core.crosschecks import CrossCheck
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import EvidenceError, FieldkitError, LinkError, RobotError
 from fieldkit.core.model import FaultKind, Protocol, Role
-from fieldkit.core.threads import run_parallel
+from fieldkit.core.threads import is_mistake, run_parallel
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import outage, outage_columns
 from fieldkit.measure.robot_clock import Offset, offset
@@ -51,7 +52,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     A backend that can cause the fault does so; on a lab's robots the fault is real. In the field the operator is
     asked to cause it; with `--yes` no operator is asked, and the attempts are void.
 
-    - `link-down`: the radio interface is down for `for`, then up again.
+    - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
     - `out-of-range`: no other robot receives the robot for `for`. If it is the relay, no robot receives any other.
     - `reboot`: every process ends at the same moment, data in memory is lost, and the robot boots.
     - `kill`: every process named `process` ends at the same moment.
@@ -68,6 +69,8 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         lasts: Duration; required by `link-down` and `out-of-range`, not allowed for the others.
         process: Name of the process, as `ps -e -o comm` shows it, up to 15 letters; required by `kill`, not allowed
             for the others.
+        link: Link that is down, by its name in [the profile](links.md); only for `link-down`. Without it, the radio
+            under test.
         after: How long the steps inside run before the fault.
         limit: Maximum time until the robot answers again after the cause is over.
         during: Steps during which the fault occurs.
@@ -95,6 +98,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         ]
         | None
     ) = None
+    link: LinkName = Field(default="", exclude_if=schema.is_empty)
     after: Duration = 1.0
     limit: Annotated[Duration, Field(gt=0)] = 60.0
     during: tuple[StepEntry, ...] = ()
@@ -107,12 +111,14 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         ):
             if is_given != is_required:
                 raise schema.validation_error(f"a {self.kind} {'needs' if is_required else 'does not allow'} {key}:")
+        if self.link and self.kind is not FaultKind.LINK_DOWN:
+            raise schema.validation_error(f"a {self.kind} does not allow link:", "link")
         return self
 
     @property
     def cause(self) -> model.Fault:
         """The fault, as passed to the testbed."""
-        return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "")
+        return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "", self.link)
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
@@ -124,7 +130,8 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         lasts = f" for {self.lasts:g} s" if self.lasts else ""
         what = f" of the process {self.process}" if self.process else ""
-        yield f"{self.kind}{what} of {scene.robot(self.robot).name}{lasts}, after {self.after:g} s"
+        over = f" of link {self.link}" if self.link else ""
+        yield f"{self.kind}{what}{over} of {scene.robot(self.robot).name}{lasts}, after {self.after:g} s"
 
     def _observer(self, scene: Scene) -> Observer:
         return Observer(scene, self.cause, self.prefix)
@@ -156,11 +163,14 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             jobs.run(shell, recovery.job)  # `measure` evaluates whether the robot recovered
             jobs.stop(shell, watch.job)
             self._wait_for_steps(steps, scene, testbed)
-        except Exception:
+        except Exception as error:
             inner.halt.set()
             with suppress(FieldkitError):
                 end_inside(self, scene, testbed)
             wait([steps])
+            mistake = steps.exception()
+            if mistake is not None and mistake is not error and is_mistake(mistake):
+                raise mistake from error
             raise
         finally:
             inner.halt.set()

@@ -235,7 +235,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
                 receiver_counters=view.evidence.counters(self.destination),
             )
             yield from load_checks.find(self._flow(view, sent, received), sent, received, load_evidence)
-        interface = view.scene.robot(self.destination).profile.radio.interface
+        interface = view.scene.link(self.destination, self.over).interface
         interface_bytes = view.evidence.interface_bytes(self.destination, interface)
         payload_bytes = sum(interval.payload_bytes for interval in received.intervals)
         if interface_bytes is not None and payload_bytes > interface_bytes:
@@ -245,8 +245,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     def _flow(self, view: View, sent: IperfTest | None, received: IperfTest | None) -> LoadFlow:
         return LoadFlow(
             protocol=self.carried_by(view.scene.protocol),
-            source_address=view.scene.robot(self.source).address,
-            destination_address=view.scene.robot(self.destination).address,
+            source_address=view.scene.link(self.source, self.over).address,
+            destination_address=view.scene.link(self.destination, self.over).address,
             ports=sent.ports if sent else (),
             payload_bytes=self.payload_bytes,
             window_s=received.window_s if received else (0.0, 0.0),

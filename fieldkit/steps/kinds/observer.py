@@ -64,9 +64,11 @@ class Observer:
         if self._is_kill:
             argv: tuple[str, ...] = ("sh", "-c", _WATCH, "sh", self.fault.process, interval)
         else:
-            argv = ping.command_line(
-                self.scene, self.role, ("-i", interval), self.scene.robot(self.fault.role).address
-            )
+            link = self.fault.link
+            # Another link of a robot also answers for the address of this link, unless the interface is given.
+            bound = ("-I", self.scene.link(self.role, link).interface) if self.scene.robot(self.role).links else ()
+            address = self.scene.link(self.fault.role, link).address
+            argv = ping.command_line(self.scene, self.role, (*bound, "-i", interval), address)
         job = Job(
             folder=self.scene.folder,
             name=step_prefixed(self.name, f"fault-{self.fault.kind}"),

@@ -25,6 +25,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
 from fieldkit.steps.capabilities import HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
+from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import Announce, Flow, Need, PingSource, Planned, Refusal, Scene, fragments
 from fieldkit.steps.variants import PingTool, Tool
 from fieldkit.steps.view import View
@@ -63,7 +64,7 @@ class Payloads(Strict):
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
-class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
+class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
     """Measures round-trip times with ping. Writes `ping.txt`.
 
     Attributes:
@@ -111,7 +112,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
             Job(
                 folder=scene.folder,
                 name=self.prefixed_name("ping"),
-                argv=command_line(scene, self.sender, options, scene.robot(self.receiver).address),
+                argv=command_line(scene, self.sender, options, scene.link(self.receiver, self.over).address),
                 limit_s=self.count * self.interval + LAST_REPLY_S + 10.0,
                 log=self._log,
                 stdout=self._file,
@@ -136,6 +137,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
+        yield from self.route_need(scene, self.sender, self.receiver)
         if self.forwarded:
             yield from routing.needs(scene)
 
@@ -164,7 +166,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
         frame_count = 2 * self.count * fragments(self.payload_of(scene.protocol))
-        yield Flow(self.sender, self.receiver, frames=frame_count)
+        yield Flow(self.sender, self.receiver, frames=frame_count, link=self.over)
 
     @override
     def ping_source(self) -> PingSource:
@@ -204,7 +206,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
         If several pings ran, the one with the fewest contradictions is assumed to be this one.
         """
-        source, destination = (view.scene.robot(end).address for end in (self.sender, self.receiver))
+        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
         for role in (self.sender, self.receiver):
             capture = view.capture(role)
             if capture is None or result.payload_bytes is None or (capture.packets.time_ns == NO_TIME).any():
@@ -226,7 +228,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         capture = view.capture(role)
         if capture is None:
             return
-        source, destination = (view.scene.robot(end).address for end in (self.sender, self.receiver))
+        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
         packets = capture.packets
         echoes = packets.where((packets.echo != NO_ECHO) & _has_payload(packets, result.payload_bytes))
         counts = (
@@ -247,7 +249,7 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
         sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
         if sender is None or receiver is None:
             return 0
-        source, destination = (view.scene.robot(role).address for role in (self.sender, self.receiver))
+        source, destination = (view.scene.link(role, self.over).address for role in (self.sender, self.receiver))
         sent, received = (capture.packets.icmp(source, destination) for capture in (sender, receiver))
         returned = sender.packets.icmp(destination, source)
         is_request = (received.echo != NO_ECHO) & (received.echo < ECHO_REPLY)
@@ -261,14 +263,22 @@ class PingStep(AlongStep, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        return (*self.columns, *ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS) if self.gap else self.columns
+        if not self.gap:
+            return self.columns
+        from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
+
+        return (*self.columns, *ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)
 
     @override
     def measure(self, view: View) -> Measured:
         result = view.evidence.read_or_none(ping.read, self._file)
         replied_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
         ends = self.sender, self.receiver
-        gap = ping.measure_gap(result, self.interval) if self.gap else Measured()
+        gap = Measured()
+        if self.gap:
+            from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
+
+            gap = ping_gaps.measure_gap(result, self.interval)
         return (
             ping.measure(result)
             | gap

@@ -65,7 +65,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
     def _load(self, scene: Scene) -> tuple[Planned, Planned]:
         """Return the jobs of server and client."""
         limit_s = LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
-        interface = scene.robot(self.sender).profile.radio.interface
+        interface = scene.link(self.sender, self.over).interface
         client = self.client(scene, "-t", str(_FOREVER_S))
         ends = {
             self.receiver: (self.server(), jobs.ready_when_bound(Protocol.TCP, self.port)),

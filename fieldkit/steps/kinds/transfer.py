@@ -30,6 +30,7 @@ from fieldkit.steps import netcat
 from fieldkit.steps.base import FileName, Step
 from fieldkit.steps.capabilities import (
     ChecksPlacement,
+    HasNeeds,
     HasRefusals,
     Listens,
     Prepares,
@@ -41,11 +42,13 @@ from fieldkit.steps.capabilities import (
     WritesOnLaptop,
 )
 from fieldkit.steps.nest import Nest, flows_inside
+from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import (
     BY_ITSELF_OR_LIMIT,
     Announce,
     Flow,
     ListeningPort,
+    Need,
     Planned,
     RecordedFile,
     Refusal,
@@ -77,8 +80,10 @@ _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.t
 
 class TransferStep(
     Step,
+    OverLink,
     Prepares,
     ChecksPlacement,
+    HasNeeds,
     HasRefusals,
     UsesSpace,
     Listens,
@@ -144,6 +149,10 @@ class TransferStep(
         return next((file for file in recordings if self.file in {file.name, file.alias}), recordings[0])
 
     @override
+    def needs(self, scene: Scene) -> Iterator[Need]:
+        yield from self.route_need(scene, self.sender, self.receiver)
+
+    @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         yield from self._netcats(scene)
 
@@ -151,7 +160,7 @@ class TransferStep(
         """Yield the jobs of listener and sender."""
         listener, sender = (scene.robot(role).profile.tools.netcat for role in (self.receiver, self.sender))
         listener_variant, sender_variant = scene.tools(self.receiver).netcat, scene.tools(self.sender).netcat
-        address = scene.robot(self.receiver).address
+        address = scene.link(self.receiver, self.over).address
         yield Planned(
             self.receiver,
             Job(
@@ -228,7 +237,7 @@ class TransferStep(
         """
         oracle = testbed.oracle
         flow = (self.sender, self.receiver, scene.protocol, self.port)
-        before = None if oracle is None else oracle.delays(*flow)
+        before = None if oracle is None else oracle.delays(*flow, link=self.over)
         _, send = self._netcats(scene)
         announce("transfer", self.expected_s(scene.protocol))
         with ExitStack() as silence_contexts:
@@ -246,7 +255,7 @@ class TransferStep(
         # A sender runs longer than its listener only if the transfer was interrupted; its limit has then also passed.
         sending.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.laptop_folder is not None:
-            after = oracle.delays(*flow)
+            after = oracle.delays(*flow, link=self.over)
             (scene.laptop_folder / self.prefixed_name(oracle_delays.AIR_DELAY_FILE)).write_text(
                 oracle_delays.air_delay_text(before, after), encoding="ascii"
             )
@@ -287,7 +296,7 @@ class TransferStep(
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
         frame_count = frames(scene.protocol, self._size_bytes(scene), netcat.DATAGRAM_BYTES[Netcat.TRADITIONAL])
-        yield Flow(self.sender, self.receiver, self.port, frame_count)
+        yield Flow(self.sender, self.receiver, self.port, frame_count, link=self.over)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
@@ -302,8 +311,8 @@ class TransferStep(
             protocol=scene.protocol,
             source=self.sender,
             destination=self.receiver,
-            sender_address=scene.robot(self.sender).address,
-            receiver_address=scene.robot(self.receiver).address,
+            sender_address=scene.link(self.sender, self.over).address,
+            receiver_address=scene.link(self.receiver, self.over).address,
             port=self.port,
             sent_file=self._sent(scene).name,
             received_file=self._into,

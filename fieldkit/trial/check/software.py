@@ -10,7 +10,6 @@ from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import RobotError
 from fieldkit.core.model import Role
-from fieldkit.remote import agent
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import variants
@@ -122,6 +121,8 @@ def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report
     """
     for need in needs_of(plan, role, by_agent=True):
         if sections.get(_section(need.required_program), MISSING_SECTION).ok:
+            from fieldkit.remote import agent  # noqa: PLC0415 (few steps need the agent)
+
             agent.install(shell)
             completed = shell.run(need.argv, deadline=Deadline.after(_AGENT_S), check=False)
             text = (completed.stdout + completed.stderr).decode("utf-8", "replace")

@@ -14,7 +14,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import RepeatId, Status
 from fieldkit.core.text import encodable
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import journal, manifest, rows, store
+from fieldkit.trial import journal, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.manifest import Manifest
@@ -173,11 +173,15 @@ class Ledger:
         return rows.head(self._plan.table) + "".join(self._lines)
 
     def _manifest_differences(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
-        if ended and not (self._folder / store.MANIFEST_FILE).exists():
-            yield store.MANIFEST_FILE, "missing, so changes of the evidence cannot be detected"
+        if not (self._folder / store.MANIFEST_FILE).exists():
+            if ended:
+                yield store.MANIFEST_FILE, "missing, so changes of the evidence cannot be detected"
+            return
+        from fieldkit.trial.stored import verification  # noqa: PLC0415 (only a resumed trial has a manifest)
+
         if self._manifest.unchanged_lines(store.TRIAL_CSV) is None:
             yield store.TRIAL_CSV, "changed"
-        yield from manifest.differences(self._folder).items()
+        yield from verification.differences(self._folder).items()
 
     def _unchanged_lines(self, ended: int) -> list[str]:
         """Return the unchanged lines of the table; none if it has more lines than attempts that ended."""
@@ -190,10 +194,12 @@ class Ledger:
 
     def _require_evidence(self, attempts: list[Attempt]) -> None:
         """Raise an error if evidence that must be measured again has changed."""
-        if differing := manifest.differences(self._folder, [attempt.folder for attempt in attempts]):
+        from fieldkit.trial.stored import verification  # noqa: PLC0415 (only a resumed trial has a manifest)
+
+        if differing := verification.differences(self._folder, [attempt.folder for attempt in attempts]):
             raise EvidenceError(
                 f"{store.TRIAL_CSV} must be rebuilt, but the evidence is not what was measured: "
-                f"{manifest.summarize(differing)}",
+                f"{verification.summarize(differing)}",
                 where=str(self._folder),
                 remedy="restore both from a copy, or start a new trial",
             )

@@ -1,6 +1,6 @@
 """Resume a trial: code, backend and robots must be the same as at its start."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -9,12 +9,14 @@ from fieldkit.core import permissions, plugins
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import Note, Sink
 from fieldkit.core.prompts import Operator
-from fieldkit.trial import journal, step_packages, store
+from fieldkit.trial import journal, step_packages
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan, simulators_text
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.runner import Outcome, converting_write_errors, place, run_repeats
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.step_packages import StepPackage
+from fieldkit.trial.stored import plans
 
 
 def resume(
@@ -39,7 +41,7 @@ def resume(
             `opened` and `resume_trial`.
     """
     plan = resumable(folder)
-    for change in step_packages.changes(plan.step_packages):
+    for change in _step_code_changes(plan.step_packages):
         sink(Note(change))
     require_backend(plan, name, folder)
     require_simulators(plan, simulators_of(backend), folder)
@@ -95,7 +97,7 @@ def resumable(folder: Path) -> Plan:
         ConfigurationError: `folder` is not a trial; or other code started it, so that its rows would be measured in
             two ways; or a program of the lab that it copies to robots has changed or is missing.
     """
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     versions = plan.versions
     # Packages that add steps or a backend are compared by version, fieldkit by its hash, which is more precise.
     added = {name: now for name, now in plugins.versions().items() if name != "fieldkit"}
@@ -178,4 +180,18 @@ def require_cast(plan: Plan, cast: Cast) -> None:
                 f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now differs",
                 where=plan.trial,
                 remedy="restore the site file and profile to the values in trial.yaml, or start a new trial",
+            )
+
+
+def _step_code_changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
+    """Yield a sentence for each kind of step whose code differs from the plan although the version is equal."""
+    for kind, current in step_packages.of_kinds(planned).items():
+        frozen = planned[kind]
+        if (frozen.package, frozen.version) == (
+            current.package,
+            current.version,
+        ) and frozen.code_sha256 != current.code_sha256:
+            yield (
+                f"the code of the step {kind} ({current.package} {current.version}) has changed since the trial "
+                "started: its repeats are measured by two versions of it"
             )

@@ -22,7 +22,7 @@ from fieldkit.core.events import PhaseStarted, Sink
 from fieldkit.core.model import RepeatId, Role
 from fieldkit.core.threads import run_parallel
 from fieldkit.measure.evidence import link_samples, oracle_delays, track
-from fieldkit.remote import evidence, fetching, jobs, programs
+from fieldkit.remote import evidence, fetching, jobs
 from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size, step_errors
@@ -87,6 +87,8 @@ class Robots:
             )
             for put, content in puts:
                 if put.role == role:
+                    from fieldkit.remote import programs  # noqa: PLC0415 (few procedures copy programs)
+
                     sha256, executable = put.program.sha256, put.program.executable
                     programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 

@@ -3,14 +3,13 @@
 import errno
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from fieldkit.analysis import wording
 from fieldkit.analysis.cells import Cell
-from fieldkit.analysis.judgements import Judgement, judge
 from fieldkit.backends.protocols import Testbed
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.events import (
@@ -27,7 +26,7 @@ from fieldkit.core.events import (
 from fieldkit.core.model import ENDED, RepeatId
 from fieldkit.core.prompts import Answer
 from fieldkit.core.units import TimeEstimate
-from fieldkit.trial import estimates, journal, manifest, rows, store
+from fieldkit.trial import estimates, journal, rows, store
 from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import motion_control, preflight
@@ -35,6 +34,9 @@ from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.stop import Stop
+
+if TYPE_CHECKING:
+    from fieldkit.analysis.judgements import Judgement
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class Outcome:
     cells: tuple[Cell, ...]
     valid: int
     failed: int
-    judgements: tuple[Judgement, ...] = ()
+    judgements: "tuple[Judgement, ...]" = ()
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
@@ -123,7 +125,9 @@ def run_repeats(
     repeats = list(plan.order())
     finished = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
-        sink(Note(f"the evidence has changed since it was stored: {manifest.summarize(ledger.differences)}"))
+        from fieldkit.trial.stored import verification  # noqa: PLC0415 (only a resumed trial has a manifest)
+
+        sink(Note(f"the evidence has changed since it was stored: {verification.summarize(ledger.differences)}"))
     try:
         sink(TrialStarted(str(folder), ledger.done, len(repeats)))
         robots.stop_leftover_jobs()
@@ -169,19 +173,25 @@ def run_repeats(
     robots.delete_remote()
     _report_unfetched(robots, sink)
     valid, void, failed = map(ledger.counts, ENDED)
-    judgements = judge(plan.procedure.expectations, cells)
-    _show_judgements(judgements, sink)
+    judgements = _judge(plan, cells, sink) if plan.procedure.expect else ()
     sink(TrialEnded(str(folder), valid, void, failed))
     return Outcome(folder, cells, valid, failed, judgements)
 
 
-def _show_judgements(judgements: Iterable[Judgement], sink: Sink) -> None:
+def _judge(plan: Plan, cells: Sequence[Cell], sink: Sink) -> "tuple[Judgement, ...]":
+    """Judge the expectations of a procedure, and report each judgement."""
+    from fieldkit.analysis.judgements import judge  # noqa: PLC0415 (few procedures have expectations)
+
+    judgements = judge(plan.procedure.expectations, cells)
     for judgement in judgements:
         sink(_judgement_event(judgement))
+    return judgements
 
 
-def _judgement_event(judgement: Judgement) -> ExpectationJudged:
-    _, protocol, measured, interval, _ = wording.judgement_texts(judgement)
+def _judgement_event(judgement: "Judgement") -> ExpectationJudged:
+    from fieldkit.analysis.judgement_words import judgement_texts  # noqa: PLC0415 (few procedures have expectations)
+
+    _, protocol, measured, interval, _ = judgement_texts(judgement)
     estimate = judgement.estimate
     return ExpectationJudged(
         expectation=judgement.expectation.text,

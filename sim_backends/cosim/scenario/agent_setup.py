@@ -36,9 +36,9 @@ from sim_backends.cosim.scenario.agent_plans import (
 from sim_backends.cosim.scenario.faults import ClockSkewFault, NodeLossFault
 from sim_backends.cosim.scenario.schema import AgentPlan, CosimScenario
 from sim_backends.physics.body import Body, Twist, Velocity
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER, DifferentialDrive, DriveLimits
-from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
-from sim_backends.physics.robot_limits import BODIES, quadrotor
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.quadrotor import Quadrotor
+from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits, quadrotor
 from sim_backends.radio.antennas import Antenna, antenna_of
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from fieldkit.core.model import Topology
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.coordinator import Coordinator, Progress
+from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
@@ -25,7 +25,7 @@ from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.external import carried_radio, open_network, open_physics, writes_captures
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.wall_time import DEADLINE_S, Stall, stalled
+from sim_backends.cosim.wall_time import DEADLINE_S, Progress, Stall, stalled
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory

@@ -20,8 +20,7 @@ from sim_backends.cosim.scenario.agent_plans import (
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, limits, path_points_m, robots
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.differential_drive import DriveLimits
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 from sim_backends.world.world import World
 
 PACKET_BYTES: Final = 1200

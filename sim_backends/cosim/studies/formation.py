@@ -12,7 +12,7 @@ from sim_backends.cosim.scenario.agent_plans import FollowPlan
 from sim_backends.cosim.scenario.agent_setup import limits
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.intervals import Floats
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import QuadrotorLimits
 from sim_backends.world.motion import State
 
 

@@ -23,7 +23,7 @@ from sim_backends.emulated.autopilot.parameters import FlightLimits, Parameters
 from sim_backends.emulated.autopilot.telemetry import Telemetry
 from sim_backends.emulated.autopilot.vehicle import Vehicle
 from sim_backends.physics.collisions import Footprint
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import QuadrotorLimits
 
 _ALL: Final = 0
 _POSITION_IGNORED: Final = 0b111

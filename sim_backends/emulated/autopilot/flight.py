@@ -15,7 +15,8 @@ from sim_backends.emulated.autopilot.modes import LANDING, PILOTED, Mode
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.physics.body import Velocity
 from sim_backends.physics.collisions import Footprint, gap_m, move
-from sim_backends.physics.quadrotor import FlightPose, Quadrotor, QuadrotorLimits
+from sim_backends.physics.quadrotor import FlightPose, Quadrotor
+from sim_backends.physics.robot_limits import QuadrotorLimits
 
 STEP_NS: Final = 10_000_000
 _STEP_S: Final = STEP_NS / 1e9

@@ -8,7 +8,8 @@ from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe
 from sim_backends.emulated.ros.flight_records import FlightCommand, FlightCommandRecord, FlightMotion, FlightRecord
 from sim_backends.physics.body import Velocity
-from sim_backends.physics.quadrotor import FlightPose, Quadrotor, QuadrotorLimits
+from sim_backends.physics.quadrotor import FlightPose, Quadrotor
+from sim_backends.physics.robot_limits import QuadrotorLimits
 
 _LATEST_NS: Final = 100_000_000
 """Longest extrapolation of a state of the physics, which records one every 10 ms."""

@@ -12,7 +12,7 @@ from sim_backends.emulated.autopilot.modes import LANDING, Mode
 from sim_backends.emulated.autopilot.onboard_estimates import CELLS
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.emulated.autopilot.vehicle import Vehicle
-from sim_backends.physics.body import GRAVITY_M_S2
+from sim_backends.world.motion import GRAVITY_M_S2
 
 _UNKNOWN_CELL: Final = 0xFFFF
 _NAN: Final = math.nan

@@ -12,7 +12,7 @@ from sim_backends.emulated.autopilot.mission_plan import Mission
 from sim_backends.emulated.autopilot.onboard_estimates import Battery, LandDetector, PositionEstimate
 from sim_backends.emulated.autopilot.parameters import Parameters
 from sim_backends.physics.collisions import Footprint
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import QuadrotorLimits
 
 
 class StatusText(NamedTuple):

@@ -19,8 +19,9 @@ from sim_backends.network.bare_ip import BROADCAST, UNICAST, BareBroadcast, Bare
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits
-from sim_backends.physics.quadrotor import Quadrotor, QuadrotorLimits
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.quadrotor import Quadrotor
+from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 from sim_backends.radio.antennas import Antenna
 from sim_backends.radio.fixed_links import UniformLinks
 from sim_backends.radio.model import RadioModel, WifiInWorld

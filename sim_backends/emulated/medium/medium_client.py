@@ -1,6 +1,6 @@
 """The lab's client of the medium process."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -62,6 +62,11 @@ class MediumClient:
     def pid(self) -> int:
         """Process id of the medium."""
         return self._worker.pid
+
+    @property
+    def attached(self) -> Set[str]:
+        """Names of the attached robots."""
+        return self._robots
 
     def attach(
         self,

@@ -11,7 +11,8 @@ from fieldkit.core.model import Vector
 from sim_backends.emulated.robot.spec import Base
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 from sim_backends.physics.body import Twist
-from sim_backends.physics.differential_drive import DifferentialDrive, DriveLimits, DrivePose
+from sim_backends.physics.differential_drive import DifferentialDrive, DrivePose
+from sim_backends.physics.robot_limits import DriveLimits
 
 TIMEOUT_NS: Final = 500_000_000
 """The base stops this long after a velocity: CONTROL_MOTOR_TIMEOUT of OpenCR's turtlebot3_core, and ROS's default."""

@@ -195,21 +195,20 @@ class Init:
                 # The sensors process is forked from this one: it inherits the mapping, but no descriptor.
                 self._neighbourhood = Neighbourhood(received_fds[0], len(spec.hosts)) if received_fds else None
                 return _motion_files(spec)
-            case "open radio":
-                return [_open_radio(request)]
+            case "open radio" | "open link":
+                return _open_devices(request)
             case "start":
                 self._start(RobotSpec.from_json(request["robot"]))
-            case "open wifi" | "switch off" | "switch on":
+            case "open wifi" | "switch off" | "switch on" | "switch link on":
                 self._change_radio(request)
             case "move":
                 own_motion.append_path(services.MOTION, AssignedPath(**request["path"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":
-                self._halt(request["interface"])
+                self._halt(request["interfaces"])
             case "boot":
-                self._switch_on(request["interface"])
-                self._spawn(RobotSpec.from_json(request["robot"]))
+                self._boot(request["interfaces"], RobotSpec.from_json(request["robot"]))
             case "socket":
                 return [socket.socket(socket.AF_INET, socket.SOCK_STREAM).detach()]
             case other:
@@ -221,11 +220,19 @@ class Init:
         for service in self._spawn(spec):
             self._supervisor.wait_ready(service, deadline)
 
-    def _halt(self, interface: str) -> None:
-        # The radio is switched off first, because a robot that loses power closes no connection.
-        network.switch_off(interface)
+    def _halt(self, interfaces: Sequence[str]) -> None:
+        # Its links are switched off first, because a robot that loses power closes no connection.
+        for interface in interfaces:
+            network.switch_off(interface)
         self._supervisor.halt()
         lose_memory()
+
+    def _boot(self, interfaces: Sequence[str], spec: RobotSpec) -> None:
+        radio, *links = interfaces
+        self._switch_on(radio)
+        for interface in links:
+            network.switch_on_link(interface)
+        self._spawn(spec)
 
     def _change_radio(self, request: Message) -> None:
         match request["do"]:
@@ -236,6 +243,8 @@ class Init:
                 network.switch_off(request["interface"])
             case "switch on":
                 self._switch_on(request["interface"])
+            case "switch link on":
+                network.switch_on_link(request["interface"])
 
     def _switch_on(self, interface: str) -> None:
         network.switch_on(interface)
@@ -251,13 +260,18 @@ class Init:
         return started
 
 
-def _open_radio(request: Message) -> int:
-    """Bring up the radio interface, and the routing daemon of a mesh guest; return the device's descriptor."""
-    interface, address, hello_s = request["interface"], request["address"], request["guest_hello_s"]
-    fd = network.bring_up(interface, address, mesh=request["mesh"])
+def _open_devices(request: Message) -> list[int]:
+    """Bring up a link, and the routing daemon of a mesh guest; return the descriptor of its device, if it has one."""
+    interface, address = request["interface"], request["address"]
+    if request["do"] == "open link":
+        if interface == network.LOOPBACK:
+            network.add_loopback_address(address)
+            return []
+        return [network.add_link(interface, address, mesh=request["mesh"])]
+    fd, hello_s = network.bring_up(interface, address, mesh=request["mesh"]), request["guest_hello_s"]
     if hello_s is not None:
         services.spawn(network.guest_command(interface, address, hello_s), {}, Path(os.devnull))
-    return fd
+    return [fd]
 
 
 def _build(spec: RobotSpec) -> None:

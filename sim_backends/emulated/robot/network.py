@@ -7,7 +7,8 @@ import shutil
 import socket
 import struct
 import subprocess
-from ipaddress import IPv4Interface
+from collections.abc import Mapping
+from ipaddress import IPv4Interface, IPv4Network
 from pathlib import Path
 from typing import Final
 
@@ -18,18 +19,36 @@ from sim_backends.emulated.robot.spec import STATE
 PID: Final = Path(STATE, "babeld.pid")
 """Written when the daemon has its socket and its interface, before its first hello."""
 
+LOOPBACK: Final = "lo"
+"""Interface of the link whose address is reached over any other link of the robots."""
+SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
+"""Addresses of the robots on that link."""
+LINK_COST: Final = 1024
+"""Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
+
 _LONG_TERM_STATE: Final = f"{STATE}/babel-state"
 
 
-def command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
+def command(interface: str, address: str, hello_s: float, links: Mapping[str, str]) -> tuple[str, ...]:
     """Return the command of the routing daemon of a robot; other settings are babeld's defaults.
 
     Args:
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
         address: The robot's address with the prefix length; each robot announces its own address as a host route.
         hello_s: Hello interval.
+        links: Address with the prefix length by the interface of each further link. With an address on `LOOPBACK`,
+            the daemon also uses the other links, each at `LINK_COST`, and announces that address over all of them,
+            but the address on the radio only over the radio.
     """
-    return (*_program(str(PID), _LONG_TERM_STATE), *_settings(interface, address, hello_s), interface)
+    either = links.get(LOOPBACK)
+    others = [name for name in links if name != LOOPBACK] if either else []
+    more = [f"out if {name} ip {IPv4Interface(address).network} deny" for name in others]
+    more += [f"interface {name} type tunnel rxcost {LINK_COST} hello-interval {hello_s:g}" for name in others]
+    if either is not None:
+        own = IPv4Interface(either).ip
+        more += [f"redistribute local ip {own}/32 allow", f"install ip {SHARED_NETWORK} pref-src {own}"]
+    settings = _settings(interface, address, hello_s, *more)
+    return (*_program(str(PID), _LONG_TERM_STATE), *settings, interface, *others)
 
 
 def guest_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
@@ -46,11 +65,12 @@ def _program(pid: str, long_term_state: str) -> tuple[str, ...]:
 
 
 def _settings(interface: str, address: str, hello_s: float, *more: str) -> tuple[str, ...]:
+    # The first filter that matches decides, so the general one comes last.
     settings = (
         f"interface {interface} type wireless hello-interval {hello_s:g}",
         f"redistribute local ip {IPv4Interface(address).network} allow",
-        "redistribute local deny",
         *more,
+        "redistribute local deny",
     )
     return tuple(word for setting in settings for word in ("-C", setting))
 
@@ -163,13 +183,48 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
         RobotError: `ip` rejected a setting.
     """
     disable_ipv6()
+    fd = _open_device(interface, address, mesh=mesh)
+    configure(interface, address)
+    return fd
+
+
+def _open_device(interface: str, address: str, *, mesh: bool) -> int:
     fd = open_tun(interface, ethernet=mesh)
     if mesh:
         _prepare_mesh(interface)
         mac = mac_of(IPv4Interface(address).ip).hex(":")
         run_ip(f"link set {interface} address {mac}")
-    configure(interface, address)
     return fd
+
+
+def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
+    """Bring up the interface of a further link, without routes for multicast.
+
+    Args:
+        interface: Name of the interface.
+        address: Its address with the prefix length.
+        mesh: As for `bring_up`.
+
+    Returns:
+        The device's descriptor, for the medium of the link.
+
+    Raises:
+        FieldkitError: The interface cannot be created.
+        RobotError: `ip` rejected a setting.
+    """
+    fd = _open_device(interface, address, mesh=mesh)
+    run_ip(f"link set {interface} mtu {MTU_BYTES} up", f"address add {address} broadcast + dev {interface}")
+    return fd
+
+
+def add_loopback_address(address: str) -> None:
+    """Give the robot an address that it has on no link; errors as `run_ip`."""
+    run_ip(f"address add {address} dev {LOOPBACK}")
+
+
+def switch_on_link(interface: str) -> None:
+    """Bring the interface of a further link up again; errors as `switch_on`."""
+    run_ip(f"link set {interface} up")
 
 
 def configure(interface: str, address: str) -> None:

@@ -168,7 +168,7 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
         argv = wireless.command(spec.interface, wifi)
         yield _program(wireless.PROGRAMS[wifi.part], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
-        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s)
+        argv = network.command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
         yield _program("babeld", argv, {}, network.PID.exists)
 
 

@@ -1,7 +1,7 @@
 """Specification of an emulated robot: plain data that the lab sends to the robot's init process as JSON."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal, Self
 
 from fieldkit.core.model import ROS_MASTER_PORT
@@ -135,6 +135,7 @@ class RobotSpec:
         ros2: Its ROS 2 over the radio; None if it has none.
         routes_zenoh: True if it runs the Zenoh router.
         wifi: Its Wi-Fi of Linux; None for a robot whose radio is a TUN or TAP device.
+        links: Interface and address with the prefix length of each further link, by its name.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """
 
@@ -174,6 +175,7 @@ class RobotSpec:
     ros2: Ros2Spec | None = None
     routes_zenoh: bool = False
     bridge: tuple[str, ...] = ()
+    links: dict[str, tuple[str, str]] = field(default_factory=dict)
     wifi: WifiSpec | None = None
 
     @property
@@ -220,7 +222,8 @@ class RobotSpec:
         targets = tuple(_laser_target(target) for target in data["laser_targets"])
         neighbours = tuple(Neighbour(*body) for body in data["neighbours"])
         parts = {"laser_targets": targets, "sensors": sensors, "definitions": definitions, "base": base, "ros2": ros2}
-        return cls(**{**data, **words, **parts, "neighbours": neighbours, "wifi": wifi})
+        links = {name: (interface, address) for name, (interface, address) in data["links"].items()}
+        return cls(**{**data, **words, **parts, "neighbours": neighbours, "wifi": wifi, "links": links})
 
 
 def unsupported_paths(paths: Iterable[str]) -> list[str]:

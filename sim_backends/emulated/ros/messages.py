@@ -21,8 +21,8 @@ from typing import Final
 from sim_backends.emulated.ros.laser import ranges_m
 from sim_backends.emulated.ros.own_motion import AT_REST, OwnMotion
 from sim_backends.emulated.ros.sensor_specs import LASER_SCAN, LaserTarget, Sensor, Template, check, packed_string
+from sim_backends.world.motion import GRAVITY_M_S2
 
-GRAVITY_M_S2: Final = 9.80665  # standard gravity, ISO 80000-3
 LASER_RANGE_M: Final = (0.12, 3.5)  # LDS-01, ROBOTIS e-Manual
 LASER_NOISE_M: Final = 0.015  # LDS-01 from 0.12 to 0.499 m, ROBOTIS e-Manual
 # Variances of x, y, z (m^2) and of rotations about them (rad^2), for pose and, per second, twist, from the controller

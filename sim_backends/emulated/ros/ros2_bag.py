@@ -66,6 +66,7 @@ class Rosbag2Recorder:
         self._sensors, self._types = types.ros1, types.ros2
         self._defaults: dict[str, object] = {}
         self._connections: dict[str, Connection] = {}
+        self._reported: set[str] = set()  # topics whose messages are not of their type
 
     def run(self) -> int:
         """Record; return the number of the signal that stopped it.
@@ -105,7 +106,11 @@ class Rosbag2Recorder:
                 data = migrate_bytes(
                     self._sensors, self._types, kind, kind, self._defaults, message, src_is2=False, dst_is2=True
                 )
-            except Exception:  # noqa: BLE001 (on any error the publisher's bytes are not a message of this type)
+            except Exception as error:  # noqa: BLE001 (on any error the publisher's bytes are not a message of this type)
+                if topic not in self._reported:
+                    self._reported.add(topic)
+                    reason = f"{type(error).__name__}: {error}"
+                    _log("rosbag2_recorder", f"Messages of topic '{topic}' are not of type '{kind}': {reason}")
                 return
             writer.write(self._connections[topic], time.time_ns(), data)
 

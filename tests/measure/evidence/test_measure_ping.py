@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 
 from fieldkit.core.columns import Measured
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import ping
+from fieldkit.measure.evidence import ping, ping_gaps
 from fieldkit.measure.evidence.delay_quantiles import quantile_of_sent
-from fieldkit.measure.evidence.ping import AnswerGap, Ping, Problem, Reply
+from fieldkit.measure.evidence.ping import Ping, Problem, Reply
+from fieldkit.measure.evidence.ping_gaps import AnswerGap
 from tests.helpers.paths import DATA
 
 OUTPUTS = DATA / "ping" / "20221126"
@@ -184,13 +185,13 @@ INTERVAL_S = 0.1
 
 
 def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
-    gap = ping.longest_gap(answered((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10), INTERVAL_S)
+    gap = ping_gaps.longest_gap(answered((1, 100), (2, 201), (6, 640), (7, 700), (9, 900), sent=10), INTERVAL_S)
     assert gap == AnswerGap(0.439, 3, is_open=False)
-    assert ping.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(answered((1, 100), (2, 200), (3, 350), sent=3), INTERVAL_S) == AnswerGap(
         0.15, 0, is_open=False
     )
     # A late answer creates no additional gap: the answer to 2 arrived after that to 3.
-    assert ping.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3), INTERVAL_S) == AnswerGap(
+    assert ping_gaps.longest_gap(answered((1, 100), (3, 300), (2, 310), sent=3), INTERVAL_S) == AnswerGap(
         0.21, 0, is_open=False
     )
 
@@ -209,9 +210,9 @@ def test_the_longest_gap_has_the_number_of_lost_requests() -> None:
     ],
 )
 def test_a_gap_at_the_start_or_end_is_a_lower_bound(ping_: Ping, lasted_s: float, lost: int, is_open: bool) -> None:
-    result = ping.longest_gap(ping_, INTERVAL_S)
+    result = ping_gaps.longest_gap(ping_, INTERVAL_S)
     assert result == AnswerGap(pytest.approx(lasted_s), lost, is_open)  # type: ignore[arg-type]
-    values = ping.measure_gap(ping_, INTERVAL_S).values
+    values = ping_gaps.measure_gap(ping_, INTERVAL_S).values
     suffix = ("_at_least_s", "_lost_at_least") if is_open else ("_s", "_lost")
     assert values == {
         f"rtt_gap{name}": pytest.approx(value) for name, value in zip(suffix, (lasted_s, lost), strict=True)
@@ -220,20 +221,20 @@ def test_a_gap_at_the_start_or_end_is_a_lower_bound(ping_: Ping, lasted_s: float
 
 def test_the_numbers_of_a_long_ping_wrap() -> None:
     answers = [(seq & 0xFFFF, 100 * seq) for seq in range(1, 70_001) if not 66_000 < seq <= 66_010]
-    assert ping.longest_gap(answered(*answers, sent=70_000), INTERVAL_S) == AnswerGap(1.1, 10, is_open=False)
+    assert ping_gaps.longest_gap(answered(*answers, sent=70_000), INTERVAL_S) == AnswerGap(1.1, 10, is_open=False)
 
 
 def test_without_time_stamps_there_is_no_gap() -> None:
-    assert ping.longest_gap(answered((1, 100), sent=1), INTERVAL_S) is None
-    assert ping.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt"), INTERVAL_S) is None
-    columns = {column.name for column in (*ping.GAP_COLUMNS, *ping.OPEN_GAP_COLUMNS)}
-    assert ping.measure_gap(None, INTERVAL_S).missing.keys() == columns
+    assert ping_gaps.longest_gap(answered((1, 100), sent=1), INTERVAL_S) is None
+    assert ping_gaps.longest_gap(ping.read(DATA / "busybox/1.35.0/ping-duplicates.txt"), INTERVAL_S) is None
+    columns = {column.name for column in (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)}
+    assert ping_gaps.measure_gap(None, INTERVAL_S).missing.keys() == columns
 
 
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_every_ping_has_either_a_gap_or_its_lower_bound(replies: list[bool]) -> None:
     result = answered(*((seq, 100 * seq) for seq, arrived in enumerate(replies, 1) if arrived), sent=len(replies))
-    measured = ping.measure_gap(result, INTERVAL_S)
+    measured = ping_gaps.measure_gap(result, INTERVAL_S)
     longest_run = max((len(list(run)) for arrived, run in groupby(replies) if not arrived), default=0)
     if len(replies) == 1 and replies[0]:
         assert not measured.values

@@ -16,9 +16,9 @@ from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Leg, Role, TrackPoint
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.measure.evidence import reading, track
+from fieldkit.measure.evidence import track
 from fieldkit.measure.positions import recorded_positions
-from fieldkit.motion.logs import drive_checks, drive_log
+from fieldkit.motion.logs import drive_checks, drive_log, motion_log
 from fieldkit.motion.logs.drive_checks import DrivePlan
 from tests.motion.logs.test_drive_log import drive
 
@@ -50,7 +50,7 @@ def write_log(folder: Path, lines_: list[dict[str, Any]], *, numbered: bool = Tr
 
 def reasons(path: Path) -> list[str]:
     log = drive_log.read(path)
-    return [*filter(None, (reading.numbered_lines_problem(path),)), *drive_checks.contradictions(log, PLAN)]
+    return [*filter(None, (motion_log.numbered_lines_problem(path),)), *drive_checks.contradictions(log, PLAN)]
 
 
 @pytest.mark.parametrize("numbered", [True, False])
@@ -143,7 +143,7 @@ def test_any_flipped_bit_is_detected(place: int, bit: int, tmp_path_factory: pyt
     content[place % len(content)] ^= 1 << bit
     path.write_bytes(content)
     try:
-        assert reading.numbered_lines_problem(path) is not None
+        assert motion_log.numbered_lines_problem(path) is not None
     except EvidenceError:
         return
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from fieldkit.agent.numbered_lines import NumberedLines
 from fieldkit.core.errors import EvidenceError
-from fieldkit.measure.evidence import reading
-from fieldkit.motion.logs import fly_checks, fly_log
+from fieldkit.motion.logs import fly_checks, fly_log, motion_log
 from fieldkit.motion.logs.fly_checks import POSITION_ERROR_M, FlyPlan
 
 START_NS = 1_795_000_000_000_000_000
@@ -58,7 +57,7 @@ def write_log(folder: Path, lines_: list[dict[str, Any]], *, ended: bool = True)
 
 def reasons(path: Path) -> list[str]:
     log = fly_log.read(path)
-    return [*filter(None, (reading.numbered_lines_problem(path),)), *fly_checks.contradictions(log, PLAN)]
+    return [*filter(None, (motion_log.numbered_lines_problem(path),)), *fly_checks.contradictions(log, PLAN)]
 
 
 def test_an_unchanged_log_has_no_contradiction(tmp_path: Path) -> None:

@@ -337,3 +337,20 @@ def test_robot_returns_after_error_inside(stopped: list[str]) -> None:
         driven(field, fail)
     assert field.returns == [True]
     assert stopped == ["out.drive"]
+
+
+def test_an_error_inside_is_reported_even_if_the_robot_does_not_return(
+    stopped: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def bring_back(*_: object, **__: object) -> str:
+        raise LinkError("it does not answer")
+
+    def fail() -> None:
+        raise RobotError("ping exited with 2")
+
+    monkeypatch.setattr(driving, "_bring_back", bring_back)
+    field = DrivingTestbed(RecordingShell(status=['{"ended": "", "ready": true}']))
+    with pytest.raises(LinkError) as caught:
+        driven(field, fail)
+    assert caught.value.what.startswith("it does not answer; before, the steps failed: RobotError: ")
+    assert "ping exited with 2" in caught.value.what

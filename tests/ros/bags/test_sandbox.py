@@ -49,7 +49,7 @@ def unpacking_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
 _UNPACKS = """
 import os, tempfile
 from pathlib import Path
-from fieldkit.measure.evidence import sandbox
+from fieldkit.measure.evidence import sandbox_process
 
 def answer(question):
     if "says" in question:
@@ -62,7 +62,7 @@ def answer(question):
         os.kill(os.getpid(), signals[0])
     return {"said": "whole"}
 
-sandbox.serve(answer)
+sandbox_process.serve(answer)
 """
 
 

@@ -30,8 +30,9 @@ from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, l
 from sim_backends.emulated.provisioning import KeyPair, robot_spec
 from sim_backends.emulated.robot import services
 from sim_backends.emulated.ros import offered_qos
-from sim_backends.emulated.ros.messages import GRAVITY_M_S2, ODOMETRY_VARIANCES
+from sim_backends.emulated.ros.messages import ODOMETRY_VARIANCES
 from sim_backends.emulated.testbed import EmulatedTestbed
+from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 from tests.helpers.paths import ROOT

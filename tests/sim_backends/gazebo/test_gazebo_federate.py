@@ -29,7 +29,7 @@ from sim_backends.gazebo.federate import adapter
 from sim_backends.gazebo.sdf import model_sdf
 from sim_backends.physics import robot_limits
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.physics.quadrotor import QuadrotorLimits
+from sim_backends.physics.robot_limits import QuadrotorLimits
 from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import GazeboServer, gazebo_server, missing_libraries

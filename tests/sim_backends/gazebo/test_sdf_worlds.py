@@ -14,7 +14,7 @@ from sim_backends.cosim.scenario.sdf_world import scenario_sdf
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.named import command_line
 from sim_backends.gazebo.sdf import SdfRobot, world_sdf
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
+from sim_backends.physics.robot_limits import TURTLEBOT3_BURGER
 from sim_backends.world.obstacles import Ramp
 from sim_backends.world.shapes import Box
 from sim_backends.world.world import World, load_world

@@ -11,9 +11,9 @@ from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
 from sim_backends.mujoco_physics.chassis import HUSKY
 from sim_backends.mujoco_physics.physics import MujocoPhysics
-from sim_backends.physics.body import GRAVITY_M_S2, Twist, Velocity
-from sim_backends.physics.differential_drive import HUSKY_A200
-from sim_backends.world.motion import State
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.physics.robot_limits import HUSKY_A200
+from sim_backends.world.motion import GRAVITY_M_S2, State
 
 WALL: Mapping[str, object] = {
     "name": "wall",

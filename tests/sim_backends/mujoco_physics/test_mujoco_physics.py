@@ -21,7 +21,7 @@ from sim_backends.mujoco_physics.chassis import BURGER, HUSKY, chassis
 from sim_backends.mujoco_physics.named import MUJOCO
 from sim_backends.mujoco_physics.physics import SERVICE, MujocoPhysics
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.physics.differential_drive import TURTLEBOT3_BURGER
+from sim_backends.physics.robot_limits import TURTLEBOT3_BURGER
 from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 from tests.helpers.federate_pairs import HELLO, Pair

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist
-from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive, DriveLimits
-from sim_backends.physics.quadrotor import IRIS, Quadrotor
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.quadrotor import Quadrotor
+from sim_backends.physics.robot_limits import HUSKY_A200, IRIS, DriveLimits
 from tests.helpers.worlds import world
 
 MS = 1_000_000

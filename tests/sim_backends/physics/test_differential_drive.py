@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.physics.differential_drive import HUSKY_A200, TURTLEBOT3_BURGER, DifferentialDrive, DriveLimits
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.robot_limits import HUSKY_A200, TURTLEBOT3_BURGER, DriveLimits
 from sim_backends.world.motion import State
 
 S = 1_000_000_000

@@ -5,9 +5,10 @@ import math
 import pytest
 
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.body import GRAVITY_M_S2, Twist
-from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive, DriveLimits
-from sim_backends.world.motion import State
+from sim_backends.physics.body import Twist
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.robot_limits import HUSKY_A200, DriveLimits
+from sim_backends.world.motion import GRAVITY_M_S2, State
 from tests.helpers.worlds import world
 
 MS = 1_000_000

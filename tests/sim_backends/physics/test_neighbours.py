@@ -9,10 +9,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sim_backends.physics.body import Body
-from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
+from sim_backends.physics.differential_drive import DifferentialDrive
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.neighbours import CellGrid, Neighbours
-from sim_backends.physics.quadrotor import IRIS, Quadrotor
+from sim_backends.physics.quadrotor import Quadrotor
+from sim_backends.physics.robot_limits import HUSKY_A200, IRIS
 from tests.helpers.nightly import examples
 from tests.helpers.worlds import world
 

@@ -12,15 +12,10 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.body import GRAVITY_M_S2, Twist, Velocity
-from sim_backends.physics.quadrotor import (
-    DUCKIEDRONE,
-    IRIS,
-    FlightPose,
-    Quadrotor,
-    QuadrotorLimits,
-    VelocityController,
-)
+from sim_backends.physics.body import Twist, Velocity
+from sim_backends.physics.quadrotor import FlightPose, Quadrotor, VelocityController
+from sim_backends.physics.robot_limits import DUCKIEDRONE, IRIS, QuadrotorLimits
+from sim_backends.world.motion import GRAVITY_M_S2
 from tests.helpers.worlds import world
 
 S = 1_000_000_000

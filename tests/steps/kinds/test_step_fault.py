@@ -1,19 +1,23 @@
 """The step fault: valid keys, roles, and golden command lines."""
 
 from dataclasses import replace
+from typing import cast
 
 import pytest
 
-from fieldkit.backends.protocols import Robot
+from fieldkit.backends.protocols import Robot, Testbed
 from fieldkit.cli.dry_run import in_shell
 from fieldkit.config import schema
 from fieldkit.core import model
-from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.model import FIXED_ROLES, FaultKind, Protocol, Role
+from fieldkit.core.errors import ConfigurationError, LinkError
+from fieldkit.core.model import FIXED_ROLES, Fault, FaultKind, Protocol, Role
+from fieldkit.remote import jobs
 from fieldkit.ros.steps.record import RecordStep
+from fieldkit.steps.base import Step, StepEntry
+from fieldkit.steps.kinds import fault as kinds_fault
 from fieldkit.steps.kinds.fault import FaultStep
 from fieldkit.steps.kinds.ping import PingStep
-from fieldkit.steps.scene import Scene
+from fieldkit.steps.scene import Announce, Scene
 from fieldkit.steps.variants import PingTool, expected
 from fieldkit.trial.procedure import Procedure, load_procedure
 from tests.helpers.casts import CAST, TURTLEBOT
@@ -150,6 +154,33 @@ def test_written_procedure_with_faults_is_read_unchanged() -> None:
     procedure = load_procedure("selfheal")
     text = schema.dump(procedure)
     assert schema.validate(schema.parse(text, source="x"), Procedure) == procedure
+
+
+class MistakenStep(Step):
+    """A step that raises an exception which no code expects, after the fault has failed."""
+
+    def roles(self) -> frozenset[Role]:
+        return frozenset({Role.SENDER})
+
+    def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
+        assert scene.halt.wait(60.0)
+        raise KeyError("hops")
+
+
+def test_a_mistake_of_a_step_inside_is_not_hidden_by_the_error_of_the_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Unreachable:
+        shells = dict.fromkeys(FIXED_ROLES)
+
+        def inject(self, fault: Fault) -> float:
+            raise LinkError("it cannot be rebooted")
+
+    monkeypatch.setattr(jobs, "start", lambda *_: None)
+    monkeypatch.setattr(kinds_fault, "end_inside", lambda *_: None)
+    entry = StepEntry("mistaken", MistakenStep())
+    step = fault("robot: sender, kind: reboot, after: 0s").model_copy(update={"during": (entry,)})
+    with pytest.raises(KeyError, match="hops") as caught:
+        step.run(SCENE, cast("Testbed", Unreachable()), lambda *_: None)
+    assert isinstance(caught.value.__cause__, LinkError)
 
 
 def test_observer_uses_address_of_the_cast() -> None:

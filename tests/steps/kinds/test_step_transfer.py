@@ -32,8 +32,14 @@ class Medium:
 
     port: int
 
-    def delays(self, source: Role, destination: Role, protocol: Protocol, port: int) -> DelayParts:
-        assert (source, destination, protocol, port) == (Role.SENDER, Role.RECEIVER, Protocol.TCP, self.port)
+    def delays(self, source: Role, destination: Role, protocol: Protocol, port: int, *, link: str = "") -> DelayParts:
+        assert (source, destination, protocol, port, link) == (
+            Role.SENDER,
+            Role.RECEIVER,
+            Protocol.TCP,
+            self.port,
+            "",
+        )
         return next(self.parts)
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:

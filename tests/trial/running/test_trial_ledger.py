@@ -22,11 +22,12 @@ from fieldkit.trial import gates, journal, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.procedure import Procedure
-from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.request import TrialRequest, make_plan
 from fieldkit.trial.running import ledger
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.stop import Stop
+from fieldkit.trial.stored import plans, verification
+from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers.casts import CAST
 from tests.trial.test_trial_crash import PING, PROCEDURE
 
@@ -62,7 +63,7 @@ def trial(tmp_path: Path) -> Path:
 
 
 def reopened(folder: Path) -> Ledger:
-    return Ledger(store.read_plan(folder), folder, Stop())
+    return Ledger(plans.read_plan(folder), folder, Stop())
 
 
 def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -91,12 +92,12 @@ def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypat
         to.summarize()
         assert to.done == now
         assert rendered[now] == now
-        assert manifest.verify(folder) == []
+        assert verification.verify(folder) == []
     assert written[120] < 3 * written[60]
 
 
 def test_a_small_trial_writes_every_row_immediately(trial: Path) -> None:
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
     keep(reopened(trial), plan, trial, list(plan.order())[2])
     after = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
@@ -122,13 +123,13 @@ def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
 
 
 def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = store.read_plan(trial)
+    plan = plans.read_plan(trial)
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
     keep(reopened(trial), plan, trial, list(plan.order())[2])
     assert (trial / store.TRIAL_CSV).read_bytes() == table, "the process is killed here"
     reopened(trial).summarize()
-    assert manifest.verify(trial) == []
+    assert verification.verify(trial) == []
     assert rebuild(trial).changed == ()
     assert (trial / store.TRIAL_CSV).read_bytes().startswith(table)
 
@@ -142,10 +143,10 @@ def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.
     monkeypatch.setattr(rows, "head", lambda table: f"more,{head(table)}")
     monkeypatch.setattr(rows, "line", lambda row, table: f",{line(row, table)}")
     monkeypatch.setattr(rows, "write_summary", lambda folder, plan, table: ())
-    before = manifest.verify(trial)
+    before = verification.verify(trial)
     (trial / "preflight.txt").write_text("changed once more\n", encoding="utf-8")
     assert rebuild(trial).changed == (store.TRIAL_CSV,)
-    assert manifest.verify(trial) == [*before, "preflight.txt: changed"]
+    assert verification.verify(trial) == [*before, "preflight.txt: changed"]
 
 
 def rot(path: Path) -> None:
@@ -174,7 +175,7 @@ def test_checksums_are_kept_and_differences_reported(
     to = reopened(trial)
     assert to.differences == changes
     to.summarize()
-    assert set(output_text) <= set(manifest.verify(trial))
+    assert set(output_text) <= set(verification.verify(trial))
     with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
         rebuild(trial)
     assert all(text in caught.value.what for text in output_text)
@@ -195,7 +196,7 @@ def test_changes_of_plan_journal_and_table_are_reported(trial: Path) -> None:
     to = reopened(trial)
     assert to.differences.items() >= {("trial.yaml", "changed"), ("journal.jsonl", "changed")}
     to.summarize()
-    assert "trial.yaml: changed" in manifest.verify(trial)
+    assert "trial.yaml: changed" in verification.verify(trial)
 
 
 @pytest.mark.parametrize("name", [journal.JOURNAL_FILE, "trial.yaml"])

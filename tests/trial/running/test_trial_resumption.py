@@ -7,13 +7,13 @@ import pytest
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, shell_command
 from fieldkit.core.model import Role
-from fieldkit.trial import store
 from fieldkit.trial.procedure import Procedure, load_procedure
 from fieldkit.trial.running import resumption
+from fieldkit.trial.stored import plans
 from tests.helpers.stored_trials import TRIALS
 
 TRIAL: Path = min(TRIALS.iterdir())
-PLAN = store.read_plan(TRIAL)
+PLAN = plans.read_plan(TRIAL)
 
 
 def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -> None:

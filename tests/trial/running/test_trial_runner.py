@@ -13,16 +13,17 @@ from fieldkit.core.errors import ConfigurationError, LockLostError, RobotError
 from fieldkit.core.events import Event, ExpectationJudged, Note, RepeatEnded, TrialEnded
 from fieldkit.core.model import Protocol, RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
-from fieldkit.trial import gates, journal, manifest, store
+from fieldkit.trial import gates, journal, store
 from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.rebuild import rebuild
 from fieldkit.trial.running.resumption import resumable, resume_trial
 from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import run_trial
 from fieldkit.trial.running.stop import Stop
 from fieldkit.trial.running.unfetched import unfetched_file
+from fieldkit.trial.stored import verification
+from fieldkit.trial.stored.rebuild import rebuild
 from tests.helpers.idle_testbed import IdleTestbed
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.plans import write_states
@@ -201,7 +202,7 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
     assert note in events
-    assert manifest.verify(folder) == []
+    assert verification.verify(folder) == []
 
 
 def test_too_little_memory_makes_an_attempt_void_and_does_not_end_the_trial(
@@ -273,7 +274,7 @@ def test_evidence_of_an_attempt_stopped_during_its_steps_stays_on_the_robots(
         assert sum("was not fetched stays" in note and remote in note for note in notes) == 2
         events.clear()
         resume_trial(folder, IdleTestbed(), events.append)
-    assert manifest.verify(folder) == []
+    assert verification.verify(folder) == []
 
 
 def failing(monkeypatch: pytest.MonkeyPatch, moment: int, error: OSError) -> list[str]:
@@ -311,7 +312,7 @@ def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatc
         if any(out.glob("*/trial.yaml")):
             folder = only(out)
             resume_trial(folder, IdleTestbed(), lambda _: None)
-            assert manifest.verify(folder) == []
+            assert verification.verify(folder) == []
             assert rebuild(folder).changed == ()
             assert sum(attempt.status is Status.VALID for attempt in journal.ended(journal.read(folder))) == 1
         shutil.rmtree(out, ignore_errors=True)
@@ -335,7 +336,7 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     assert caught.value.remedy == "fieldkit resume FOLDER, with the present path of the folder"
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
-    assert manifest.verify(tmp_path / "moved") == []
+    assert verification.verify(tmp_path / "moved") == []
     assert [attempt.status for attempt in journal.ended(journal.read(tmp_path / "moved"))] == [
         "void",
         "valid",
@@ -358,7 +359,7 @@ def test_changed_evidence_is_reported_on_resume(tmp_path: Path, events: list[Eve
     (folder / "repeats/tcp-02/ping.txt").write_text(PING.replace("time=2", "time=9"), encoding="utf-8")
     resume_trial(folder, IdleTestbed(), events.append)
     assert Note("the evidence has changed since it was stored: repeats/tcp-02/ping.txt: changed") in events
-    assert manifest.verify(folder) == ["repeats/tcp-02/ping.txt: changed"]
+    assert verification.verify(folder) == ["repeats/tcp-02/ping.txt: changed"]
 
 
 def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(

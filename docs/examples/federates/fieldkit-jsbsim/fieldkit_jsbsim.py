@@ -10,8 +10,8 @@ from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.named import PythonFederate
 from sim_backends.federates.records import VELOCITY
 from sim_backends.federates.simulator_options import SimulatorOptions
-from sim_backends.physics.body import GRAVITY_M_S2, Velocity
-from sim_backends.world.motion import State
+from sim_backends.physics.body import Velocity
+from sim_backends.world.motion import GRAVITY_M_S2, State
 
 FOOT_M, EAST_M, NORTH_M = 0.3048, 6_378_137.0, 6_335_439.0  # with radii of WGS 84 at the equator, along both axes
 HOVER_S = 3.0  # before time 0, until the motors have their speed

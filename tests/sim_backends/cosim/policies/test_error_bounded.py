@@ -19,7 +19,8 @@ from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Datagram, Received
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist
-from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.robot_limits import HUSKY_A200
 from sim_backends.world.motion import STILL, State
 from tests.helpers.worlds import world
 

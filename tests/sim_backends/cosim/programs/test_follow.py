@@ -18,8 +18,9 @@ from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Received
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist, Velocity
-from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
-from sim_backends.physics.quadrotor import IRIS, Quadrotor
+from sim_backends.physics.differential_drive import DifferentialDrive
+from sim_backends.physics.quadrotor import Quadrotor
+from sim_backends.physics.robot_limits import HUSKY_A200, IRIS
 from sim_backends.world.motion import State
 
 MS = 1_000_000

@@ -9,8 +9,9 @@ from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.federates import FederateError
 from sim_backends.cosim.programs.way_points import DriveThrough
 from sim_backends.physics.bodies import Bodies
-from sim_backends.physics.differential_drive import HUSKY_A200, DifferentialDrive
+from sim_backends.physics.differential_drive import DifferentialDrive
 from sim_backends.physics.paths import Paths
+from sim_backends.physics.robot_limits import HUSKY_A200
 from sim_backends.world.motion import WayPoints
 
 MS = 1_000_000

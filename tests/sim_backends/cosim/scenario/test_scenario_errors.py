@@ -10,7 +10,7 @@ from sim_backends.cosim.scenario import checks
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.physics import robot_limits
-from sim_backends.physics.differential_drive import HUSKY_A200
+from sim_backends.physics.robot_limits import HUSKY_A200
 
 SCENARIO = """\
 name: meadow

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.autopilot.flight import STEP_NS, Airframe, stop_m, velocity_to
-from sim_backends.physics.body import GRAVITY_M_S2
 from sim_backends.physics.collisions import Footprint
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.quadrotor import DUCKIEDRONE, IRIS, QuadrotorLimits
+from sim_backends.physics.robot_limits import DUCKIEDRONE, IRIS, QuadrotorLimits
+from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import World
 
 STEP_S = STEP_NS / 1e9

@@ -5,7 +5,7 @@ import pytest
 from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators, start_physics
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.mujoco_physics.physics import MujocoPhysics
-from sim_backends.physics.quadrotor import IRIS
+from sim_backends.physics.robot_limits import IRIS
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.motion import State
 from tests.helpers.cosim_benches import BODY

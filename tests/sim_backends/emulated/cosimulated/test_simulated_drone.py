@@ -22,9 +22,9 @@ from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.flight_records import FlightMotion, FlightRecord
 from sim_backends.emulated.ros.own_motion import MotionReporter
-from sim_backends.physics.body import GRAVITY_M_S2
 from sim_backends.physics.ground import Ground
-from sim_backends.physics.quadrotor import DUCKIEDRONE
+from sim_backends.physics.robot_limits import DUCKIEDRONE
+from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
 from tests.helpers.cosim_benches import PLACES, CosimBench, Driven, cosim_bench
 from tests.helpers.ground_station import LIMITS

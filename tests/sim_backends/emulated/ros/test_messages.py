@@ -20,9 +20,10 @@ from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import own_motion
-from sim_backends.emulated.ros.messages import GENERATORS, GRAVITY_M_S2, Source
+from sim_backends.emulated.ros.messages import GENERATORS, Source
 from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion
 from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, LaserTarget, Sensor
+from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST, ros_of
 

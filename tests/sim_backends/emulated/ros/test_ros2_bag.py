@@ -8,11 +8,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import pytest
 from rosbags.interfaces import Connection, ConnectionExtRosbag2, QosDurability, QosReliability
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from fieldkit.config.profiles import RobotProfile, load_profile
@@ -28,6 +28,8 @@ from fieldkit.trial.check import tools
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
+from sim_backends.emulated.ros.ros2_bag import Rosbag2Recorder
+from sim_backends.emulated.ros.tcpros import Header
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 
@@ -246,3 +248,13 @@ def test_debian_s_ros_is_not_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
                 backend.cast(Topology.MASTER)
         else:
             assert backend.cast(Topology.MASTER)
+
+
+def test_a_message_that_is_not_of_its_type_is_logged_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    header = cast("Header", {"topic": "/scan", "type": "sensor_msgs/LaserScan"})
+    recorder = Rosbag2Recorder(["/scan"], tmp_path / "bag", StoragePlugin.SQLITE3, "humble")
+    with Writer(tmp_path / "bag", version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        for _ in range(2):
+            recorder._write(writer, header, b"\x01")
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if "are not of type" in line)
+    assert "Messages of topic '/scan' are not of type 'sensor_msgs/msg/LaserScan': " in line

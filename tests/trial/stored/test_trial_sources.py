@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.analysis.repeats import Repeats
 from fieldkit.core.errors import ConfigurationError, EvidenceError
-from fieldkit.trial import sources
+from fieldkit.trial.stored import sources
 from tests.helpers.tables import ROW, repeats, replace, write
 
 

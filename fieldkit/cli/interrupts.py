@@ -1,4 +1,4 @@
-"""The person at the terminal: questions to this person, and Ctrl-C."""
+"""Ctrl-C and other signals that stop a trial."""
 
 import os
 import signal
@@ -10,10 +10,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Final
 
-from fieldkit.core import prompts
-from fieldkit.core.errors import ConfigurationError
-from fieldkit.core.events import Answered, Asked, Entered, Request, Sink
-from fieldkit.core.prompts import Answer, Question
 from fieldkit.core.units import format_duration
 from fieldkit.trial.running.stop import Stop
 
@@ -22,75 +18,6 @@ _FINISHING: Final = "finishing the repeat that runs{left}; Ctrl-C again stops it
 _STOPPING: Final = "stopping: terminating the programs on the robots"
 _WAIT_CANCELLED: Final = "no longer waiting for confirmations; the order to stop was sent"
 _CLEAR_LINE: Final = "\r\x1b[K"
-
-
-class Terminal:
-    """An operator who answers at this terminal.
-
-    Args:
-        sink: Receives each request, which it shows, and the answer.
-    """
-
-    def __init__(self, sink: Sink) -> None:
-        self._sink = sink
-
-    def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        """Ask the operator to do something, as `Operator.ask`."""
-        _require_terminal(
-            f"a person must {request}",
-            "place the robots first, then add --yes; or give the answers by --answers FILE",
-        )
-        self._sink(Request(request, may_skip))
-        while (answer := prompts.parse(_read_line(), may_skip=may_skip)) is None:
-            print(prompts.answer_hint(may_skip=may_skip), file=sys.stderr)
-        self._sink(Answered(answer.skip, answer.note))
-        return answer
-
-    def enter(self, question: Question) -> str:
-        """Ask the operator for a value, as `Operator.enter`."""
-        _require_terminal(
-            f"a person must answer: {question.text}",
-            "give the answers by --answers FILE; with --yes no question is asked",
-        )
-        self._sink(Asked(question.text, question.answer_hint))
-        while (answer := question.read(_read_line())) is None:
-            print(question.answer_hint, file=sys.stderr)
-        self._sink(Entered(answer))
-        return answer
-
-
-def _require_terminal(what: str, remedy: str) -> None:
-    if not sys.stdin.isatty():
-        raise ConfigurationError(f"{what}, but standard input is not a terminal", remedy=remedy)
-
-
-def confirmed(question: str, *, remedy: str) -> bool:
-    """Return True if the person at the terminal answers yes.
-
-    Args:
-        question: In the imperative, without a question mark: `pin it`.
-        remedy: The remedy if there is no terminal.
-
-    Raises:
-        ConfigurationError: Standard input is not a terminal.
-    """
-    if not sys.stdin.isatty():
-        raise ConfigurationError(f"a person must confirm: {question}", remedy=remedy)
-    print(f"{question}? yes or no", file=sys.stderr)
-    while (answer := _read_line().strip().lower()) not in {"yes", "no"}:
-        print("yes or no", file=sys.stderr)
-    return answer == "yes"
-
-
-def _read_line() -> str:
-    """Return a line from the terminal. The prompt goes to standard error, apart from the output."""
-    print("> ", end="", file=sys.stderr, flush=True)
-    try:
-        return input()
-    except EOFError as error:
-        raise ConfigurationError(
-            "the terminal was closed during a question", remedy="run the command again"
-        ) from error
 
 
 @contextmanager

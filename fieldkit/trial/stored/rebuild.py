@@ -11,6 +11,7 @@ from fieldkit.trial import journal, manifest, rows, store
 from fieldkit.trial.columns import Row
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
+from fieldkit.trial.stored import plans, verification
 
 
 @dataclass(frozen=True)
@@ -38,10 +39,11 @@ def rebuild(folder: Path) -> Rebuilt:
         EvidenceError: The journal cannot be read, or the evidence differs from its checksums; nothing is written
             then.
     """
-    plan = store.read_plan(folder)
-    if differences := manifest.differences(folder):
+    plan = plans.read_plan(folder)
+    if differences := verification.differences(folder):
         raise EvidenceError(
-            f"the evidence is not what was measured; the tables are not changed: {manifest.summarize(differences)}",
+            "the evidence is not what was measured; the tables are not changed: "
+            f"{verification.summarize(differences)}",
             where=str(folder),
             remedy="restore it from a copy; or show the results of the evidence as it is now: "
             + shell_command("fieldkit", "aggregate", folder, "--rebuild"),

@@ -18,7 +18,8 @@ from fieldkit.measure.positions.position_sources import PositionSource, Position
 from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.rebuild import Rebuilt, rebuild
+from fieldkit.trial.stored import plans, verification
+from fieldkit.trial.stored.rebuild import Rebuilt, rebuild
 
 MAX_BYTES: Final = 64 << 20
 """Maximum size of a position file: one day at 10 Hz as GPX."""
@@ -58,7 +59,7 @@ def set_positions(
             missing.
         EvidenceError: A file cannot be read, or the trial's evidence has changed.
     """
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     for role, source in sources.items():
         _require_role(plan, role)
         if isinstance(source, Path):
@@ -66,10 +67,10 @@ def set_positions(
             position_files.read_file(source)
     # Position files that were added before are replaced, so their changes do not matter.
     changes = {
-        name: change for name, change in manifest.differences(folder).items() if not manifest.is_positions(name)
+        name: change for name, change in verification.differences(folder).items() if not manifest.is_positions(name)
     }
     if changes:
-        problem = f"the evidence is not what was measured: {manifest.summarize(changes)}"
+        problem = f"the evidence is not what was measured: {verification.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.locked(folder):
         sources_by_role = {
@@ -168,7 +169,7 @@ def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
         ConfigurationError: `folder` is not a trial.
         EvidenceError: The journal is damaged.
     """
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     for attempt in journal.ended(journal.history(folder, plan)):
         if attempt.status is Status.VALID:
             evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.archive_trials import write_archive
-from fieldkit.trial import indexed_tables
+from fieldkit.trial.stored import indexed_tables
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated

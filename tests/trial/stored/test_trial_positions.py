@@ -11,7 +11,8 @@ from fieldkit.core.model import Role
 from fieldkit.measure.evidence import ping
 from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import LOCAL, WGS84
-from fieldkit.trial import journal, manifest, positions
+from fieldkit.trial import journal
+from fieldkit.trial.stored import positions, verification
 from tests.helpers.runs import rows
 from tests.helpers.stored_trials import TRIALS
 
@@ -60,7 +61,7 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
     assert output.startswith("changed: trial.csv")
     means = [float(metres) for metres in means_m(trial)]
     assert all(65 <= metres <= 5 + max(elapsed_ns) / 1e9 for metres in means)
-    assert manifest.verify(trial) == []
+    assert verification.verify(trial) == []
     assert {path.name for path in trial.glob("positions*")} == {"positions.json", "positions-receiver.csv"}
     assert output_text(capsys)[1].count("sender 0, 0, 0 in metres, receiver positions-receiver.csv") == 2 * len(means)
 

@@ -17,7 +17,7 @@ from fieldkit.core.executors import Workers
 from fieldkit.core.tasks import completed
 from fieldkit.trial import frozen
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.tables import expected, frozen_columns, other_names
+from fieldkit.trial.stored.tables import expected, frozen_columns, other_names
 
 MIN_TABLES: Final = 100
 """Smallest number of tables for which an index is made; fewer tables are read faster without an index."""

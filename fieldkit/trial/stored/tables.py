@@ -14,6 +14,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import frozen, store
 from fieldkit.trial.columns import installed, trial_columns
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import plans
 
 Facts = Callable[[Path], TableFacts | None]
 """Returns the properties of a table that are known without reading it; None if they are unknown."""
@@ -51,11 +52,11 @@ def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column,
 
 def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
     """Return every column in the plans of tables; errors as for `declared_in`, or if a plan cannot be read."""
-    plans = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
+    plan_files = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     everywhere = set(trial_columns())
     declared = (
-        (plan, [column for column in store.read_plan(plan.parent).table if column not in everywhere])
-        for plan in plans
+        (plan, [column for column in plans.read_plan(plan.parent).table if column not in everywhere])
+        for plan in plan_files
     )
     return trial_columns(merge_columns(declared).values())
 
@@ -108,7 +109,7 @@ def frozen_columns(table: Path) -> tuple[Column, ...]:
 
         return datasets.declared_columns(table)
     plan = table.parent / PLAN_FILE
-    return frozen.read(plan) if plan.exists() and not files.unexpected_type(plan) else ()
+    return plans.read_columns(plan) if plan.exists() and not files.unexpected_type(plan) else ()
 
 
 def expected(table: Path) -> tuple[str, ...]:
@@ -119,7 +120,7 @@ def expected(table: Path) -> tuple[str, ...]:
     """
     plan = table.parent / PLAN_FILE
     has_plan = table.name == store.TRIAL_CSV and plan.is_file() and not files.unexpected_type(plan)
-    return frozen.expected(plan) if has_plan else ()
+    return plans.read_expectations(plan) if has_plan else ()
 
 
 def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:

@@ -19,9 +19,10 @@ from fieldkit.core.columns import Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, did_you_mean, shell_command
 from fieldkit.core.executors import Workers
 from fieldkit.core.units import format_count
-from fieldkit.trial import indexed_tables, rows, store, tables
-from fieldkit.trial.indexed_tables import NO_INDEX, IndexedTables
+from fieldkit.trial import rows, store
 from fieldkit.trial.plan import PLAN_FILE
+from fieldkit.trial.stored import indexed_tables, plans, tables
+from fieldkit.trial.stored.indexed_tables import NO_INDEX, IndexedTables
 
 ALL_PROCESSORS: Final = Workers()
 
@@ -358,7 +359,7 @@ def _remeasure(table: Path) -> tuple[bytes, list[str]]:
 
 def _remeasured_table(table: Path, note: Note) -> bytes:
     """Return a trial's table, measured again from its raw evidence."""
-    from fieldkit.trial import rebuild  # noqa: PLC0415 (loads all measuring code, which existing tables do not need)
+    from fieldkit.trial.stored import rebuild  # noqa: PLC0415 (loads all measuring code, which existing tables do not need)
 
     folder = table.parent
     if table.name != store.TRIAL_CSV or not (folder / PLAN_FILE).is_file():
@@ -367,14 +368,14 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
             where=str(table),
             remedy="name the folder of the trial, or leave out --rebuild",
         )
-    plan = store.read_plan(folder)
+    plan = plans.read_plan(folder)
     note_differences(folder, note)
     return rows.to_csv(rebuild.measured(folder, plan), plan.table).encode()
 
 
 def note_differences(folder: Path, note: Note) -> None:
     """Show a note if evidence that is measured again differs from what was measured first."""
-    from fieldkit.trial import manifest  # noqa: PLC0415 (as above)
+    from fieldkit.trial.stored import verification  # noqa: PLC0415 (as above)
 
-    if differences := manifest.differences(folder):
-        note(f"{folder}: measured from changed evidence: {manifest.summarize(differences)}")
+    if differences := verification.differences(folder):
+        note(f"{folder}: measured from changed evidence: {verification.summarize(differences)}")

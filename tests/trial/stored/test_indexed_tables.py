@@ -17,7 +17,7 @@ from fieldkit.analysis import table_index
 from fieldkit.core.errors import FieldkitError
 from fieldkit.core.executors import Workers
 from fieldkit.export import table
-from fieldkit.trial import indexed_tables, sources
+from fieldkit.trial.stored import indexed_tables, sources
 from tests.helpers.paths import ROOT
 
 STORED: Final = ROOT / "tests" / "data" / "fieldkit"
@@ -89,7 +89,7 @@ def test_rows_come_from_the_index_and_equal_those_of_the_tables(
 
     monkeypatch.setattr("fieldkit.analysis.table_files._split", unread)
     monkeypatch.setattr("fieldkit.analysis.table_files.names", unread)
-    monkeypatch.setattr("fieldkit.trial.frozen.read", unread)
+    monkeypatch.setattr("fieldkit.trial.stored.plans.read_columns", unread)
     assert outcome(tmp_path / "trials", use_index=True) == expected
     selection = 'topology == "master" and distance_m < 20'
     some = outcome(tmp_path / "trials", use_index=True, selection=selection)

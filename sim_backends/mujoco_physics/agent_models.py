@@ -1,0 +1,49 @@
+"""The limits of an agent, and its model at its start."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from fieldkit.core.errors import ConfigurationError
+from sim_backends.federates.handshake import AgentStart
+from sim_backends.mujoco_physics.chassis import chassis
+from sim_backends.mujoco_physics.mjcf import Model, quaternion
+from sim_backends.physics.ground import Ground
+from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, QuadrotorLimits, quadrotor
+from sim_backends.world.world import World
+
+
+def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimits | QuadrotorLimits:
+    """Return the limits of an agent: the limits in the configuration, otherwise the limits of its profile.
+
+    Raises:
+        ConfigurationError: The configuration has other limits than its kind of robot.
+    """
+    if body is not None:
+        values: dict[str, Any] = {
+            name: tuple(value) if isinstance(value, list) else value for name, value in body.items()
+        }
+        try:
+            return QuadrotorLimits(**values) if agent.flies else DriveLimits(**values)
+        except TypeError as error:
+            raise ConfigurationError(
+                f"the body of {agent.name} is invalid: {error}", remedy="use the configuration of a scenario"
+            ) from error
+    if agent.flies:
+        return quadrotor(agent.profile)
+    built_in_limits = BODIES.get(agent.profile)
+    return built_in_limits if isinstance(built_in_limits, DriveLimits) else TURTLEBOT3_BURGER
+
+
+def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:
+    """Return an agent at its start; a robot on wheels is upright on the ground below it."""
+    e, n, u = agent.start.position_m
+    place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
+    if isinstance(limits, QuadrotorLimits):
+        return Model(place_m, quaternion(heading_rad), agent.antenna_m, 0.0, limits)
+    cos, sin = math.cos(heading_rad), math.sin(heading_rad)
+    east, north = Ground(world, math.inf).surface(e, n).grade
+    forward, left = east * cos + north * sin, north * cos - east * sin
+    roll_rad = math.asin(left / math.hypot(1.0, forward, left))
+    upright = quaternion(heading_rad, -math.atan(forward), roll_rad)
+    return Model(place_m, upright, agent.antenna_m, limits.friction, chassis(agent.profile, limits))

@@ -1,0 +1,57 @@
+"""Computed properties of the links of a channel, each with the time or the positions for which it is valid."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_backends.radio.propagation import Echoes, Fades
+from sim_backends.world.shapes import Floats
+
+
+class LinkRow:
+    """The links of one station to all others, by index, valid until a station moves.
+
+    Args:
+        revision: Revision of the positions for which it was computed.
+        mean_mw: Received power of the station at each other station, without fading, in mW.
+
+    Attributes:
+        linked: True for each station that receives it and is received by it, without fading; None before the first
+            use.
+        slot: Number of the time slot (of the validity of a gain) for which `powers_mw` was computed; -1 for none.
+        powers_mw: Received power of the station at each other station in that slot; without fading if `slot` is -1.
+    """
+
+    __slots__ = ("linked", "mean_mw", "powers_mw", "revision", "slot")
+
+    def __init__(self, revision: int, mean_mw: Floats) -> None:
+        self.revision = revision
+        self.mean_mw = mean_mw
+        self.linked: list[bool] | None = None
+        self.slot = -1
+        self.powers_mw: list[float] = mean_mw.tolist()
+
+
+class GainCache:
+    """The gains of some links, valid until a station moves or the time slot ends.
+
+    Args:
+        links: Indices of the links.
+        ends: Indices of their first ends, and of their second ends.
+        echoes: Their echoes.
+
+    Attributes:
+        revision: Revision of the positions for which `fades` was computed.
+        fades: Gains over time since then.
+        slot: Time slot for which `gains` was computed.
+        gains: Gains in that slot, in the order of `links`.
+    """
+
+    __slots__ = ("echoes", "ends", "fades", "gains", "links", "revision", "slot")
+
+    def __init__(self, links: NDArray[np.int64], ends: NDArray[np.int64], echoes: Echoes) -> None:
+        self.links = links
+        self.ends = ends
+        self.echoes = echoes
+        self.revision = self.slot = -1
+        self.fades: Fades | None = None
+        self.gains = np.empty(0)

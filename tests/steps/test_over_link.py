@@ -1,0 +1,122 @@
+"""Steps over one of several links: their commands, their errors, and the check of the route."""
+
+import pytest
+
+from fieldkit.backends.protocols import RobotLink
+from fieldkit.config import schema
+from fieldkit.config.profiles import RobotProfile
+from fieldkit.core.errors import ConfigurationError
+from fieldkit.core.model import Protocol, Role, Verdict
+from fieldkit.steps.base import Step
+from fieldkit.steps.capabilities import HasNeeds, SendsTraffic
+from fieldkit.steps.kinds.capture import CaptureStep
+from fieldkit.steps.kinds.fault import FaultStep
+from fieldkit.steps.kinds.iperf3 import Iperf3Step
+from fieldkit.steps.kinds.ping import PingStep
+from fieldkit.steps.kinds.send import SendStep
+from fieldkit.steps.over_link import judge_route
+from fieldkit.steps.scene import CommandResult, Scene
+from tests.helpers.casts import CAST, TURTLEBOT
+
+LINKS = {"wifi": "wlan0", "cell": "wwan0", "either": "lo"}
+PROFILE = TURTLEBOT.model_copy(update={"links": LINKS})
+
+
+def ends(number: int) -> dict[str, RobotLink]:
+    return {
+        "cell": RobotLink(interface="wwan0", address=f"100.64.0.{number}"),
+        "either": RobotLink(interface="lo", address=f"10.99.0.{number}"),
+    }
+
+
+LINKED = {
+    role: CAST[role].model_copy(update={"profile": PROFILE, "links": ends(number)})
+    for number, role in enumerate((Role.SENDER, Role.RECEIVER), start=1)
+}
+SCENE = Scene(Protocol.TCP, LINKED, "f")
+
+
+def parsed(kind: type[Step], text: str) -> Step:
+    return schema.validate(schema.parse(f"{{{text}}}", source="x.yaml"), kind)
+
+
+def commands(step: Step) -> list[str]:
+    return [" ".join(planned.job.argv) for planned in step.jobs(SCENE)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "keys", "address"),
+    [
+        (PingStep, "from: sender, to: receiver", "10.42.0.2"),
+        (PingStep, "from: sender, to: receiver, over: wifi", "10.42.0.2"),
+        (PingStep, "from: sender, to: receiver, over: cell", "100.64.0.2"),
+        (PingStep, "from: sender, to: receiver, over: either", "10.99.0.2"),
+        (SendStep, "from: sender, to: receiver, size: 5kB, over: cell", "100.64.0.2"),
+        (Iperf3Step, "from: sender, to: receiver, over: cell", "100.64.0.2"),
+    ],
+)
+def test_a_step_sends_to_the_address_on_its_link(kind: type[Step], keys: str, address: str) -> None:
+    assert any(f" {address}" in command for command in commands(parsed(kind, keys)))
+
+
+def test_a_capture_and_a_fault_use_the_interface_of_their_link() -> None:
+    step = parsed(CaptureStep, "over: cell, during: [{ping: {from: sender, to: receiver, over: cell}}]")
+    captures = commands(step)[:2]
+    assert all(" -i wwan0 " in command for command in captures)
+    assert all("host 100.64.0.1 and host 100.64.0.2" in command for command in captures)
+    fault = parsed(FaultStep, "robot: receiver, kind: link-down, link: cell, for: 5s")
+    assert isinstance(fault, FaultStep)
+    assert fault.cause.link == "cell"
+    assert commands(fault)[0].endswith("-I wwan0 -i 0.1 100.64.0.2")
+
+
+@pytest.mark.parametrize(
+    ("outer", "inner"), [("over: cell,", ""), ("", ", over: cell"), ("over: wifi,", ", over: cell")]
+)
+def test_a_capture_on_another_link_than_its_steps_is_refused(outer: str, inner: str) -> None:
+    step = parsed(CaptureStep, f"{outer} during: [{{ping: {{from: sender, to: receiver{inner}}}}}]")
+    assert isinstance(step, CaptureStep)
+    assert "see `over`" in (step.placement_error((), ()) or "")
+
+
+def test_a_link_that_a_robot_does_not_have_is_refused_with_the_nearest_name() -> None:
+    with pytest.raises(ConfigurationError, match=r"turtlebot-2 \(receiver\) has no link 'cel'") as error:
+        commands(parsed(PingStep, "from: sender, to: receiver, over: cel"))
+    assert "cell" in error.value.remedy
+    with pytest.raises(ConfigurationError, match="a reboot does not allow link"):
+        parsed(FaultStep, "robot: receiver, kind: reboot, link: cell")
+
+
+def test_flows_and_route_checks_name_the_link() -> None:
+    step = parsed(PingStep, "from: sender, to: receiver, over: cell")
+    assert isinstance(step, SendsTraffic)
+    assert isinstance(step, HasNeeds)
+    assert [flow.link for flow in step.flows(SCENE)] == ["cell"]
+    (need,) = step.needs(SCENE)
+    assert need.argv == ("ip", "-o", "route", "get", "100.64.0.2")
+    for other in ("", ", over: wifi", ", over: either"):
+        radio = parsed(PingStep, f"from: sender, to: receiver{other}")
+        assert isinstance(radio, HasNeeds)
+        assert len(list(radio.needs(SCENE))) == (1 if "wifi" in other else 0)
+
+
+@pytest.mark.parametrize(
+    ("output", "code", "verdict"),
+    [
+        ("100.64.0.2 dev wwan0 src 100.64.0.1 uid 0 \\    cache", 0, Verdict.OK),
+        ("100.64.0.2 via 10.0.0.1 dev eth0 src 10.0.0.5 uid 1000 \\    cache", 0, Verdict.FAIL),
+        ("RTNETLINK answers: Network is unreachable", 2, Verdict.FAIL),
+        ("", 127, Verdict.FAIL),
+    ],
+)
+def test_the_route_must_leave_by_the_interface_of_the_link(output: str, code: int, verdict: Verdict) -> None:
+    here, there = (LINKED[role].links["cell"] for role in (Role.SENDER, Role.RECEIVER))
+    actual, _, remedy = judge_route(here, there, CommandResult(output, code))
+    assert actual is verdict
+    assert ("ip route replace 100.64.0.2 dev wwan0" in remedy) == (verdict is Verdict.FAIL)
+
+
+def test_two_links_with_one_interface_are_refused() -> None:
+    data = TURTLEBOT.model_dump(mode="json", by_alias=True) | {"links": {"a": "wlan0", "b": "wlan0"}}
+    with pytest.raises(schema.ValidationError, match="two links have the same interface"):
+        RobotProfile.model_validate(data)
