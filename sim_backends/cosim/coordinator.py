@@ -213,14 +213,14 @@ class Coordinator:
                 self._wall_time.start()
 
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
-        window = f"the window that begins at {seconds_text(begin_ns)}"
         try:
             end_ns = self.policy.next_window(self.situation)
         except PolicyError:
             raise
         except Exception as error:
             raise FederateError(
-                f"policy {self.policy.name} failed to return the end of {window}: {describe_exception(error)}",
+                f"policy {self.policy.name} failed to return the end of {_window_text(begin_ns)}: "
+                f"{describe_exception(error)}",
                 remedy=error.remedy if isinstance(error, FieldkitError) else "",
             ) from error
         if end_ns is None:
@@ -229,7 +229,7 @@ class Coordinator:
             end_ns = index(end_ns)
         except TypeError as error:  # the policy may come from another package
             raise FederateError(
-                f"policy {self.policy.name} returned {end_ns!r} as the end of {window}",
+                f"policy {self.policy.name} returned {end_ns!r} as the end of {_window_text(begin_ns)}",
                 remedy="return a whole number of nanoseconds, or None",
             ) from error
         if end_ns > to_ns:
@@ -385,3 +385,7 @@ class Coordinator:
         self.is_committing = False
         if self.is_interrupted:
             raise KeyboardInterrupt
+
+
+def _window_text(begin_ns: int) -> str:
+    return f"the window that begins at {seconds_text(begin_ns)}"

@@ -243,7 +243,9 @@ class Mobility:
     def _update_medium(self) -> float | None:
         """Send the medium all positions; return the seconds until the next update, or None without motion."""
         with self._lock:
-            placement, now_ns = self._require_placement(), time.monotonic_ns()
+            placement = self._require_placement()
+            # The time of the track is that of the positions: the medium's answer may take long on a busy machine.
+            now_ns, utc_ns = time.monotonic_ns(), time.time_ns()
             positions_m = places.positions_m(self._cast, placement, self._world)
             states = {name: State(place_m) for name, place_m in positions_m.items()}
             for start_ns, motion in self._motions:
@@ -263,12 +265,11 @@ class Mobility:
                 relay=relay if relay in states else None,
                 velocities_m_s={name: state.velocity_m_s for name, state in states.items()},
             )
-            self._extend_track(states)
+            self._extend_track(utc_ns, states)
             return self._next_update_s(now_ns, states)
 
-    def _extend_track(self, states: Mapping[str, State]) -> None:
-        """Append to the track the robots whose position or velocity has changed."""
-        utc_ns = time.time_ns()
+    def _extend_track(self, utc_ns: int, states: Mapping[str, State]) -> None:
+        """Append to the track the robots whose position or velocity has changed; `utc_ns` is the time of `states`."""
         last = {point.role: point for point in self._track}
         for role, robot in self._cast.items():
             state = states.get(robot.name)

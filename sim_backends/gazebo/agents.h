@@ -23,9 +23,9 @@ struct Agent
     Pose pose;
     Vector velocity;
     int64_t appears_ns = 0, disappears_ns = -1; // -1 for never
-    bool is_present = true; // it has a model, which may not have published a pose yet
+    bool is_present = false; // it has a model, which may not have published a pose yet
     bool is_new = false;    // its model has not published a pose yet
-    bool had_model = true;  // it had a model before the run
+    bool had_model = false; // it had a model before the run
 
     bool HasLifetime() const
     {

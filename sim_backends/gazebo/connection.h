@@ -26,7 +26,7 @@ class Connection
         }
     }
 
-    // Wait until the world is free, and connect to it.
+    // Wait until the world is free, and connect to it; `FindModels` must follow.
     void Open()
     {
         WaitForOtherRuns();
@@ -47,6 +47,12 @@ class Connection
             [&] {
                 return "no poses have been received on " + poses + "; the world needs the SceneBroadcaster plugin";
             });
+    }
+
+    // Find the models of the agents, and wait for the receivers of their commands.
+    void FindModels()
+    {
+        WorldMonitor::Lock lock(m_monitor.mutex);
         SetPresence();
         for (Agent& agent : m_agents)
         {
@@ -54,6 +60,14 @@ class Connection
         }
         CheckModels();
         WaitForSubscribers(lock);
+    }
+
+    // The unique id of the process that offers the world.
+    std::string ProcessId() const
+    {
+        std::vector<transport::ServicePublisher> publishers;
+        m_node.ServiceInfo(m_options.ControlService(), publishers);
+        return publishers.empty() ? "" : publishers.front().PUuid();
     }
 
     // Set which of the agents with a lifetime have a model now; the others must have one.

@@ -4,8 +4,10 @@
 #define FIELDKIT_GAZEBO_LOCK_STEP_H
 
 #include "connection.h"
+#include "model_journal.h"
 
 #include <deque>
+#include <optional>
 
 namespace fieldkit
 {
@@ -38,7 +40,12 @@ class LockStep
     {
         m_connection.Open();
         Pause();
+        ModelJournal journal(m_connection.ProcessId(), m_options.world);
+        RestoreAfterKilledRun(journal);
         MeasureStep();
+        m_connection.FindModels();
+        WriteJournal(journal);
+        m_journal = journal;
         int64_t settle_steps = StepsOf(m_options.settle_s);
         SendCommands();
         ComeToRest(settle_steps);
@@ -132,8 +139,12 @@ class LockStep
             }
             else if (agent.had_model && !agent.is_present)
             {
-                RequestModel(agent);
+                RequestModel(InitialModelOf(agent));
             }
+        }
+        if (m_journal)
+        {
+            m_journal->Delete();
         }
     }
 
@@ -194,28 +205,84 @@ class LockStep
         m_windowAt = at;
     }
 
-    // The service answers before it creates the model, which happens at the latest before the next step. A request that
-    // arrives twice creates it once, because its name must be new.
-    void RequestModel(const Agent& agent)
+    // Restore the models if the last run in this world was killed. Gazebo ignores a request to remove a model that
+    // does not exist, or to create one that exists.
+    void RestoreAfterKilledRun(const ModelJournal& journal)
     {
-        msgs::EntityFactory request;
+        Restoration restoration = journal.Read();
+        for (const std::string& name : restoration.created)
+        {
+            RequestRemoval(name);
+            std::fprintf(stderr, "the model %s of a killed run is removed\n", name.c_str());
+        }
+        for (const InitialModel& model : restoration.initial)
+        {
+            RequestModel(model);
+            std::fprintf(stderr, "the model %s is created if a killed run has removed it\n", model.name.c_str());
+        }
+    }
+
+    void WriteJournal(const ModelJournal& journal)
+    {
+        Restoration restoration;
+        for (const Agent& agent : m_agents)
+        {
+            if (agent.HasLifetime() && !agent.had_model)
+            {
+                restoration.created.push_back(agent.model);
+            }
+            else if (agent.HasLifetime())
+            {
+                restoration.initial.push_back(InitialModelOf(agent));
+            }
+        }
+        if (restoration.created.empty() && restoration.initial.empty())
+        {
+            journal.Delete();
+            return;
+        }
+        journal.Write(restoration);
+    }
+
+    InitialModel InitialModelOf(const Agent& agent) const
+    {
+        InitialModel model;
+        model.name = agent.model;
         auto file = m_options.model_files.find(agent.name);
         if (file != m_options.model_files.end())
         {
-            request.set_sdf_filename(file->second);
+            model.file = file->second;
         }
         else
         {
-            request.set_sdf(m_options.sdf.at(agent.name));
+            model.sdf = m_options.sdf.at(agent.name);
         }
-        request.set_name(agent.model);
-        *request.mutable_pose() = StartOf(agent);
+        model.position = agent.start;
+        model.yaw = agent.start_yaw;
+        return model;
+    }
+
+    // The service answers before it creates the model, which happens at the latest before the next step. A request that
+    // arrives twice creates it once, because its name must be new.
+    void RequestModel(const InitialModel& model)
+    {
+        msgs::EntityFactory request;
+        if (!model.file.empty())
+        {
+            request.set_sdf_filename(model.file);
+        }
+        else
+        {
+            request.set_sdf(model.sdf);
+        }
+        request.set_name(model.name);
+        *request.mutable_pose() = PoseOf(model.name, model.position, model.yaw);
         m_connection.Call(m_options.Name(m_options.create_service), request);
     }
 
     void Create(Agent& agent)
     {
-        RequestModel(agent);
+        RequestModel(InitialModelOf(agent));
         agent.is_present = agent.is_new = true;
         size_t number = static_cast<size_t>(&agent - m_agents.data());
         agent.pose = agent.Start();
@@ -233,12 +300,17 @@ class LockStep
     // As with Create, the model is removed at the latest before the next step.
     void Remove(Agent& agent)
     {
-        msgs::Entity request;
-        request.set_name(agent.model);
-        request.set_type(msgs::Entity::MODEL);
-        m_connection.Call(m_options.Name(m_options.remove_service), request);
+        RequestRemoval(agent.model);
         agent.is_present = agent.is_new = false;
         agent.Stop();
+    }
+
+    void RequestRemoval(const std::string& name)
+    {
+        msgs::Entity request;
+        request.set_name(name);
+        request.set_type(msgs::Entity::MODEL);
+        m_connection.Call(m_options.Name(m_options.remove_service), request);
     }
 
     int64_t StepsOf(double seconds) const
@@ -410,21 +482,21 @@ class LockStep
         {
             if (agent.is_present)
             {
-                m_connection.Call(m_options.Name(m_options.pose_service), StartOf(agent));
+                m_connection.Call(m_options.Name(m_options.pose_service), PoseOf(agent.model, agent.start, agent.start_yaw));
             }
         }
     }
 
-    static msgs::Pose StartOf(const Agent& agent)
+    static msgs::Pose PoseOf(const std::string& name, const Vector& position, double yaw)
     {
-        Pose start = agent.Start();
+        Pose rotation = Pose::WithYaw(yaw);
         msgs::Pose pose;
-        pose.set_name(agent.model);
-        pose.mutable_position()->set_x(start.position.x);
-        pose.mutable_position()->set_y(start.position.y);
-        pose.mutable_position()->set_z(start.position.z);
-        pose.mutable_orientation()->set_w(start.w);
-        pose.mutable_orientation()->set_z(start.z);
+        pose.set_name(name);
+        pose.mutable_position()->set_x(position.x);
+        pose.mutable_position()->set_y(position.y);
+        pose.mutable_position()->set_z(position.z);
+        pose.mutable_orientation()->set_w(rotation.w);
+        pose.mutable_orientation()->set_z(rotation.z);
         return pose;
     }
 
@@ -458,6 +530,7 @@ class LockStep
     std::vector<Agent> m_agents;
     WorldMonitor m_monitor;
     Connection m_connection;
+    std::optional<ModelJournal> m_journal; // of this run
     int64_t m_stepNs = 0;
     int64_t m_nowNs = -1; // Gazebo's time
     int64_t m_startNs = 0;

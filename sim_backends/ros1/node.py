@@ -72,8 +72,8 @@ class RosPublisher:
         """
         if header.get("md5sum") not in {"*", self._kind.md5}:
             raise ValueError(f"the type of {header.get('topic')} is {self._kind.name}, not {header.get('type')}")
-        stream.sendall(pack(pack_header(self._header)))
-        with self._lock:
+        with self._lock:  # a subscriber that has the header must get every message that is published from now on
+            stream.sendall(pack(pack_header(self._header)))
             self._streams.append(stream)
         # Subscribers send nothing more, so only the end of the stream can be read.
         ended = select.poll()
@@ -89,7 +89,9 @@ class RosPublisher:
         """
         packet = pack(message)
         sent, was_late = 0, False
-        for stream in tuple(self._streams):
+        with self._lock:
+            streams = tuple(self._streams)
+        for stream in streams:
             try:
                 stream.settimeout(None if deadline_s is None else max(deadline_s - time.monotonic(), 0.001))
                 stream.sendall(packet)

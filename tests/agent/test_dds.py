@@ -126,6 +126,16 @@ def test_settings_are_escaped() -> None:
                 "Policy.Lifespan",
             ],
         ),
+        (
+            Quality(history="keep_all", durability="transient_local", late_reader_depth=2),
+            [
+                "Policy.Reliability.Reliable",
+                "Policy.History.KeepAll",
+                "Policy.Durability.TransientLocal",
+                "Policy.DurabilityService",
+                "Policy.History.KeepLast(depth=2)",
+            ],
+        ),
         (Quality("system_default", "system_default", 0, "system_default"), []),
     ],
 )

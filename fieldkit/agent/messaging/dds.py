@@ -124,9 +124,9 @@ def _durability(requested: Quality, *, writes: bool) -> list[Any]:
     """Return the durability policies. The history for late readers is a separate policy, whose default depth is 1."""
     if requested.durability != "transient_local":
         return [Policy.Durability.Volatile] if requested.durability == "volatile" else []
-    history = (
-        Policy.History.KeepAll if requested.history == "keep_all" else Policy.History.KeepLast(requested.depth or 1)
-    )
+    keeps_all = requested.history == "keep_all" and not requested.late_reader_depth
+    depth = requested.late_reader_depth or requested.depth or 1
+    history = Policy.History.KeepAll if keeps_all else Policy.History.KeepLast(depth)
     service = [Policy.DurabilityService(0, history, *[_UNLIMITED] * 3)] if writes else []
     return [Policy.Durability.TransientLocal, *service]
 

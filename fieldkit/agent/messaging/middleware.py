@@ -31,6 +31,8 @@ class Quality:
         durability: `volatile` or `transient_local`.
         deadline_ns: Maximum expected time between two samples; None for no deadline.
         lifespan_ns: Time after which a sample expires; None for no limit.
+        late_reader_depth: Number of samples that a DDS writer with `transient_local` keeps for readers that it
+            discovers later; 0 for as many as `history` and `depth` say.
     """
 
     reliability: str = "reliable"
@@ -39,6 +41,7 @@ class Quality:
     durability: str = "volatile"
     deadline_ns: int | None = None
     lifespan_ns: int | None = None
+    late_reader_depth: int = 0
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,10 @@
 """DDS with CycloneDDS: two reliable topics that keep all samples. There is no master.
 
+The two sides discover each other at different times. A writer may thus send the first sample before the reader has
+discovered it; a volatile reader never receives this sample. So the topics are transient local: a reader receives the
+last two samples of a writer that it discovers later. Two are needed if the federate refuses a run, as the end of the
+run follows the error. All other samples follow an answer, which proves that the reader has discovered the writer.
+
 The topics are `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, their type is `fieldkit::Frame` with one member,
 `data`, a sequence of octets. Without an address of an interface, only the loopback interface is used.
 """
@@ -22,7 +27,9 @@ from sim_backends.federates.transports.contract import ChannelListener, Federate
 _LOOPBACK: Final = "127.0.0.1"
 _MAX_DOMAIN: Final = 232
 _TYPE: Final = "fieldkit/Frame"
-_QUALITY: Final = Quality(reliability="reliable", history="keep_all")
+_QUALITY: Final = Quality(
+    reliability="reliable", history="keep_all", durability="transient_local", late_reader_depth=2
+)
 _CDR: Final = struct.Struct("<4sI")
 _CDR_LITTLE_ENDIAN: Final = b"\0\1\0\0"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")

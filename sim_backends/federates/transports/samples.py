@@ -1,10 +1,15 @@
 """Channels over a bus of samples, a pair of topics of DDS or ROS 1.
 
 The coordinator writes `requests` and reads `answers`; the federate does the reverse. A sample consists of the `run`,
-a u64 that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run. DDS:
-topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type `fieldkit::Frame { sequence<octet> data; }` in
-plain CDR, reliable, keep all, volatile. ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type
-`std_msgs/UInt8MultiArray` without dimensions.
+a u64 that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run.
+
+DDS: topics `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, final type
+`fieldkit::Frame { sequence<octet> data; }` in plain CDR, reliable, keep all, transient local; the durability service
+of a writer keeps the last two samples. A volatile writer does not match. A volatile reader does, but misses `hello`
+if it discovers the writer too late.
+
+ROS 1: topics `/fieldkit/NAME/requests` and `/fieldkit/NAME/answers`, type `std_msgs/UInt8MultiArray` without
+dimensions.
 """
 
 import secrets
@@ -30,6 +35,8 @@ _RUN: Final = struct.Struct("<Q")
 _KIND_OFFSET: Final = _RUN.size + 4
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
+_PEER_S: Final = 10.0
+"""Longest wait of the side that accepts, for the discovery of its peer. If it exits earlier, its answer is lost."""
 _MAX_WAITING: Final = 16
 _POLL_S: Final = 0.01
 
@@ -153,6 +160,7 @@ class SampleListener:
             if _is_hello(sample):
                 self._waiting.append(sample)
         first = self._waiting.popleft()
+        _wait_for_peer(self._bus, time.monotonic() + _PEER_S)
         channel = SampleChannel(self._bus, _RUN.unpack_from(first)[0], first=first)
         channel.other_hellos = self._waiting
         return channel
@@ -164,12 +172,19 @@ def connected_channel(bus: SampleBus, address: object, deadline_s: float) -> Sam
     Raises:
         DeadlineError: There was none in time.
     """
+    if not _wait_for_peer(bus, deadline_s):
+        bus.close()
+        raise DeadlineError(f"no federate has been discovered at {address}")
+    return SampleChannel(bus, secrets.randbits(64), owns_bus=True)
+
+
+def _wait_for_peer(bus: SampleBus, deadline_s: float) -> bool:
+    """Return True as soon as the bus has a peer, or False at the deadline."""
     while not bus.has_peer():
         if time.monotonic() >= deadline_s:
-            bus.close()
-            raise DeadlineError(f"no federate has been discovered at {address}")
+            return False
         time.sleep(_POLL_S)
-    return SampleChannel(bus, secrets.randbits(64), owns_bus=True)
+    return True
 
 
 def listening(make_bus: Callable[[], SampleBus]) -> AbstractContextManager[ChannelListener]:

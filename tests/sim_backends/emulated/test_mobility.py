@@ -250,6 +250,19 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
     assert track[0] == track[-1] == place
 
 
+def test_the_time_of_the_track_is_that_of_the_positions(
+    medium: RecordingMedium, flying: tuple[Mobility, SteeringRobot], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mobility, robot = flying
+    placed_ns: list[int] = []
+    monkeypatch.setattr(medium, "place", lambda *_, **__: placed_ns.append(time.time_ns()))
+    robot.record((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
+    mobility.set_out_of_range(Role.SENDER)
+    last = [point for point in mobility.track(0) if point.role is Role.RELAY][-1]
+    assert last.velocity_m_s == (0.0, 0.0, 5.0)
+    assert last.utc_ns <= placed_ns[-1], "the robot may have stopped before the medium answered"
+
+
 def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: RecordingMedium) -> None:
     robot = SteeringRobot()
     robots = cast("Mapping[Role, EmulatedRobot]", {Role.SENDER: robot})

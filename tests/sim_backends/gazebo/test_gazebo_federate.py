@@ -1,8 +1,10 @@
 """The physics federate `gazebo`, against a server like Gazebo Fortress with DART."""
 
 import math
+import os
 import re
 import shlex
+import signal
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -31,6 +33,7 @@ from sim_backends.physics.robot_limits import QuadrotorLimits
 from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 from tests.helpers.gazebo_server import GazeboServer, gazebo_server, missing_libraries
+from tests.helpers.host import descendants
 
 pytestmark = [pytest.mark.emulated, pytest.mark.skipif(bool(missing_libraries()), reason=missing_libraries())]
 
@@ -258,6 +261,34 @@ def test_robots_appear_and_disappear_at_their_times(reset: str, tmp_path: Path) 
             assert moved_m == pytest.approx(0.55, abs=0.1), "speed and acceleration are those of its model"
         with connected(running) as physics:
             assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
+
+
+def test_the_next_run_restores_the_models_of_a_killed_one(tmp_path: Path) -> None:
+    """The world has no model of the leader, which the killed run creates; it removes the drone."""
+    changes = {**LIFETIMES, "agents.leader.at_m": [20, 53]}
+    leader = re.search(r'<model name="leader">.*?</model>', SDF, re.DOTALL)
+    assert leader is not None
+    with gazebo_server(tmp_path, SDF.replace(leader[0], "")) as running:
+        with connected(running, changes=changes) as physics:
+            presence(physics)
+            os.kill(adapter_pid(), signal.SIGKILL)
+            with pytest.raises(FederateError, match="SIGKILL"):
+                physics.advance(1_000_000_000, {})
+        with connected(running, changes=changes) as physics:
+            assert presence(physics)["drone"] == list(range(0, 301, 10))
+        with pytest.raises(FederateError, match=r"it has no moving model leader \("), connected(running):
+            pass
+
+
+def adapter_pid() -> int:
+    """Return the process of the adapter, which is a child of this process."""
+    pids = [
+        pid
+        for pid in descendants(os.getpid())
+        if b"gazebo-adapter" in Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0]
+    ]
+    assert len(pids) == 1
+    return pids[0]
 
 
 def test_a_robot_that_has_been_removed_is_no_obstacle(tmp_path: Path) -> None:

@@ -2,16 +2,18 @@
 
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 
 import pytest
+from typing_extensions import Buffer
 
 from fieldkit.core.deadline import Deadline
 from sim_backends.federates.transports.ros1 import MESSAGE
 from sim_backends.ros1.framing import pack, pack_header
-from sim_backends.ros1.node import RosMessageType, RosNode
+from sim_backends.ros1.node import RosMessageType, RosNode, RosPublisher
 from sim_backends.ros1.node_calls import MasterError, call
 from tests.helpers.federate_transports import ros_master
 from tests.helpers.sshd import wait_until
@@ -72,6 +74,41 @@ def test_invalid_data_disconnect_only_their_sender(master: str) -> None:
                 stream.sendall(data)
                 assert stream.recv(1) == b""
         assert publisher.connections == 0
+
+
+class _StreamWithCallback(socket.socket):
+    """A socket that calls a function after its first data were sent."""
+
+    on_sent: Callable[[], object] | None = None
+
+    def sendall(self, data: Buffer, flags: int = 0, /) -> None:
+        super().sendall(data, flags)
+        callback, self.on_sent = self.on_sent, None
+        if callback is not None:
+            callback()
+
+
+def test_a_subscriber_that_has_the_header_gets_every_message() -> None:
+    """It counts as connected from then on, and may send a request whose answer is published immediately."""
+    near, far = socket.socketpair()
+    stream = _StreamWithCallback(fileno=near.detach())
+    publisher = RosPublisher("/data", MESSAGE, "/a")
+    counts: list[int] = []
+    publishing = threading.Thread(target=lambda: counts.append(publisher.publish(b"answer", after_s(30))))
+
+    def publish() -> None:
+        publishing.start()
+        publishing.join(0.1)
+
+    stream.on_sent = publish
+    accepting = threading.Thread(target=publisher.accept, args=(stream, {"md5sum": "*"}))
+    accepting.start()
+    until(lambda: publishing.ident is not None)
+    publishing.join(30)
+    far.close()
+    accepting.join(30)
+    stream.close()
+    assert counts == [1]
 
 
 def test_a_master_that_is_missing_or_another_program(master: str) -> None:

@@ -21,10 +21,6 @@ from tests.helpers.runs import cosim
 
 DEADLINE_S: Final = 1.5
 """Deadline of answers; that of the start is longer, because a busy machine may need it."""
-SCHEME_PARAMETERS: Final = [
-    pytest.param(scheme, marks=pytest.mark.emulated) if scheme == "dds" else scheme for scheme in SCHEMES
-]
-"""DDS gets a second try: a `hello` that is sent before the federate has discovered its writer is lost."""
 OPTIONS: Final = ("--duration", "300ms", "--policy", "sliding_window", "--window", "10ms", "--deadline", "60s")
 UNANSWERED: Final = f"has not answered for {DEADLINE_S:g} s: request to advance from 0.2"
 MESSAGES: Final = {
@@ -86,7 +82,7 @@ def test_a_fault_over_a_pipe(fault: str, role: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("role", ["physics", "network"])
 @pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("scheme", SCHEME_PARAMETERS)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_fault_over_a_transport(scheme: str, fault: str, role: str, federates: Federates, tmp_path: Path) -> None:
     served_at, address = new_addresses(scheme)
     pid = federates.start(role, fault, served_at)

@@ -2,6 +2,9 @@
 
 import re
 import socket
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -15,6 +18,8 @@ from sim_backends.federates.handshake import AgentStart
 from sim_backends.federates.protocols import UnansweredError
 from sim_backends.federates.remote import open_network, open_physics
 from sim_backends.federates.transports.contract import TOKEN_VARIABLE
+from sim_backends.federates.transports.dds import DdsBus
+from sim_backends.federates.transports.dds import parse as parse_dds
 from sim_backends.federates.transports.transport_table import FORMS, TRANSPORTS, parse_address
 from sim_backends.world.motion import State
 from tests.helpers.faulty_federates import Federates, forked_federates
@@ -26,6 +31,18 @@ MS: Final = 1_000_000
 MANY: Final = [
     AgentStart(f"r{number}", "husky", State((float(number), 0.0, 0.0), heading_rad=0.0)) for number in range(2000)
 ]
+
+WRITE_EARLY: Final = """
+import sys
+from sim_backends.federates.transports.dds import DdsBus, parse
+
+bus = DdsBus(parse(sys.argv[1]), reads="requests", writes="answers")
+for sample in (b"busy", b"error", b"end"):
+    bus.write(sample, None)
+print("written", flush=True)
+bus.write(bus.receive(None), None)
+sys.stdin.read()
+"""
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +108,33 @@ def test_a_federate_may_connect_by_udp(federates: Federates) -> None:
     federates.start("physics", "none", connected_to)
     with closing(open_physics(listened_at, HELLO, 30.0)) as physics:
         assert physics.advance(0, {})
+
+
+def test_a_hello_that_is_sent_before_discovery_arrives(federates: Federates, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sides discover each other at different times: the coordinator may send before the federate can receive."""
+    monkeypatch.setattr(DdsBus, "has_peer", lambda _: True)
+    served_at, address = new_addresses("dds")
+    federates.start("physics", "none", served_at, delay_s=0.5)
+    with closing(open_physics(address, HELLO, 30.0)) as physics:
+        assert physics.advance(0, {})["ann"] == HELLO.agents[0].start
+
+
+def test_the_last_answers_reach_a_coordinator_that_discovers_their_writer_late() -> None:
+    """The last two samples are kept, because an error is followed by the end of the run."""
+    address = new_addresses("dds")[1]
+    with subprocess.Popen(
+        (sys.executable, "-c", WRITE_EARLY, address), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as writer:
+        assert writer.stdout is not None
+        assert writer.stdout.readline() == "written\n"
+        bus = DdsBus(parse_dds(address), reads="answers", writes="requests")
+        try:
+            assert [bus.receive(time.monotonic() + 60) for _ in range(2)] == [b"error", b"end"]
+            bus.write(b"live", time.monotonic() + 60)
+            assert bus.receive(time.monotonic() + 60) == b"live"
+        finally:
+            bus.close()
+            writer.kill()
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
