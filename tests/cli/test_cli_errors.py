@@ -97,9 +97,9 @@ def test_messages_about_arguments_name_the_smallest_number_and_only_what_is_requ
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["trial", "los", "30ft", "--repeats", "-2"]) == 2
-    assert "'-2' is not a whole number from 1" in capsys.readouterr().err
+    assert "'-2' is not a whole number of at least 1" in capsys.readouterr().err
     assert main(["compare", "a"]) == 2
-    assert capsys.readouterr().err.startswith("error: compare takes two runs, A and B, and one is given\n")
+    assert capsys.readouterr().err.startswith("error: compare needs two runs, A and B, and one is given\n")
 
 
 def test_two_robots_with_one_address_are_an_error(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -55,6 +55,8 @@ def add(parser: Parser) -> None:
 
 
 _OUT: Final = Path("report.html")
+_OTHER_FORMATS: Final = frozenset({".csv", ".json", ".md", ".pdf", ".png", ".svg", ".tex"})
+"""Suffixes of files that programs would not open as a page."""
 _PAGE: Final = b"<!DOCTYPE html>"
 
 
@@ -101,6 +103,12 @@ def _require_writable(out: Path) -> None:
     if not out.parent.is_dir():
         raise ConfigurationError(
             "there is no such folder", where=str(out.parent), remedy=shell_command("mkdir", "-p", out.parent)
+        )
+    if out.suffix.lower() in _OTHER_FORMATS:
+        raise ConfigurationError(
+            "a report is a page of HTML",
+            where=str(out),
+            remedy=f"name a file: {shell_command('-o', out.with_suffix('.html'))}; for figures --figures FOLDER",
         )
     if out.is_dir():
         raise ConfigurationError(

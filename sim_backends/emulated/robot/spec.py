@@ -86,11 +86,11 @@ class WifiSpec:
     """The Wi-Fi of Linux on a robot.
 
     Attributes:
-        part: `ad hoc`, `access point` or `station`.
+        mode: `ad hoc`, `access point` or `station`.
         passphrase: Passphrase of the access point; empty if `ad hoc`.
     """
 
-    part: Literal["ad hoc", "access point", "station"]
+    mode: Literal["ad hoc", "access point", "station"]
     passphrase: str = ""
 
 
@@ -199,7 +199,7 @@ class RobotSpec:
     @property
     def waits_for_another(self) -> bool:
         """True if its startup waits for another robot: its ROS master, its Zenoh router or its access point."""
-        joins = self.wifi is not None and self.wifi.part == "station"
+        joins = self.wifi is not None and self.wifi.mode == "station"
         return self.shares_master or bool(self.ros2 and self.ros2.router) or joins
 
     @property
