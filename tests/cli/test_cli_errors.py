@@ -34,7 +34,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("trial los 30", "distance '30' has no unit"),
         ("trial los 30feet", "unknown unit 'feet'"),
         ("trial lso 30ft", "did you mean 'los'?"),
-        ("trial los 30ft --record 2", "duration '2' has no unit"),
+        ("trial los 30ft --record 2", "--record '2' has no unit"),
         ("trial los 30ft --record 0s", "records nothing"),
         ("trial los 30ft --backend emulatd", "no backend 'emulatd'"),
         ("trial los 30ft --backend field", "needs a site file"),
