@@ -22,7 +22,10 @@ from fieldkit.agent.messaging.middleware import MiddlewareError, Network, Topic
 from fieldkit.agent.messaging.records import Log, LogError
 from fieldkit.agent.messaging.stream import Stream
 
-_USAGE = "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, or agent.pyz route|fly|arming|survey|link JSON"
+_USAGE = (
+    "usage: agent.pyz publish|subscribe|mavlink|drive JSON LOG, "
+    "or agent.pyz route|fly|arming|survey|link|datagrams JSON"
+)
 
 Arguments = Mapping[str, Any]
 
@@ -137,6 +140,13 @@ def _link(arguments: Arguments, stop_event: threading.Event) -> int:
     return 0
 
 
+def _datagrams(arguments: Arguments, stop_event: threading.Event) -> int:
+    """Send test datagrams to other robots, or count those that arrive; return the exit code."""
+    from fieldkit.agent import datagrams  # noqa: PLC0415 (loaded only if needed)
+
+    return datagrams.run(arguments, stop_event)
+
+
 @contextmanager
 def _naming_connection(connection: str) -> Iterator[None]:
     """Add the name of the connection to errors of a connection to an autopilot."""
@@ -181,6 +191,7 @@ _WITHOUT_LOG: Mapping[str, Callable[..., int]] = {
     "arming": _check_arming,
     "survey": _survey,
     "link": _link,
+    "datagrams": _datagrams,
 }
 
 

@@ -25,6 +25,9 @@ SESSION_JOBS: Final = "fieldkit.session_jobs"
 CHECKS: Final = "fieldkit.checks"
 """Entry point group of checks of a robot: `NAME = "package.module:function"`; see
 `fieldkit.trial.running.preflight`."""
+FLEET_CHECKS: Final = "fieldkit.fleet_checks"
+"""Entry point group of checks of all robots together: `NAME = "package.module:function"`; `fieldkit check --NAME`
+runs one. See `fieldkit.trial.running.preflight`."""
 POSITIONS: Final = "fieldkit.positions"
 """Entry point group of readers of positions: `SUFFIX = "package.module:function"`, without the dot; see
 `fieldkit.measure.positions.position_files`."""

@@ -65,3 +65,9 @@ def _plan(procedure: Procedure, repeats: int, protocols: tuple[Protocol, ...], r
         seed=7,
     )
     return make_plan(request, backend="field", cast=CAST, now=datetime(2026, 11, 20, 12, 0, tzinfo=UTC))
+
+
+def ros2_robot(name: str, address: str = "10.42.0.1") -> Robot:
+    """A robot whose profile has ROS 2."""
+    profile = TURTLEBOT.model_copy(update={"ros": ros_of(TURTLEBOT).model_copy(update={"variant": "ros2"})})
+    return Robot(name=name, address=address, profile=profile)

@@ -1,16 +1,22 @@
 """`fieldkit check`: check the requirements of a trial on robots and laptop, with a remedy for each problem."""
 
 import argparse
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_findings, showing_events
 from fieldkit.cli.parser import Parser
+from fieldkit.core import plugins
 from fieldkit.core.errors import RobotError
 from fieldkit.core.events import PhaseStarted
 from fieldkit.core.model import Distance, Verdict
 from fieldkit.core.prompts import Unattended
+
+if TYPE_CHECKING:
+    from fieldkit.trial.running.preflight import FleetCheck
 
 
 def add(parser: Parser) -> None:
@@ -27,12 +33,26 @@ def add(parser: Parser) -> None:
     )
     shared.add_site(parser)
     shared.add_overrides(parser)
+    for point in plugins.entry_points(plugins.FLEET_CHECKS):
+        parser.add_argument(
+            f"--{point.name}",
+            dest="fleet_checks",
+            action="append_const",
+            const=point.name,
+            default=[],
+            help=f"also check the {point.name.upper()} network between the robots: settings, and test datagrams",
+        )
     shared.add_json(parser)
     parser.set_defaults(run=run)
 
 
 # No person places robots for a check. Robots that fieldkit places are next to each other.
 _CLOSE = Distance(metres=1.0, label="check")
+
+
+def _fleet_checks(names: Sequence[str]) -> "list[FleetCheck]":
+    points = plugins.entry_points(plugins.FLEET_CHECKS)
+    return [plugins.load(point) for point in points if point.name in names]
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -59,7 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
         with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Unattended()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))
-            findings = preflight.check(plan, lab.shells, Path("trials"), all_checks=True).findings
+            checked = preflight.check(
+                plan, lab.shells, Path("trials"), all_checks=True, fleet_checks=_fleet_checks(arguments.fleet_checks)
+            )
+            findings = checked.findings
         if arguments.json:
             for finding in findings:
                 sink(finding)

@@ -32,6 +32,10 @@ RobotCheck = Callable[[Plan, Role, Shell, Probed, Report], None]
 """A check that a package adds to `fieldkit check`, after all others. It adds its findings to the report, and raises
 `LinkError` if the robot did not answer, `RobotError` if it could not be checked."""
 
+FleetCheck = Callable[[Plan, Shells, Mapping[Role, Report]], None]
+"""A check of all robots together, which a package adds as an option of `fieldkit check`. Its arguments are the plan,
+the robots that answered, and the reports, to which it adds its findings. It raises no `FieldkitError`."""
+
 _CONNECTION: Final = "connection"
 
 
@@ -68,7 +72,9 @@ class Checked:
     variants: Mapping[Role, Variants]
 
 
-def check(plan: Plan, shells: Shells, out: Path, *, all_checks: bool) -> Checked:
+def check(
+    plan: Plan, shells: Shells, out: Path, *, all_checks: bool, fleet_checks: Sequence[FleetCheck] = ()
+) -> Checked:
     """Check every robot of the cast and this machine, and install the job script on each robot.
 
     Args:
@@ -76,6 +82,7 @@ def check(plan: Plan, shells: Shells, out: Path, *, all_checks: bool) -> Checked
         shells: The robots.
         out: Folder of the trial.
         all_checks: Whether to also check locks, and to run the checks that packages add (`plugins.CHECKS`).
+        fleet_checks: Checks of all robots together, which run last.
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
@@ -86,6 +93,9 @@ def check(plan: Plan, shells: Shells, out: Path, *, all_checks: bool) -> Checked
     run_parallel(check_robot, plan.cast)
     for refusal in plan.refusals(variants_by_role):
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
+    reachable = {role: shells[role] for role in plan.cast if role in variants_by_role}
+    for fleet_check in fleet_checks:
+        fleet_check(plan, reachable, reports)
     laptop = Report(LAPTOP)
     system.judge_laptop(plan, out, laptop)
     return Checked(_all_findings([*reports.values(), laptop]), variants_by_role)

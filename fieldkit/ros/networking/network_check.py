@@ -1,0 +1,73 @@
+"""`fieldkit check --ros`: the known causes for which ROS programs of several robots do not reach each other.
+
+It follows the order in which a person searches: settings of each robot, their agreement, what really arrives between
+the robots. Clock, power save and signal are checks of every `fieldkit check`.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+from fieldkit.backends.protocols import Cast
+from fieldkit.core.errors import FieldkitError
+from fieldkit.core.model import Role
+from fieldkit.core.threads import run_parallel
+from fieldkit.ros.networking import reachability, settings, state
+from fieldkit.ros.networking.exchange import exchange
+from fieldkit.ros.networking.state import RosState
+from fieldkit.steps.scene import Shells
+from fieldkit.trial.check.report import Report
+from fieldkit.trial.plan import Plan
+
+_CHECK: Final = "ROS network"
+
+
+def check_network(plan: Plan, shells: Shells, reports: Mapping[Role, Report]) -> None:
+    """Add the findings on the network of all robots with ROS. It is the entry point `ros` of `fieldkit.fleet_checks`.
+
+    Args:
+        plan: The plan of a trial.
+        shells: The robots that answer.
+        reports: Receive the findings.
+    """
+    cast = {role: robot for role, robot in plan.cast.items() if role in shells and robot.profile.ros is not None}
+    for role in shells:
+        if role not in cast:
+            reports[role].ok(_CHECK, "its profile has no ROS")
+    states: dict[Role, RosState] = {}
+
+    def read(role: Role) -> None:
+        try:
+            states[role] = state.read(cast[role], shells[role])
+        except FieldkitError as error:
+            reports[role].fail(_CHECK, error.what, error.remedy)
+
+    run_parallel(read, cast)
+    states = {role: states[role] for role in cast if role in states}
+    for role, robot_state in states.items():
+        settings.judge_robot(cast[role], robot_state, reports[role])
+    settings.judge_agreement(cast, states, reports)
+    settings.judge_servers(cast, states, reports)
+    _check_reachability({role: cast[role] for role in states}, states, plan.trial, shells, reports)
+
+
+def _check_reachability(
+    cast: Cast,
+    states: Mapping[Role, RosState],
+    trial: str,
+    shells: Shells,
+    reports: Mapping[Role, Report],
+) -> None:
+    if len(cast) < 2:
+        return
+    domain = min((settings.domain(robot_state.variables) or 0 for robot_state in states.values()), default=0)
+    for (source, destination), arrivals in exchange(cast, shells, domain, trial).items():
+        ros2 = settings.is_ros2(cast[source]) and settings.is_ros2(cast[destination])
+        reachability.judge_arrivals(
+            cast[source], arrivals, states[destination], domain, reports[destination], ros2=ros2
+        )
+    for role in cast:
+        if not settings.is_ros2(cast[role]):
+            try:
+                reachability.judge_names(role, cast, states, shells[role], reports[role])
+            except FieldkitError as error:
+                reports[role].fail(_CHECK, error.what, error.remedy)

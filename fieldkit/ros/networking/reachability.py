@@ -1,0 +1,121 @@
+"""Findings on test datagrams between robots, and on the names by which nodes of ROS 1 are reached."""
+
+from collections.abc import Mapping
+from typing import Final
+from urllib.parse import urlsplit
+
+from fieldkit.agent.datagrams import FRAGMENTED, MULTICAST, SIZES, UNICAST
+from fieldkit.backends.protocols import Robot
+from fieldkit.core.deadline import Deadline
+from fieldkit.core.model import Role
+from fieldkit.remote.command import printable
+from fieldkit.remote.shell import Shell
+from fieldkit.ros.networking import settings
+from fieldkit.ros.networking.exchange import COUNT, Arrivals
+from fieldkit.ros.networking.state import RosState
+from fieldkit.trial.check.report import Report
+
+MIN_ARRIVED: Final = 18
+"""Number of `COUNT` datagrams from which a link is reported as good: 10 % loss."""
+
+_RESOLVE_S: Final = 15.0
+_LOOPBACK: Final = {None, "localhost", "127.0.0.1", "::1"}
+_FRAGMENTS: Final = -(-SIZES[FRAGMENTED] // 1480)
+
+
+def judge_arrivals(
+    source: Robot, arrivals: Arrivals, state: RosState, domain: int, report: Report, *, ros2: bool
+) -> None:
+    """Add the findings on the test datagrams of one robot that arrived at the robot of `report`.
+
+    Args:
+        source: The sender.
+        arrivals: What arrived.
+        state: State of the receiver.
+        domain: ROS domain of the test.
+        report: Receives the findings.
+        ros2: Whether both robots run ROS 2, for which multicast and fragments matter.
+    """
+    if arrivals.error:
+        report.fail(f"datagrams from {source.name}", f"not tested: {arrivals.error}", "fieldkit check   # first")
+        return
+    unicast, multicast, fragmented = (arrivals.counts.get(kind, 0) for kind in (UNICAST, MULTICAST, FRAGMENTED))
+    blocked = f"; firewall: {state.drop_rules[0]}" if state.drop_rules else ""
+    remedy = settings.ports_remedy(domain)
+    _judge_count(f"UDP from {source.name}", unicast, report, nothing=f"no unicast arrives{blocked}", remedy=remedy)
+    if not ros2:
+        return
+    if settings.needs_multicast(state.variables):
+        check, peers = f"multicast from {source.name}", f"export ROS_STATIC_PEERS={source.address}"
+        if unicast:
+            nothing, advice = f"no multicast arrives, unicast does{blocked}", f"{peers}   # or a discovery server"
+        else:
+            nothing, advice = f"no multicast arrives{blocked}", remedy
+        _judge_count(check, multicast, report, nothing=nothing, remedy=advice)
+    if unicast:
+        _judge_count(
+            f"fragments from {source.name}",
+            fragmented,
+            report,
+            nothing=f"no datagram of {SIZES[FRAGMENTED]} B arrives, those of {SIZES[UNICAST]} B do{blocked}",
+            remedy="allow IP fragments in the firewall; or keep datagrams below the MTU: settings: tuned",
+            what=f"datagrams of {SIZES[FRAGMENTED]} B ({_FRAGMENTS} fragments)",
+        )
+
+
+def _judge_count(
+    check: str, count: int, report: Report, *, nothing: str, remedy: str, what: str = "datagrams"
+) -> None:
+    if not count:
+        report.fail(check, f"0 of {COUNT} {what}: {nothing}", remedy)
+    elif count < MIN_ARRIVED:
+        report.warn(
+            check, f"{count} of {COUNT} {what}: the link loses packets", "bring the robots closer, then again"
+        )
+    else:
+        report.ok(check, f"{count} of {COUNT} {what}")
+
+
+def advertised_name(state: RosState) -> str:
+    """Return the name under which nodes of ROS 1 are reached (wiki.ros.org/ROS/EnvironmentVariables)."""
+    return state.variables.get("ROS_HOSTNAME") or state.variables.get("ROS_IP") or state.hostname
+
+
+def _host(uri: str) -> str | None:
+    try:
+        return urlsplit(uri).hostname
+    except ValueError:
+        return uri
+
+
+def judge_names(
+    role: Role, cast: Mapping[Role, Robot], states: Mapping[Role, RosState], shell: Shell, report: Report
+) -> None:
+    """Add whether a robot with ROS 1 resolves the names of the others on its master to their addresses on the radio.
+
+    Raises:
+        LinkError: The robot did not answer.
+    """
+    master = states[role].variables.get("ROS_MASTER_URI", "")
+    if _host(master) in _LOOPBACK:
+        report.ok("ROS network", f"its ROS master, {master}, is its own: its topics reach no other robot")
+        return
+    for other, state in states.items():
+        if other is role or settings.is_ros2(cast[other]) or state.variables.get("ROS_MASTER_URI") != master:
+            continue
+        robot, name = cast[other], advertised_name(state)
+        argv = ("getent", "ahostsv4", name)
+        output = shell.run(argv, deadline=Deadline.after(_RESOLVE_S), check=False).stdout
+        addresses = list(
+            dict.fromkeys(line.split()[0] for line in output.decode(errors="replace").splitlines() if line)
+        )
+        check = f"name of {robot.name}"
+        if robot.address in addresses:
+            report.ok(check, f"its nodes are reached as {name}, which is {robot.address}")
+        else:
+            resolved = printable(", ".join(addresses).encode()) or "unknown here"
+            report.fail(
+                check,
+                f"its nodes are reached as {name}, which is {resolved}, not {robot.address}",
+                f"on {robot.name}: export ROS_IP={robot.address}   # before its nodes start",
+            )

@@ -1,0 +1,306 @@
+"""Findings on the ROS settings of one robot, and on settings that must agree between robots.
+
+Sources: docs.ros.org, "The ROS_DOMAIN_ID", "Improved Dynamic Discovery", "DDS tuning information" and "Discovery
+Server"; wiki.ros.org/ROS/NetworkSetup; github.com/ros2/rmw_zenoh, README.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from fieldkit.backends.protocols import Robot
+from fieldkit.config.locations import copy_profile_command
+from fieldkit.core.model import Role
+from fieldkit.ros.networking.exchange import multicast_port
+from fieldkit.ros.networking.state import RosProgram, RosState, Variables
+from fieldkit.trial.check.report import Report
+
+DEFAULT_RMW: Final = "rmw_fastrtps_cpp"
+"""RMW of all distributions from Foxy to Kilted if the environment names none (REP 2000)."""
+_ZENOH_PORT: Final = 7447
+_SERVER_PORT: Final = 11811
+"""Default port of a discovery server of Fast DDS."""
+_RECOMMENDED: Final = {
+    # "DDS tuning information": CycloneDDS recommends 10 MB, Fast DDS and Connext recommend more.
+    "net/core/rmem_max": (10_485_760, "at least", "a burst of fragments of a large sample exceeds the buffer"),
+    "net/ipv4/ipfrag_time": (3, "at most", "incomplete datagrams of a lossy link occupy the buffer of fragments"),
+    "net/ipv4/ipfrag_high_thresh": (134_217_728, "at least", "incomplete datagrams fill the buffer of fragments"),
+}
+
+
+def is_ros2(robot: Robot) -> bool:
+    """Return True if a robot runs ROS 2."""
+    return robot.profile.ros is not None and robot.profile.ros.variant == "ros2"
+
+
+def domain(variables: Variables) -> int | None:
+    """Return the ROS domain of an environment; None if its value is invalid."""
+    text = variables.get("ROS_DOMAIN_ID") or "0"
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= 3 else None
+
+
+def rmw(variables: Variables) -> str:
+    """Return the RMW of an environment."""
+    return variables.get("RMW_IMPLEMENTATION") or DEFAULT_RMW
+
+
+def uses_zenoh(variables: Variables) -> bool:
+    """Return True if the RMW is that of Zenoh, which has no multicast by default and needs a router."""
+    return "zenoh" in rmw(variables)
+
+
+def needs_multicast(variables: Variables) -> bool:
+    """Return True if nodes with this environment discover other robots by multicast only."""
+    configured = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
+    return not uses_zenoh(variables) and not any(variables.get(name) for name in configured)
+
+
+def judge_robot(robot: Robot, state: RosState, report: Report) -> None:
+    """Add the findings on one robot."""
+    if is_ros2(robot):
+        _judge_domain(robot, state, report)
+        _judge_range(state.variables, report)
+        if uses_zenoh(state.variables):
+            _judge_router(state, report)
+        else:
+            _judge_rmw_interfaces(robot, state, report)
+            _judge_multicast_route(robot, state, report)
+            _judge_kernel(state, report)
+    _judge_firewall(state, report)
+
+
+def judge_agreement(
+    cast: Mapping[Role, Robot], states: Mapping[Role, RosState], reports: Mapping[Role, Report]
+) -> None:
+    """Add the findings on settings of ROS 2 that must agree; each robot is compared with the first one.
+
+    Args:
+        cast: The robots.
+        states: State of each robot that could be read.
+        reports: Receive the findings.
+    """
+    roles = [role for role in states if is_ros2(cast[role])]
+    if len(roles) < 2:
+        return
+    first, *others = roles
+    for role in others:
+        for compare in (_compare_domains, _compare_rmws, _compare_distributions, _compare_servers):
+            compare(cast[first], states[first].variables, states[role].variables, reports[role])
+
+
+def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
+    own = domain(state.variables)
+    if own is None:
+        report.fail("ROS domain", f"ROS_DOMAIN_ID is {state.variables['ROS_DOMAIN_ID']!r}", "use a number, 0 to 101")
+        return
+    count = len(state.programs)
+    others = _differing(state.programs, lambda variables: domain(variables) == own, "ROS_DOMAIN_ID", "0")
+    if others:
+        report.warn(
+            "ROS domain",
+            f"{own} by its setup files and profile, but of {count} running ROS programs: {others}",
+            f"start them in domain {own}, or correct ROS_DOMAIN_ID: {copy_profile_command(robot.profile.name)}",
+        )
+    else:
+        report.ok("ROS domain", f"{own}; {count} running ROS programs, all in this domain" if count else str(own))
+    own_rmw = rmw(state.variables)
+    others = _differing(
+        state.programs, lambda variables: rmw(variables) == own_rmw, "RMW_IMPLEMENTATION", DEFAULT_RMW
+    )
+    if others:
+        report.warn(
+            "RMW",
+            f"{own_rmw} by its setup files and profile, but of {count} running ROS programs: {others}",
+            "set RMW_IMPLEMENTATION for all programs of the robot, and restart them: ros2 daemon stop",
+        )
+    else:
+        report.ok("RMW", own_rmw)
+
+
+def _differing(
+    programs: tuple[RosProgram, ...], is_equal: Callable[[Variables], bool], name: str, default: str
+) -> str:
+    """Return the values of a variable in programs that differ, with their numbers; empty if none differs."""
+    values = Counter(
+        program.variables.get(name) or default for program in programs if not is_equal(program.variables)
+    )
+    return ", ".join(f"{count} with {value}" for value, count in values.most_common(3))
+
+
+def _judge_range(variables: Variables, report: Report) -> None:
+    if variables.get("ROS_LOCALHOST_ONLY") == "1":
+        report.fail(
+            "discovery range",
+            "ROS_LOCALHOST_ONLY=1: its nodes do not communicate with other robots",
+            "unset ROS_LOCALHOST_ONLY   # in its setup files and in .bashrc",
+        )
+        return
+    chosen = (variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET").upper()
+    if chosen == "OFF" or (chosen == "LOCALHOST" and not variables.get("ROS_STATIC_PEERS")):
+        report.fail(
+            "discovery range",
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE={chosen}: its nodes do not discover other robots",
+            "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET   # or list the robots in ROS_STATIC_PEERS",
+        )
+        return
+    peers, server = variables.get("ROS_STATIC_PEERS"), variables.get("ROS_DISCOVERY_SERVER")
+    words = [chosen, *([f"peers {peers}"] if peers else []), *([f"discovery server {server}"] if server else [])]
+    report.ok("discovery range", ", ".join(words))
+
+
+def _judge_router(state: RosState, report: Report) -> None:
+    if state.variables.get("ZENOH_SESSION_CONFIG_URI"):
+        report.ok("Zenoh router", f"session configuration {state.variables['ZENOH_SESSION_CONFIG_URI']}")
+    elif _ZENOH_PORT not in state.tcp_ports:
+        report.fail(
+            "Zenoh router",
+            f"no router listens on TCP port {_ZENOH_PORT}, without which nodes do not discover each other",
+            "ros2 run rmw_zenoh_cpp rmw_zenohd",
+        )
+    elif not any(p.variables.get("ZENOH_ROUTER_CONFIG_URI") for p in (_as_program(state), *state.programs)):
+        report.warn(
+            "Zenoh router",
+            "a router runs, with the default configuration, which connects to no other router",
+            "list the other robots in connect.endpoints of a file that ZENOH_ROUTER_CONFIG_URI names   # on one side",
+        )
+    else:
+        report.ok("Zenoh router", f"listens on TCP port {_ZENOH_PORT}, with a configuration of its own")
+
+
+def _as_program(state: RosState) -> RosProgram:
+    return RosProgram("", state.variables)
+
+
+def _judge_rmw_interfaces(robot: Robot, state: RosState, report: Report) -> None:
+    radio, check = robot.profile.radio.interface, "RMW settings"
+    named = state.rmw_interfaces
+    if state.unreadable_settings:
+        report.fail(check, state.unreadable_settings, "correct CYCLONEDDS_URI or FASTDDS_DEFAULT_PROFILES_FILE")
+    elif named and not {radio, robot.address} & set(named):
+        report.fail(
+            check,
+            f"limited to {', '.join(named)}: its nodes do not use {radio}",
+            f"name {radio} in the file of CYCLONEDDS_URI or FASTDDS_DEFAULT_PROFILES_FILE",
+        )
+    elif named:
+        report.ok(check, f"limited to {', '.join(named)}")
+
+
+def _judge_multicast_route(robot: Robot, state: RosState, report: Report) -> None:
+    radio = robot.profile.radio.interface
+    if not needs_multicast(state.variables):
+        return
+    if state.multicast_interface is None:
+        report.fail("multicast route", "no route to 239.255.0.1", f"sudo ip route add 224.0.0.0/4 dev {radio}")
+    elif state.multicast_interface != radio:
+        report.warn(
+            "multicast route",
+            f"239.255.0.1 leaves by {state.multicast_interface}; a middleware that follows the route misses {radio}",
+            f"sudo ip route add 224.0.0.0/4 dev {radio}   # or name {radio} in the settings of the RMW",
+        )
+    else:
+        report.ok("multicast route", f"by {radio}")
+
+
+def _judge_kernel(state: RosState, report: Report) -> None:
+    problems, commands = [], []
+    for key, (value, relation, consequence) in _RECOMMENDED.items():
+        actual = state.kernel.get(key)
+        if actual is not None and (actual < value if relation == "at least" else actual > value):
+            name = key.replace("/", ".")
+            problems.append(f"{name} is {actual}: {consequence}")
+            commands.append(f"{name}={value}")
+    if problems:
+        report.warn(
+            "kernel buffers", "; ".join(problems), f"sudo sysctl -w {' '.join(commands)}   # for samples above 1 kB"
+        )
+    elif state.kernel:
+        report.ok("kernel buffers", "as ROS recommends")
+    else:
+        report.ok("kernel buffers", "not known: they cannot be read in its network namespace")
+
+
+def _judge_firewall(state: RosState, report: Report) -> None:
+    if state.drop_rules is None:
+        report.ok("firewall", "rules not known: reading them needs root, nft or iptables")
+    elif state.drop_rules:
+        shown = "; ".join(state.drop_rules[:3])
+        report.warn(
+            "firewall", f"rules drop packets: {shown}", "sudo nft list ruleset   # do they drop those of ROS?"
+        )
+    else:
+        report.ok("firewall", "no rule drops received packets")
+
+
+def _compare_domains(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+    if domain(actual) != domain(expected):
+        report.fail(
+            "same ROS domain",
+            f"domain {domain(actual)}, but {first.name} is in domain {domain(expected)}: they do not see each other",
+            "use one ROS_DOMAIN_ID on all robots",
+        )
+
+
+def _compare_rmws(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+    if uses_zenoh(actual) != uses_zenoh(expected):
+        report.fail(
+            "same RMW",
+            f"{rmw(actual)}, but {first.name} has {rmw(expected)}: Zenoh and DDS do not communicate",
+            "use one RMW_IMPLEMENTATION on all robots",
+        )
+    elif rmw(actual) != rmw(expected):
+        report.warn(
+            "same RMW",
+            f"{rmw(actual)}, but {first.name} has {rmw(expected)}: ROS does not support different RMWs",
+            "use one RMW_IMPLEMENTATION on all robots",
+        )
+    else:
+        report.ok("same RMW", f"{rmw(actual)}, as on {first.name}")
+
+
+def _compare_distributions(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+    own, other = actual.get("ROS_DISTRO", ""), expected.get("ROS_DISTRO", "")
+    if own and other and own != other:
+        report.warn(
+            "same ROS distribution",
+            f"{own}, but {first.name} has {other}: ROS does not support different distributions",
+            "install one distribution on all robots, or compare the types: ros2 topic info -v TOPIC",
+        )
+
+
+def _compare_servers(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+    own, other = actual.get("ROS_DISCOVERY_SERVER", ""), expected.get("ROS_DISCOVERY_SERVER", "")
+    if own != other:
+        report.fail(
+            "same discovery server",
+            f"{own or 'no discovery server'}, but {first.name} has {other or 'none'}: no discovery",
+            "use one ROS_DISCOVERY_SERVER on all robots, or on none",
+        )
+
+
+def judge_servers(
+    cast: Mapping[Role, Robot], states: Mapping[Role, RosState], reports: Mapping[Role, Report]
+) -> None:
+    """Add a finding on each discovery server that should run on one of the robots."""
+    roles = {cast[role].address: role for role in states}
+    for role, state in states.items():
+        for server in filter(None, state.variables.get("ROS_DISCOVERY_SERVER", "").split(";")):
+            address, _, port_text = server.partition(":")
+            port = int(port_text) if port_text.isascii() and port_text.isdecimal() else _SERVER_PORT
+            holder = roles.get(address)
+            if holder is None:
+                reports[role].ok("discovery server", f"{server} is on none of the robots, and is not checked")
+            elif port in states[holder].udp_ports:
+                reports[role].ok("discovery server", f"{server}: a program of {cast[holder].name} has this UDP port")
+            else:
+                reports[role].fail(
+                    "discovery server",
+                    f"{server}: no program of {cast[holder].name} has UDP port {port}",
+                    f"on {cast[holder].name}: fastdds discovery -i 0 -l {address} -p {port}",
+                )
+
+
+def ports_remedy(domain_number: int) -> str:
+    """Return a command that opens a firewall for a domain."""
+    first = multicast_port(domain_number)
+    return f"sudo ufw allow proto udp to any port {first}:{first + 249}   # the ports of ROS domain {domain_number}"
