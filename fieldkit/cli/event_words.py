@@ -79,8 +79,8 @@ def _campaign_words(event: CampaignPlanned | CampaignTrial | CampaignWent | Camp
             names = (f"\n{number:5d}  {name}" for number, name in enumerate(event.trials, start=event.done + 1))
             disk = f"{format_bytes(event.needed_bytes)} of disk ({format_bytes(event.free_bytes)} free)"
             duration = TimeEstimate(event.left_s, event.left_most_s)
-            dead_links = " if links are dead" if not duration.is_certain else ""
-            cost = f"{event.walk_m:.0f} m to walk with robots, about {duration}{dead_links}; at most {disk}"
+            failed_links = " if links fail" if not duration.is_certain else ""
+            cost = f"{event.walk_m:.0f} m to walk with robots, about {duration}{failed_links}; at most {disk}"
             return ((f"{done}; {cost}{''.join(names)}", ""),)
         case CampaignWent():
             duration = TimeEstimate(event.left_s, event.left_most_s)
