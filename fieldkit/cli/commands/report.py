@@ -104,12 +104,6 @@ def _require_writable(out: Path) -> None:
         raise ConfigurationError(
             "there is no such folder", where=str(out.parent), remedy=shell_command("mkdir", "-p", out.parent)
         )
-    if out.suffix.lower() in _OTHER_FORMATS:
-        raise ConfigurationError(
-            "a report is a page of HTML",
-            where=str(out),
-            remedy=f"name a file: {shell_command('-o', out.with_suffix('.html'))}; for figures --figures FOLDER",
-        )
     if out.is_dir():
         raise ConfigurationError(
             "this is a folder", where=str(out), remedy=f"name a file: {shell_command('-o', out / _OUT)}"
@@ -119,6 +113,12 @@ def _require_writable(out: Path) -> None:
             "this file is not a report, and is not overwritten",
             where=str(out),
             remedy="choose another -o",
+        )
+    if out.suffix.lower() in _OTHER_FORMATS:
+        raise ConfigurationError(
+            "a report is a page of HTML",
+            where=str(out),
+            remedy=f"name a file: {shell_command('-o', out.with_suffix('.html'))}; for figures --figures FOLDER",
         )
 
 
