@@ -88,7 +88,7 @@ def main() -> None:
             turns = [(worker.PROJECT, here_us), (arguments.other.resolve(), other_us)]
             for project, spent_us in turns if number % 2 == 0 else reversed(turns):
                 spent_us.append(processor_us(project, options, rate, arguments.seconds))
-        ratios = [this / other for this, other in zip(here_us, other_us, strict=True)]
+        ratios = [here / other for here, other in zip(here_us, other_us, strict=True)]
         print(f"{name:14}{_spread(here_us, 1):>26}{_spread(other_us, 1):>26}{_spread(ratios, 3):>24}")
 
 

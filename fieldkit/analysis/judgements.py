@@ -113,7 +113,7 @@ def _limitations(expectation: Expectation, estimate: Estimate, valid: int) -> It
     if expectation.is_below and estimate.quantity.of_sent and estimate.sample is not None:
         infinite = int(np.isinf(estimate.sample.high).sum()) - estimate.n_censored
         if infinite:
-            yield f"in {infinite} of {estimate.n} repeats too much was lost for a value over all sent items"
+            yield f"in {infinite} of {estimate.n} repeats the figure is infinite because of lost items"
 
 
 def _decide(expectation: Expectation, estimate: Estimate) -> _Decision:

@@ -29,7 +29,7 @@ def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1,
     Raises:
         ConfigurationError: There is no such procedure, or the recording has no length.
     """
-    record_s = None if arguments.record is None else parse_duration_s(arguments.record)
+    record_s = None if arguments.record is None else parse_duration_s(arguments.record, "--record")
     if record_s == 0:
         raise ConfigurationError("a recording of 0 s records nothing", remedy="write for example --record 2s")
     return TrialRequest(

@@ -86,13 +86,13 @@ def _same_factor(run: Sources) -> list[frozenset[str]]:
 def _require_two(paths: Sequence[Path]) -> None:
     if len(paths) == 1:
         raise ConfigurationError(
-            "compare takes two runs, A and B, and one is given",
+            "compare needs two runs, A and B, and one is given",
             remedy=f"name another run; or, to compare two values of a column in this run, {_EXAMPLE}",
         )
     if len(paths) > 2:
         command = shell_command("fieldkit", "aggregate", *paths, "--by", "trial,protocol")
         raise ConfigurationError(
-            f"compare takes two runs, A and B, and {len(paths)} are given",
+            f"compare needs two runs, A and B, and {len(paths)} are given",
             remedy="for a run of several trials give their folder, or their table from fieldkit export; "
             f"to show all of these in one table: {command}",
         )

@@ -184,7 +184,7 @@ def file_to_write(text: str) -> Path:
 def natural(text: str, least: int = 0) -> int:
     """Return a whole number with at most 15 digits; argparse reports other texts, with the smallest number."""
     if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number from {least}")
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number of at least {least}")
     if len(text) > _MAX_DIGITS:
         raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
     return int(text)

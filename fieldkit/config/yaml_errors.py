@@ -104,7 +104,7 @@ def explain(problems: Sequence[Any], document: Document, shapes: Mapping[str, st
     remedy = f"add {missing}: to it" if missing else "correct this line"
     # A value with several valid forms has one problem per form at the same location.
     others = len({(document.existing_part(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
-    more = f" ({others} more after this one)" if others else ""
+    more = f" (and {format_count(others, 'more problem')})" if others else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
         where=document.where(location),
@@ -185,8 +185,8 @@ def _type_message(kind: str, message: str, value: object) -> str:
             return f"{message}; put it in quotes"
         case "bool_type" if isinstance(value, str):
             return f"{message}; write true or false"
-        case "int_type" if isinstance(value, str):
-            return f"{message}, in digits only and without quotes"
+        case "int_type" if isinstance(value, str | float):
+            return f"{value!r} is not a whole number; write it in digits only and without quotes"
         case "int_parsing" | "int_from_float":
             return f"{value!r} is not a whole number"
         case "float_parsing" | "float_type":

@@ -43,8 +43,8 @@ class CampaignPlanned(Event):
         names = (f"\n{number:5d}  {name}" for number, name in enumerate(self.trials, start=self.done + 1))
         disk = f"{format_bytes(self.needed_bytes)} of disk ({format_bytes(self.free_bytes)} free)"
         duration = TimeEstimate(self.left_s, self.left_most_s)
-        dead_links = " if links are dead" if not duration.is_certain else ""
-        cost = f"{self.walk_m:.0f} m to walk with robots, about {duration}{dead_links}; at most {disk}"
+        failed_links = " if links fail" if not duration.is_certain else ""
+        cost = f"{self.walk_m:.0f} m to walk with robots, about {duration}{failed_links}; at most {disk}"
         return ((f"{done}; {cost}{''.join(names)}", ""),)
 
 

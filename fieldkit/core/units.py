@@ -35,7 +35,7 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
     Args:
         text: For example `15s`, `0.2 s`, `30ft`.
         units: Factor per unit symbol; the shortest decimal text of a factor is used as its exact value.
-        what: The kind of quantity, for the message.
+        what: The kind of quantity, or the command-line option, for the message.
 
     Raises:
         ConfigurationError: The number or the unit is missing, the unit is unknown, or the value exceeds `_MAX_VALUE`.
@@ -88,9 +88,9 @@ def format_distance(distance: Distance) -> str:
     return label if label.endswith(" m") else f"{label} ({metres})"
 
 
-def parse_duration_s(text: str) -> float:
-    """Return a duration in seconds; raises `ConfigurationError` as `parse_quantity` does."""
-    return parse_quantity(text, SECONDS_PER_UNIT, "duration")
+def parse_duration_s(text: str, what: str = "duration") -> float:
+    """Return a duration in seconds; `what` and errors as for `parse_quantity`."""
+    return parse_quantity(text, SECONDS_PER_UNIT, what)
 
 
 def format_count(count: int, noun: str) -> str:

@@ -145,11 +145,11 @@ Answer = TypeVar("Answer")
 
 _REPLY_TIMEOUT_S: Final = 20.0
 _EXIT_TIMEOUT_S: Final = 20.0
-_NO_LAB: Final = "this directory has no lab that is up"
+_NO_LAB: Final = "no lab is running in this directory"
 
 
 class NoLabError(ConfigurationError):
-    """The directory has no lab that is up."""
+    """No lab is running in the directory."""
 
 
 def state(folder: LabFolder) -> LabState:

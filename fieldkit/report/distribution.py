@@ -160,6 +160,4 @@ def _caption(samples: Sequence[_Sample], unit_name: str, *, is_log: bool) -> str
         text += f"; of {len(places)} distances the nearest, a middle one and the farthest"
     if counts[-1] > MAX_STEPS:
         text += f"; a line of more than {MAX_STEPS} {unit_name} is drawn through {MAX_STEPS} quantiles"
-    return (
-        f"{text}. Requests without a reply are in no line: see ping loss." if unit_name == "replies" else f"{text}."
-    )
+    return f"{text}. Requests without a reply are not drawn: see ping loss." if unit_name == "replies" else f"{text}."

@@ -33,7 +33,8 @@ _LABELS: Final = {
 }
 _HOW: Final = (
     "Each quantity with its 95 % interval: losses as shares of all that was sent, times and rates as medians over "
-    "repeats; below it, faint, each repeat. Properties that are true or false are shares of the valid repeats."
+    "repeats. Faint points below it are single repeats. Properties that are true or false are shares of the valid "
+    "repeats."
 )
 
 

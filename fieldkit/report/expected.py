@@ -16,14 +16,14 @@ class JudgementRow:
     """The judgement of an expectation under one condition, as texts.
 
     Attributes:
-        place: The condition; empty if no repeat has ended.
+        condition: The condition; empty if no repeat has ended.
         value: The measured value.
         interval: Its 95 % interval; empty if it has none.
         ruling: The ruling on the expectation.
         why: Reason for a failure other than the numbers, or empty.
     """
 
-    place: str
+    condition: str
     value: str
     interval: str
     ruling: Ruling
@@ -43,10 +43,10 @@ def verdicts(cells: Sequence[Cell], evidence: Evidence) -> Mapping[str, Sequence
 
 
 def _verdict(judgement: Judgement, differing: Collection[str]) -> JudgementRow:
-    place = wording.condition(judgement.cell, differing=differing) if judgement.cell else ""
+    condition = wording.condition(judgement.cell, differing=differing) if judgement.cell else ""
     _, _, value, interval, _ = judgement_texts(judgement)
     return JudgementRow(
-        place, wording.without_breaks(value), wording.without_breaks(interval), judgement.ruling, judgement.why
+        condition, wording.without_breaks(value), wording.without_breaks(interval), judgement.ruling, judgement.why
     )
 
 

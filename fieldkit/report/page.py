@@ -35,6 +35,8 @@ _DROPPED: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
 # More than two decimals of a point are invisible, but make up half of the page's size.
 _GEOMETRY: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
 _DECIMALS: Final = re.compile(r"(\.\d{2})\d+")
+_OTHER_FORMATS: Final = frozenset({".csv", ".json", ".md", ".pdf", ".png", ".svg", ".tex"})
+"""Suffixes of files that programs would not open as a page."""
 _LOCAL_URL: Final = re.compile(r"url\(#")
 
 ET.register_namespace("", _SVG)
@@ -62,6 +64,12 @@ def require_writable(out: Path) -> None:
             "this file is not a report, and is not overwritten",
             where=str(out),
             remedy="choose another -o",
+        )
+    if out.suffix.lower() in _OTHER_FORMATS:
+        raise ConfigurationError(
+            "a report is a page of HTML",
+            where=str(out),
+            remedy=f"name a file: {shell_command('-o', out.with_suffix('.html'))}; for figures --figures FOLDER",
         )
 
 

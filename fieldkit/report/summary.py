@@ -58,7 +58,7 @@ def paragraph(cells: Sequence[Cell], evidence: Evidence, sweep: Mapping[str, str
         f"{wording.join_words([name.upper() for name in _values(cells, 'protocol')])}; "
         f"{_topologies(cells)}{wording.join_words(_values(cells, 'backend'))} robots. "
         f"{format_count(len(repeats), 'attempt')}: {status_counts(Counter(repeats.texts['status']))}. "
-        "All figures are of the valid ones."
+        "All figures use only the valid ones."
     )
 
 

@@ -36,9 +36,9 @@ _HEADER_BYTES: Final = 8
 _FRAGMENT_BYTES: Final = 1480
 """Payload of an IPv4 packet in an Ethernet frame, including the UDP or ICMP header."""
 
-BY_ITSELF: Final = frozenset({Cause.EXITED})
+BY_EXIT: Final = frozenset({Cause.EXITED})
 BY_LIMIT: Final = frozenset({Cause.LIMIT})
-BY_ITSELF_OR_LIMIT: Final = BY_ITSELF | BY_LIMIT
+BY_EXIT_OR_LIMIT: Final = BY_EXIT | BY_LIMIT
 BY_FIELDKIT: Final = frozenset({Cause.STOPPED})
 
 
@@ -171,7 +171,7 @@ class Planned:
     program: str
     setup: tuple[str, ...] = ()
     tool: Tool | None = None
-    permitted_causes: frozenset[Cause] = BY_ITSELF
+    permitted_causes: frozenset[Cause] = BY_EXIT
     least_s: float = 0.0
     remedy: str = ""
     put: PutProgram | None = None

@@ -28,7 +28,7 @@ from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 
 KINDS: Final = ("capture", "ping", "record", "transfer")
-"""Kinds of step that a simulation can reproduce. Of a recording, it reproduces only the size."""
+"""Kinds of step that a simulation can reproduce; it reproduces only the size of a recording."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class SimulatedRepeat:
         reason: The reason why it is not valid; empty if it is.
         captures: Contents of the captures of sender and receiver; empty if the simulation has none.
         ping: Output of ping.
-        values: Columns that the simulation knows without evidence.
+        values: Columns that the simulation provides without evidence.
     """
 
     repeat: RepeatId
@@ -144,8 +144,8 @@ class SimulatedTrial:
         """Return what the procedure sends under a protocol.
 
         Raises:
-            ConfigurationError: The procedure has not exactly one transfer and one ping between the same robots, or no
-                capture of both.
+            ConfigurationError: The procedure does not have exactly one transfer and one ping between the same
+                robots, or no capture of both.
         """
         transfers = [placed for placed in self._plan.procedure.walk() if isinstance(placed.step, TransferStep)]
         pings = [placed.step for placed in self._plan.procedure.walk() if isinstance(placed.step, PingStep)]

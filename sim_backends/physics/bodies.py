@@ -177,7 +177,7 @@ class Bodies:
         return next(
             (
                 footprint.name
-                for footprint in (*self._grounds[name].around, *others)
+                for footprint in (*self._grounds[name].obstacles, *others)
                 if overlaps(footprint, body, place_m)
             ),
             "",
@@ -331,7 +331,7 @@ class Bodies:
             place_m = self._initial_pose(name).place_m
             if not all(map(math.isfinite, place_m)):
                 raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
-            self._check_free(name, place_m, self._grounds[name].around)
+            self._check_free(name, place_m, self._grounds[name].obstacles)
 
     def _check_no_overlap(self, new: Collection[str]) -> None:
         """Check that bodies that appear now overlap no other body."""

@@ -57,7 +57,7 @@ class Ground:
         max_grade: Maximum grade on which the bodies drive, rise over run; None for flying bodies.
 
     Attributes:
-        around: Obstacles for the bodies, including sides of higher ground; for flying bodies also the floor.
+        obstacles: Obstacles for the bodies, including sides of higher ground; for flying bodies also the floor.
     """
 
     def __init__(self, world: World | None, max_grade: float | None) -> None:
@@ -73,7 +73,7 @@ class Ground:
                 self._pieces.append(_Piece(obstacle, nearest_m))
             else:
                 footprints += [shape_footprint(part.obstacle, part.shape) for part in obstacle.parts()]
-        self.around: Sequence[Footprint] = (*footprints, *map(self._side, self._pieces))
+        self.obstacles: Sequence[Footprint] = (*footprints, *map(self._side, self._pieces))
         self._max_grade = max((math.hypot(*piece.obstacle.grade) for piece in self._pieces), default=0.0)
 
     def surface(self, east_m: float, north_m: float) -> Surface:

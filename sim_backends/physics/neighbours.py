@@ -117,7 +117,7 @@ class Neighbours:
 
     def _add_ground_candidates(self, mover: _Kinematics, ground: Ground) -> None:
         edge_s, *obstacle_times_s = _ground_times_s(mover, ground)
-        for footprint, time_s in zip(ground.around, obstacle_times_s, strict=True):
+        for footprint, time_s in zip(ground.obstacles, obstacle_times_s, strict=True):
             if time_s <= self._horizon_s:
                 self._candidates_of(mover.name).footprints.append(footprint)
         if edge_s <= self._horizon_s:
@@ -135,7 +135,7 @@ class Neighbours:
 def _ground_times_s(mover: _Kinematics, ground: Ground) -> list[float]:
     """Return the minimum times to reach the ground's edge and each obstacle on the ground."""
     body, place_m = mover.body, mover.place_m
-    gaps_m = [ground.edge_m(place_m), *(gap_m(footprint, body, place_m) for footprint in ground.around)]
+    gaps_m = [ground.edge_m(place_m), *(gap_m(footprint, body, place_m) for footprint in ground.obstacles)]
     return [_closing_time_s(gap, mover) for gap in gaps_m]
 
 

@@ -156,14 +156,14 @@ def test_acknowledgements_for_others_and_in_progress_are_ignored() -> None:
 
 @given(legs, st.floats(-math.pi, math.pi), st.tuples(metres, metres, metres))
 def test_path_length_is_independent_of_position_and_heading(
-    way: list[tuple[float, float, float]], yaw_rad: float, begin_m: tuple[float, float, float]
+    path_legs: list[tuple[float, float, float]], yaw_rad: float, begin_m: tuple[float, float, float]
 ) -> None:
-    corners_m = plan(way).corners_m(FlightOrigin("local", "", begin_m[0], begin_m[1], yaw_rad), begin_m[2])
+    corners_m = plan(path_legs).corners_m(FlightOrigin("local", "", begin_m[0], begin_m[1], yaw_rad), begin_m[2])
     assert corners_m[0] == pytest.approx((begin_m[0], begin_m[1], begin_m[2] - 3.0))
     assert [math.dist(a, b) for a, b in pairwise(corners_m)] == pytest.approx(
-        [math.hypot(*leg) for leg in way], abs=1e-6
+        [math.hypot(*leg) for leg in path_legs], abs=1e-6
     )
-    assert corners_m[-1][2] == pytest.approx(begin_m[2] - 3.0 - sum(up for _, _, up in way))
+    assert corners_m[-1][2] == pytest.approx(begin_m[2] - 3.0 - sum(up for _, _, up in path_legs))
 
 
 def test_legs_ahead_and_left_follow_the_heading() -> None:
@@ -176,9 +176,9 @@ def test_legs_ahead_and_left_follow_the_heading() -> None:
 
 @given(legs, st.floats(0, 400), st.floats(0, 400))
 def test_points_on_a_path_do_not_exceed_the_speed(
-    way: list[tuple[float, float, float]], one_m: float, other_m: float
+    path_legs: list[tuple[float, float, float]], one_m: float, other_m: float
 ) -> None:
-    corners_m = plan(way).corners_m(FlightOrigin("local", "", 0.0, 0.0, 0.0), 0.0)
+    corners_m = plan(path_legs).corners_m(FlightOrigin("local", "", 0.0, 0.0, 0.0), 0.0)
     assert (
         math.dist(point_on_path(corners_m, one_m), point_on_path(corners_m, other_m)) <= abs(one_m - other_m) + 1e-6
     )

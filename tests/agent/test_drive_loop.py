@@ -89,7 +89,7 @@ class World:
         self.orders, self.leaves_s = orders, leaves_s
         self.pose = OdometryPose(1.0, 1.0, 0.3)
         self.sent: list[DriveVelocity] = []
-        self.hears: Callable[[], int] = lambda: 1
+        self.count_subscribers: Callable[[], int] = lambda: 1
         self.deliver: Deliver | None = None
         self.over = False
 
@@ -128,7 +128,7 @@ class World:
             self.sent.append(DriveVelocity(values[0], values[5]))
             return True
 
-        return SimpleNamespace(write=write, matched=self.hears)
+        return SimpleNamespace(write=write, matched=self.count_subscribers)
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         self.deliver = deliver
@@ -176,7 +176,7 @@ def test_lost_laptop_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
 
 def test_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
-    world.hears = lambda: setattr(world, "over", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
+    world.count_subscribers = lambda: setattr(world, "over", world.now_s > 100.5) or 1  # type: ignore[func-returns-value]
     monkeypatch.setattr(World, "is_set", lambda self: self.now_s > 101.0)
     ended, _, status = run(world, monkeypatch, tmp_path)
     assert ended == status["ended"] == "ordered to stop"
@@ -185,7 +185,7 @@ def test_signal_stops_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Non
 
 def test_missing_subscription_and_odometry_are_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     world = World(tmp_path / "orders")
-    world.hears = lambda: 0
+    world.count_subscribers = lambda: 0
     with pytest.raises(MiddlewareError, match="/cmd_vel has no subscription"):
         run(world, monkeypatch, tmp_path)
     world = World(tmp_path / "orders")

@@ -138,11 +138,11 @@ def moving(task: DriveTask = TASK) -> tuple[Driver, Robot, float]:
     return driver, robot, 29 * TICK_S
 
 
-def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: bool, hears: bool) -> float:
+def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: bool, has_odometry: bool) -> float:
     now_s = since_s
     while not driver.stop_reason:
         now_s += TICK_S
-        if hears:
+        if has_odometry:
             driver.on_odometry(now_s, robot.odometry())
         if renews:
             driver.on_order(now_s, OUT)
@@ -157,23 +157,23 @@ def stopped_after_s(driver: Driver, since_s: float, robot: Robot, *, renews: boo
 
 def test_lost_laptop_stops_it_within_its_lease() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)]))
-    assert stopped_after_s(driver, since_s, robot, renews=False, hears=True) <= TASK.lease_s + TICK_S
+    assert stopped_after_s(driver, since_s, robot, renews=False, has_odometry=True) <= TASK.lease_s + TICK_S
     assert driver.stop_reason == "no order from the laptop for 2 s"
 
 
 def test_silent_odometry_stops_it() -> None:
     driver, robot, since_s = moving()
-    assert stopped_after_s(driver, since_s, robot, renews=True, hears=False) <= TASK.odometry_s + TICK_S
+    assert stopped_after_s(driver, since_s, robot, renews=True, has_odometry=False) <= TASK.odometry_s + TICK_S
     assert driver.stop_reason == "no odometry for 0.5 s"
 
 
 def test_stops_at_its_fence_and_after_its_time_limit() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], fence_m=2.0))
-    stopped_after_s(driver, since_s, robot, renews=True, hears=True)
+    stopped_after_s(driver, since_s, robot, renews=True, has_odometry=True)
     assert driver.stop_reason == "beyond the fence, 2 m from its place"
     assert math.dist(robot.pose[:2], (7.0, 8.0)) < 2.0 + 2 * TASK.speed_m_s * TICK_S
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], limit_s=3.0))
-    assert stopped_after_s(driver, since_s, robot, renews=True, hears=True) <= 3.0
+    assert stopped_after_s(driver, since_s, robot, renews=True, has_odometry=True) <= 3.0
     assert driver.stop_reason == "the path was not finished in 3 s"
 
 

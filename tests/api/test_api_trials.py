@@ -231,7 +231,7 @@ def test_paths_without_a_trial_are_rejected_as_by_commands(tmp_path: Path) -> No
         fieldkit.load()
     with pytest.raises(ConfigurationError, match="no such file or folder"):
         fieldkit.load(tmp_path / "gone")
-    with pytest.raises(ConfigurationError, match="no trial is there"):
+    with pytest.raises(ConfigurationError, match="there is no trial in this folder"):
         fieldkit.load(tmp_path)
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n", encoding="utf-8")

@@ -34,7 +34,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("trial los 30", "distance '30' has no unit"),
         ("trial los 30feet", "unknown unit 'feet'"),
         ("trial lso 30ft", "did you mean 'los'?"),
-        ("trial los 30ft --record 2", "duration '2' has no unit"),
+        ("trial los 30ft --record 2", "--record '2' has no unit"),
         ("trial los 30ft --record 0s", "records nothing"),
         ("trial los 30ft --backend emulatd", "no backend 'emulatd'"),
         ("trial los 30ft --backend field", "needs a site file"),
@@ -97,9 +97,9 @@ def test_messages_about_arguments_name_the_smallest_number_and_only_what_is_requ
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     assert main(["trial", "los", "30ft", "--repeats", "-2"]) == 2
-    assert "'-2' is not a whole number from 1" in capsys.readouterr().err
+    assert "'-2' is not a whole number of at least 1" in capsys.readouterr().err
     assert main(["compare", "a"]) == 2
-    assert capsys.readouterr().err.startswith("error: compare takes two runs, A and B, and one is given\n")
+    assert capsys.readouterr().err.startswith("error: compare needs two runs, A and B, and one is given\n")
 
 
 def test_two_robots_with_one_address_are_an_error(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -53,7 +53,7 @@ def test_every_shipped_procedure_loads(name: str) -> None:
         ("summary: ROBOTIS", "# summary: ROBOTIS", "required key 'summary' is missing"),
         ("type: sensor_msgs/LaserScan, rate: 5Hz", "type: sensor_msgs/LaserScan, rate: 5", "has no unit"),
         ("type: sensor_msgs/LaserScan, rate: 5Hz", "type: sensor_msgs/LaserScan, rate: 5ft", "unknown unit 'ft'"),
-        ("points: 360", "points: many", "valid integer"),
+        ("points: 360", "points: many", "is not a whole number"),
         ("points: 360", "points: 0", "greater than 0"),
         ("{duration_s}", "{duraton_s}", "unknown placeholder"),
         ("  variant: ros1", "  variant: ros3", "'ros3' is not one of: ros1, ros2"),
@@ -88,7 +88,7 @@ def test_each_error_is_counted_once(tmp_path: Path, old: str, new: str, others: 
     path.write_text(PROFILE.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(ConfigurationError) as caught:
         schema.load(path, RobotProfile)
-    assert ("(1 more after this one)" in caught.value.what) == bool(others), caught.value.what
+    assert ("(and 1 more problem)" in caught.value.what) == bool(others), caught.value.what
 
 
 def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
@@ -125,8 +125,8 @@ def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
         ("into: recv.bag", "file: a/b/c.bag", "is not the name of a recording"),
         ("port: 1234\n", "port: 0\n", "greater than 0"),
         ("topology: master", "topology: mesh", "'mesh' is not one of: master, masterless"),
-        ("repeats: 20", "repeats: 20.5", "valid integer"),
-        ("repeats: 20", "repeats: '20'", "valid integer"),
+        ("repeats: 20", "repeats: 20.5", "is not a whole number"),
+        ("repeats: 20", "repeats: '20'", "is not a whole number"),
         (
             "        - ping: {",
             "        - transfer: {from: sender, to: receiver}\n          ping: {",

@@ -83,7 +83,7 @@ def test_an_error_in_a_section_hides_no_other_error() -> None:
     with pytest.raises(ConfigurationError) as caught:
         schema.validate(schema.parse(documents.to_text(broken), source="robots/iris.yaml"), BenchProfile)
     assert caught.value.what.startswith("in limits.max_speed_m_s: "), "the first error in the file"
-    assert caught.value.what.endswith(" (1 more after this one)")
+    assert caught.value.what.endswith(" (and 1 more problem)")
 
 
 def test_a_key_of_no_package_is_unknown() -> None:

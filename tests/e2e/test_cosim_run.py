@@ -155,7 +155,7 @@ def test_replay_and_plot_reject_invalid_recordings(lab: Path) -> None:
         (("run", "pas"), "there is no scenario 'pas'", "baylands"),
         (("run", "none.yaml"), "none.yaml: cannot be read: No such file", "ls -l none.yaml"),
         (("run", "pass.yaml", "--policy", "sliding"), "there is no sync policy 'sliding'", "sliding_window"),
-        (("run", "pass.yaml", "--seed", "-1"), "'-1' is not a whole number from 0", "--help"),
+        (("run", "pass.yaml", "--seed", "-1"), "'-1' is not a whole number of at least 0", "--help"),
         (("run", "pass.yaml", "--seeds", "0"), "must be at least 1", "--help"),
         (("run", "pass.yaml", "--seed", "1", "--seeds", "2"), "not allowed with", "--help"),
         (("run", "pass.yaml", "--set", "duration"), "--set: 'duration' is not KEY=VALUE", "--set policy.window=5ms"),

@@ -216,7 +216,7 @@ def test_a_policy_without_a_window_is_reported_and_the_others_continue(lab: Path
     ("words", "message", "remedy"),
     [
         (("--policy", "slidng_window"), "there is no sync policy 'slidng_window'", "did you mean 'sliding_window'?"),
-        (("--window", "1"), "duration '1' has no unit", "1s or 1ms"),
+        (("--window", "1"), "--window '1' has no unit", "1s or 1ms"),
         (("--window", "0ms"), "a window that is not above 0", "--window 1ms,10ms,100ms"),
         (("--bias",), "--bias: one seed has no distribution", "add --seeds 20"),
         (("--figure", "x.jpg"), "--figure: 'x.jpg' has no known format", ".svg, .pdf, .png"),

@@ -446,19 +446,19 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: Fie
         (agent,) = [pid for pid in descendants(os.getpid()) if b"drive" in command_line(pid)]
         os.kill(agent, signal.SIGSTOP)
         wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
-        stands_ns = time.time_ns()
+        stationary_since_ns = time.time_ns()
         stopped = run_here(field_robots.folder, "stop", "rover-1")
         assert (stopped.code, stopped.out) == (0, "rover-1: stopped (stationary)\n")
         wait_for_end({agent}, within_s=60.0)
-        assert standstill_s(field_robots, stands_ns) == 0.0
+        assert standstill_s(field_robots, stationary_since_ns) == 0.0
         assert finish(process).code == 3
-    assert standstill_s(field_robots, stands_ns) == 0.0
+    assert standstill_s(field_robots, stationary_since_ns) == 0.0
     trial = only_trial(field_robots.folder)
     assert motions(trial) == ["origin", "begun", "held"]
     again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
     assert "no robot moves before a person confirms: rover-1" in again.err
-    assert standstill_s(field_robots, stands_ns) == 0.0
+    assert standstill_s(field_robots, stationary_since_ns) == 0.0
 
 
 def command_line(pid: int) -> list[bytes]:

@@ -25,7 +25,7 @@ def kernel_packets(folder: Path, role: str) -> dict[str, int]:
         assert fields
         counts = fields[1].split()
         moments.append({"rx": int(counts[1]), "tx": int(counts[9])})
-    return {way: moments[1][way] - moments[0][way] for way in ("rx", "tx")}
+    return {direction: moments[1][direction] - moments[0][direction] for direction in ("rx", "tx")}
 
 
 def test_radios_kernels_captures_and_the_air_log_have_equal_counts(tmp_path: Path) -> None:

@@ -174,11 +174,15 @@ def _parse_tools(data: bytes, _: Path) -> None:
 
 
 def _tool_seeds() -> tuple[bytes, ...]:
-    abouts = {"netcat": "nc.openbsd/*/about.txt", "ping": "ping/*/about.txt", "capture": "tcpdump/4.99.3/about.txt"}
-    abouts |= {"recorder": "ros2-bag/jazzy/record-help.txt"}
+    about_files = {
+        "netcat": "nc.openbsd/*/about.txt",
+        "ping": "ping/*/about.txt",
+        "capture": "tcpdump/4.99.3/about.txt",
+    }
+    about_files |= {"recorder": "ros2-bag/jazzy/record-help.txt"}
     parts = [b"==> user <==\n1000\n\n==> exit 0 <==\n"]
     parts += [
-        b"==> %s <==\n%s\n==> exit 0 <==\n" % (name.encode(), _stored(file)[0]) for name, file in abouts.items()
+        b"==> %s <==\n%s\n==> exit 0 <==\n" % (name.encode(), _stored(file)[0]) for name, file in about_files.items()
     ]
     return (b"".join(parts), *_stored("*/*/*about.txt", "*/*/record-help.txt"))
 

@@ -60,16 +60,16 @@ def robots_with_much_evidence() -> Iterator[None]:
         yield
 
 
-def run(out: Path, witness: VersionRecorder) -> None:
+def run(out: Path, recorder: VersionRecorder) -> None:
     """Start the trial in `out`, or resume it if a power cut left its plan; the witness receives the messages."""
     plans = list(out.glob(f"*/{PLAN_FILE}"))
     if plans:
-        resume_trial(plans[0].parent, IdleTestbed(), witness.on_event)
+        resume_trial(plans[0].parent, IdleTestbed(), recorder.on_event)
     else:
         out.mkdir(exist_ok=True)
         for leftover in out.iterdir():  # a trial that was not reported to the user; the next one has a different name
             shutil.rmtree(leftover)
-        run_trial(plan(), IdleTestbed(), out, witness.on_event)
+        run_trial(plan(), IdleTestbed(), out, recorder.on_event)
 
 
 @contextmanager
@@ -126,21 +126,21 @@ def cuts_at_every_sync(
     locations: list[str] = []
     with disk.mounted(place / "disk") as mounted:
         (out := mounted / OUT).mkdir()
-        witness = VersionRecorder(out)
+        recorder = VersionRecorder(out)
 
         def cut(location: str) -> bool:
-            witness.record_versions()
+            recorder.record_versions()
             image = disk.image(mounted, place / f"cut-{len(cuts)}.img")
             cuts.append(
-                PowerCut(image, dict(witness.reported), witness.is_over, f"cut {len(cuts)}, before {location}")
+                PowerCut(image, dict(recorder.reported), recorder.is_over, f"cut {len(cuts)}, before {location}")
             )
             locations.append(location)
             return location != without
 
         with at_every_sync(cut):
-            run(out, witness)
+            run(out, recorder)
         cut("power off")
-    return cuts, witness, locations[:-1]
+    return cuts, recorder, locations[:-1]
 
 
 @contextmanager
@@ -169,11 +169,11 @@ def calls_of_a_trial(place: Path) -> int:
     """Approximate number of calls and returns in a trial; the first trial of a process has more."""
     counts = []
     for number in range(2):
-        witness = VersionRecorder(place / f"whole-{number}")
+        recorder = VersionRecorder(place / f"whole-{number}")
         calls = itertools.count()
         sys.setprofile(lambda *_, calls=calls: next(calls))
         try:
-            run(witness.folder, witness)
+            run(recorder.folder, recorder)
         finally:
             sys.setprofile(None)
         counts.append(next(calls))
@@ -193,9 +193,9 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
     """
     with disk.mounted(place / "disk") as mounted, ThreadPoolExecutor() as pool:
         (out := mounted / OUT).mkdir(exist_ok=True)
-        witness = VersionRecorder(out)
-        witness.record_versions()
-        witness.reported = dict.fromkeys(witness.versions, 0)  # these versions are on disk and must stay there
+        recorder = VersionRecorder(out)
+        recorder.record_versions()
+        recorder.reported = dict.fromkeys(recorder.versions, 0)  # these versions are on disk and must stay there
         states: list[tuple[dict[str, int], bool]] = []
         cut_requested = threading.Event()
 
@@ -208,22 +208,22 @@ def cut_at_a_moment(disk: Disk, place: Path, file: Path, after_calls: int) -> tu
 
         def cut() -> None:
             # The trial may hold any lock here, including one of the thread pool, so no thread is started.
-            states.append((dict(witness.reported), witness.is_over))
+            states.append((dict(recorder.reported), recorder.is_over))
             cut_requested.set()
 
         def record(_location: str) -> bool:
-            witness.record_versions()
+            recorder.record_versions()
             return True
 
         cut_result = pool.submit(image)
         try:
             with at_every_sync(record), at_call(after_calls, cut):
-                run(out, witness)
-            witness.record_versions()
+                run(out, recorder)
+            recorder.record_versions()
         finally:
             if not states:
                 cut()
-        return cut_result.result(), witness
+        return cut_result.result(), recorder
 
 
 def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, calls: int, most: int) -> int:
@@ -244,13 +244,13 @@ def cuts_in_a_row(file_system: FileSystem, place: Path, draw: random.Random, *, 
     """
     disk, image = Disk.make(file_system, place / "disk.img"), place / "left.img"
     for number in range(1, most + 1):
-        cut, witness = cut_at_a_moment(disk, place, image, draw.randrange(calls))
+        cut, recorder = cut_at_a_moment(disk, place, image, draw.randrange(calls))
         image.rename(disk.file)
         with disk.repair().mounted(place / "disk") as mounted:
-            lost = cut.lost(mounted / OUT, witness)
+            lost = cut.lost(mounted / OUT, recorder)
             assert not lost, lost
             if cut.is_over or number == most:
-                run(mounted / OUT, witness)
+                run(mounted / OUT, recorder)
                 assert_resumable(mounted / OUT)
                 break
     disk.file.unlink()

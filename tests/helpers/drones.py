@@ -92,7 +92,7 @@ def flying(
         system=SYSTEM,
         limits=LIMITS,
         airframe_limits=DUCKIEDRONE,
-        obstacles=Ground(None, None).around,
+        obstacles=Ground(None, None).obstacles,
         now_ns=time.monotonic_ns(),
         boot_s=boot_s,
     )

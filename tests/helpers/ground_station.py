@@ -41,7 +41,7 @@ class GroundStation:
         firmware: Firmware = PX4,
         boot_s: float = 0.0,
     ) -> None:
-        obstacles = Ground(world, None).around
+        obstacles = Ground(world, None).obstacles
         self.autopilot = Autopilot(
             firmware=firmware,
             system=SYSTEM,

@@ -76,7 +76,7 @@ class Attempt:
     draw: random.Random
     truth: AttemptTruth = field(default_factory=AttemptTruth)
 
-    def play(self) -> AttemptTruth:
+    def write_evidence_of_steps(self) -> AttemptTruth:
         """Write the evidence of each step and return the ground truth."""
         self._now_ns = {_SEQUENTIAL: _START_NS}
         self._ip_ids = count(1)

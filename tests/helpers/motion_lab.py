@@ -205,7 +205,7 @@ class MotionLab:
             assert process.stdout is not None
             process.stdout.close()
 
-    def tidy(self, craft: Craft, folder: Path) -> list[str]:
+    def restore_lab(self, craft: Craft, folder: Path) -> list[str]:
         """Restore the lab after a trial, as an operator would; return descriptions of what was left behind.
 
         Args:

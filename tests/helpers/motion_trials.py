@@ -113,7 +113,7 @@ class MotionTrial:
                 outcome = MotionOutcome(cell.name, self.seed, problems=(f"{error}; {self._printed()[-300:]}",))
             finally:
                 self._end()
-        leftovers = self.lab.tidy(craft, self.folder)
+        leftovers = self.lab.restore_lab(craft, self.folder)
         duration_s = round(time.monotonic() - began_s, 1)
         return replace(outcome, problems=(*outcome.problems, *leftovers), took_s=duration_s)
 

@@ -170,7 +170,9 @@ class MotionSampler:
     def _sample(self, motion: Steered, now_ns: int) -> MotionSample:
         if self._heading_rad is None:
             self._heading_rad = motion.heading_rad
-        east_m, north_m, up_m = (newest - then for newest, then in zip(motion.place_m, self._start_m, strict=True))
+        east_m, north_m, up_m = (
+            newest - origin_m for newest, origin_m in zip(motion.place_m, self._start_m, strict=True)
+        )
         return MotionSample(
             now_ns / 1e9,
             east_m,

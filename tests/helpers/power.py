@@ -14,7 +14,7 @@ from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.running.resumption import resume_trial
 from tests.helpers.disks import Disk
 from tests.helpers.idle_testbed import IdleTestbed
-from tests.trial.test_trial_crash import VOID_FIRST, demand_whole, trial_of
+from tests.trial.test_trial_crash import VOID_FIRST, assert_complete, trial_of
 
 _MANIFEST: Final = "MANIFEST.sha256"
 
@@ -63,7 +63,7 @@ class PowerCut:
     is_over: bool
     at: str
 
-    def lost(self, folder: Path, witness: VersionRecorder) -> list[str]:
+    def lost(self, folder: Path, recorder: VersionRecorder) -> list[str]:
         """Descriptions of lost or partial files on the disk after the cut.
 
         Args:
@@ -75,15 +75,15 @@ class PowerCut:
             f"{self.at}: {name} is {'older than reported' if name in remaining else 'missing'}"
             for name, number in self.reported.items()
             if not _is_current(
-                remaining.get(name), witness.versions[name][number:], grows=name.endswith(JOURNAL_FILE)
+                remaining.get(name), recorder.versions[name][number:], grows=name.endswith(JOURNAL_FILE)
             )
         ]
         lost += [
             f"{self.at}: {name} is incomplete"
             for name, content in remaining.items()
-            if not name.endswith(JOURNAL_FILE) and content not in witness.versions.get(name, [])
+            if not name.endswith(JOURNAL_FILE) and content not in recorder.versions.get(name, [])
         ]
-        return lost + [f"{self.at}: {problem}" for problem in _lost_evidence(folder, witness)]
+        return lost + [f"{self.at}: {problem}" for problem in _lost_evidence(folder, recorder)]
 
 
 def read_tree(folder: Path) -> dict[str, bytes | None]:
@@ -106,7 +106,7 @@ def _is_current(content: bytes | None, versions: list[bytes], *, grows: bool) ->
     return content.startswith(reported[: reported.rfind(b"\n") + 1]) if grows else content in versions
 
 
-def _lost_evidence(folder: Path, witness: VersionRecorder) -> Iterator[str]:
+def _lost_evidence(folder: Path, recorder: VersionRecorder) -> Iterator[str]:
     """Yield differences between the evidence of ended attempts and the journal or manifest."""
     remaining = visible(folder)
     for path in folder.glob(f"*/{JOURNAL_FILE}"):
@@ -118,7 +118,7 @@ def _lost_evidence(folder: Path, witness: VersionRecorder) -> Iterator[str]:
         for attempt in entries:
             attempt_folder = path.parent / "repeats" / attempt.folder
             prefix = f"{attempt_folder.relative_to(folder).as_posix()}/"
-            expected = {name: content[-1] for name, content in witness.versions.items() if name.startswith(prefix)}
+            expected = {name: content[-1] for name, content in recorder.versions.items() if name.startswith(prefix)}
             if not attempt_folder.is_dir() or expected != {
                 name: remaining[name] for name in remaining if name.startswith(prefix)
             }:
@@ -137,7 +137,7 @@ def assert_resumable(out: Path) -> None:
     before, evidence = journal.ended(entries), visible(folder / "repeats")
     measured = [attempt for attempt in journal.interrupted(entries) if attempt.status is Status.MEASURED]
     resume_trial(folder, IdleTestbed(), lambda _: None)
-    demand_whole(out)
+    assert_complete(out)
     after = journal.ended(journal.read(folder))
     assert after[: len(before)] == before
     assert evidence.items() <= visible(folder / "repeats").items()

@@ -18,13 +18,13 @@ HEADERS_BYTES = 28
 class FixedPowers(RadioChannel):
     """A channel where all stations receive each other equally well, except the pairs in `deaf`."""
 
-    def __init__(self, names: Sequence[str], mode: WifiMode, *, deaf: Sequence[tuple[str, str]] = ()) -> None:
+    def __init__(self, names: Sequence[str], mode: WifiMode, *, without_link: Sequence[tuple[str, str]] = ()) -> None:
         self.names = tuple(names)
         self.noise_mw = [NOISE_MW] * len(names)
         self.sensitivity_mw = [SENSITIVITY_MW] * len(names)
         self._mode = mode
         self.rows = [[0.0 if receiver == transmitter else STRONG_MW for receiver in names] for transmitter in names]
-        for pair in deaf:
+        for pair in without_link:
             first, second = (self.names.index(name) for name in pair)
             self.rows[first][second] = self.rows[second][first] = 0.0
 

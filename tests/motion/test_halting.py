@@ -20,11 +20,9 @@ pytestmark = pytest.mark.emulated
 FOLDER = jobs.work_folder("trial-a", "tcp-01-1")
 ANNA = Holder("trial-a", "anna@one", "trial-a")
 DRIVE_SCRIPT = "trap 'touch .jobs/drive/stationary; exit' INT; echo up; while :; do sleep 0.05; done"
-LANDS = (
-    "trap 'echo 1.0 land: told >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
-)
+LANDS = "trap 'echo 1.0 land: x >&2; sleep 4; echo 5.0 landed >&2; exit' INT; echo up; while :; do sleep 0.05; done"
 WARNS = (
-    "trap 'touch .jobs/fly/unhurried; echo 1.0 land: told >&2; echo 1.2 ALARM: IT MAY FALL >&2; trap : INT' INT; "
+    "trap 'touch .jobs/fly/unhurried; echo 1.0 land: x >&2; echo 1.2 ALARM: IT MAY FALL >&2; trap : INT' INT; "
     "echo up; while :; do sleep 0.05; done"
 )
 HANGS = "trap '' INT; echo up; while :; do sleep 0.05; done"

@@ -146,7 +146,7 @@ steps:
 """
 SLOW = """\
 name: slow
-summary: An echo that is to be faster than light
+summary: An echo that must be faster than light
 scenario: los
 topology: masterless
 protocols: [tcp]

@@ -115,8 +115,11 @@ FALSE_OUTPUTS = {
 }
 
 
-@pytest.mark.parametrize(("tool", "lie"), [(tool, lie) for tool, lies in FALSE_OUTPUTS.items() for lie in lies])
-def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str, lie: str) -> None:
+@pytest.mark.parametrize(
+    ("tool", "false_output"),
+    [(tool, false_output) for tool, false_outputs in FALSE_OUTPUTS.items() for false_output in false_outputs],
+)
+def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str, false_output: str) -> None:
     home, into, tools = (tmp_path / name for name in ("home", "into", "bin"))
     for folder in (home, into, tools):
         folder.mkdir()
@@ -124,7 +127,7 @@ def test_wrong_output_of_tools_on_a_robot_is_detected(tmp_path: Path, tool: str,
     jobs.install(robot, Deadline.after(30))
     evidence.begin(robot, FOLDER, "sender", "lo", need_kib=0)
     (home / FOLDER / "camera.bag").write_bytes(LARGE)
-    (tools / tool).write_text(f"#!/bin/sh\n{lie}\n", encoding="ascii")
+    (tools / tool).write_text(f"#!/bin/sh\n{false_output}\n", encoding="ascii")
     (tools / tool).chmod(0o755)
     with pytest.raises((EvidenceError, RobotError)):
         fetch(robot, into)

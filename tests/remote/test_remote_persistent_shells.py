@@ -63,14 +63,14 @@ class Robot:
 
     def shell_pid(self) -> int:
         """Return the pid of the persistent shell when it is open."""
-        found: list[int] = []
+        pids: list[int] = []
 
         def is_same_shell() -> bool:
-            found.append(self.pid())
-            return found[-2:-1] == found[-1:]
+            pids.append(self.pid())
+            return pids[-2:-1] == pids[-1:]
 
         wait_until(is_same_shell, soon())
-        return found[-1]
+        return pids[-1]
 
 
 @contextmanager

@@ -188,7 +188,7 @@ def test_sampling_interval_in_each_shell(shell: LocalShell, tmp_path: Path, word
     (folder / ".jobs" / "link").mkdir(parents=True)
     os.mkfifo(folder / ".jobs" / "link" / "end")
     (folder / ".began").write_text("- boot\n", encoding="ascii")
-    output_file = folder / "told"
+    output_file = folder / "output"
     with output_file.open("wb") as out:
         argv = (*words, str(shell.home / script.SCRIPT_PATH), "sample", "wlan0", "-")
         running = subprocess.Popen(argv, cwd=folder, stdout=out, env=os.environ | {"PATH": shell.path})

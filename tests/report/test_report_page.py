@@ -86,3 +86,12 @@ def test_page_has_no_external_references(page: str) -> None:
     outside = [value for name, value in elements.attributes if "//" in value and not name.startswith("xmlns")]
     assert outside == []
     assert not {"script", "iframe", "object", "img"} & set(elements.tags)
+
+
+@pytest.mark.parametrize("name", ["report.pdf", "figure.SVG"])
+def test_a_page_is_not_written_to_a_file_of_another_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    assert main(["report", str(tables.write(tmp_path, lawns.lawn(2))), "-o", str(tmp_path / name)]) == 2
+    assert "a report is a page of HTML" in capsys.readouterr().err
+    assert not (tmp_path / name).exists()

@@ -232,7 +232,7 @@ def test_summary_paragraph_has_counts_and_conditions(tmp_path: Path) -> None:
     assert paragraph == (
         "24 trials of los and nlos on 2026-11-21 12:00 UTC: 10ft to 55ft; "
         "TCP and UDP; master and masterless; emulated and field robots. 192 attempts: 176 valid, 16 void. "
-        "All figures are of the valid ones."
+        "All figures use only the valid ones."
     )
 
 

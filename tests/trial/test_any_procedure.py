@@ -230,7 +230,7 @@ def judge(steps: list[Any], protocol: Protocol, loss: float, seed: int) -> None:
         return
     with tempfile.TemporaryDirectory() as folder:
         repeat = RepeatId(protocol, 1)
-        truth = Attempt(plan, repeat, Path(folder), loss, random.Random(seed)).play()
+        truth = Attempt(plan, repeat, Path(folder), loss, random.Random(seed)).write_evidence_of_steps()
         verdict = gates.judge(plan, repeat, AttemptEvidence(Path(folder)))
     assert verdict.problems == ()
     OUTCOMES["valid"] += 1

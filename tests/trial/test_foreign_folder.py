@@ -160,12 +160,12 @@ def test_a_file_that_is_replaced_is_never_what_a_link_leads_to(tmp_path: Path, f
 
 
 def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> None:
-    strange = ["a\nb.txt", "back\\slash", "re\rturn"]
-    for name in strange:
+    unusual_names = ["a\nb.txt", "back\\slash", "re\rturn"]
+    for name in unusual_names:
         (trial / "repeats/udp-01" / name).write_text("x", encoding="utf-8")
     Path(os.fsdecode(os.fsencode(trial / "repeats/udp-01") + b"/\xff.txt")).write_text("x", encoding="utf-8")
     lines = verification.verify(trial)
-    assert len(lines) == len(strange) + 1
+    assert len(lines) == len(unusual_names) + 1
     assert all(line.isprintable() and line.endswith(": not in the manifest") for line in lines)
     (trial / store.MANIFEST_FILE).unlink()
     ledger = Ledger(plans.read_plan(trial), trial, Stop())
@@ -174,7 +174,7 @@ def test_names_that_are_not_text_are_written_as_by_sha256sum(trial: Path) -> Non
     assert os.system(f"cd '{trial}' && sha256sum --check --quiet MANIFEST.sha256") == 0
 
 
-def lie(trial: Path, *entries: JournalEntry) -> None:
+def false_journal(trial: Path, *entries: JournalEntry) -> None:
     journal.append(trial, *entries)
 
 
@@ -196,7 +196,9 @@ RUNNING, VALID, VOID, MEASURED = Status.RUNNING, Status.VALID, Status.VOID, Stat
 def test_a_contradictory_journal_is_reported_with_its_line(
     trial: Path, entries: list[tuple[int, int, Status]], reason: str
 ) -> None:
-    lie(trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries))
+    false_journal(
+        trial, *(JournalEntry(1, Protocol.UDP, number, attempt, status) for number, attempt, status in entries)
+    )
     for read in (rebuild, lambda folder: Ledger(plans.read_plan(folder), folder, Stop())):
         with pytest.raises(EvidenceError, match=f"impossible entry: {reason}") as caught:
             read(trial)

@@ -13,7 +13,7 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.positions import position_columns, position_sources
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.positions.samples import LOCAL, WGS84
-from fieldkit.steps.kinds import follow
+from fieldkit.steps import position_recording
 from fieldkit.steps.view import View
 from fieldkit.trial import placements
 from tests.helpers.casts import los_plan
@@ -84,7 +84,7 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     evidence = write_sources(
         tmp_path, PositionSource(place=(x + off_m, y, z)), PositionSource(place=places_m[Role.SENDER])
     )
-    problems = list(follow.problems(View(SCENE, evidence), ()))
+    problems = list(position_recording.problems(View(SCENE, evidence), ()))
     assert (
         (problems == []) if expected_reason is None else [expected_reason in reason for reason in problems] == [True]
     )

@@ -148,8 +148,8 @@ def test_a_handshake_missing_in_one_capture(tcp: Attempt, role: str, reason: str
     demand(tcp, reason)
 
 
-@pytest.mark.parametrize(("calls", "is_told"), [(1, True), (2, False)])
-def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: bool) -> None:
+@pytest.mark.parametrize(("calls", "is_reported"), [(1, True), (2, False)])
+def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_reported: bool) -> None:
     """An immediate refusal: no listener; a refusal after lost calls: perhaps the listener was at its time limit."""
 
     def with_reset(packets: list[Packet]) -> list[Packet]:
@@ -161,7 +161,7 @@ def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_told: boo
         tcp.capture(role, with_reset)
     tcp.file("recv.bag", lambda _: b"")
     message = "the receiver refused the connection: no program listened when the sender started"
-    assert (message in " ".join(tcp.problems())) == is_told
+    assert (message in " ".join(tcp.problems())) == is_reported
 
 
 def test_a_bag_that_is_missing_contradicts_nothing(attempt: Attempt) -> None:

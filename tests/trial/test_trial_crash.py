@@ -110,7 +110,7 @@ def read_once(path: Path) -> schema.Document:
     return parsed_once(path.read_text(encoding="utf-8"), str(path))
 
 
-def die(call: Callable[..., object], *words: object) -> None:
+def exit_after_kill(call: Callable[..., object], *words: object) -> None:
     """Exit like after kill -9, with half of the data of a journal entry on disk."""
     if call is WRITE:
         descriptor, data = words
@@ -120,12 +120,12 @@ def die(call: Callable[..., object], *words: object) -> None:
     os._exit(KILLED)
 
 
-def be_told(_call: Callable[..., object], *_words: object) -> None:
+def receive_stop_signal(_call: Callable[..., object], *_words: object) -> None:
     """Receive a request to stop immediately, as from a second Ctrl-C."""
     signal.raise_signal(signal.SIGTERM)
 
 
-def at_write(moment: int, befalls: Callable[..., None]) -> None:
+def call_at_write(moment: int, event: Callable[..., None]) -> None:
     """Let an event happen to this process at its `moment`-th write, for the rest of its life."""
     count = 0
 
@@ -134,7 +134,7 @@ def at_write(moment: int, befalls: Callable[..., None]) -> None:
             nonlocal count
             count += 1
             if count == moment:
-                befalls(call, *words)
+                event(call, *words)
             return None if call is FSYNC else call(*words, **options)  # a kill of a process does not affect the disk
 
         return counted
@@ -143,13 +143,13 @@ def at_write(moment: int, befalls: Callable[..., None]) -> None:
         setattr(os, name, watched(getattr(os, name)))
 
 
-def run(out: Path, moment: int = 0, befalls: Callable[..., None] = die) -> bool:
+def run(out: Path, moment: int = 0, event: Callable[..., None] = exit_after_kill) -> bool:
     """Start or resume the trial in `out` in a separate process; return True if it ended normally."""
     pid = os.fork()
     if pid == 0:
         code = 1
         try:
-            at_write(moment, befalls)
+            call_at_write(moment, event)
             with interruptible() as stop:
                 if any(out.glob("*/trial.yaml")):
                     resume_trial(trial_of(out), IdleTestbed(), lambda _: None, stop)
@@ -177,7 +177,7 @@ def trial_of(out: Path) -> Path:
     return path.parent
 
 
-def demand_agreement(folder: Path) -> None:
+def assert_consistent(folder: Path) -> None:
     """Check that a trial's files are consistent."""
     assert verification.verify(folder) == []
     before = {name: (folder / name).read_bytes() for name in ("trial.csv", "summary.csv")}
@@ -185,7 +185,7 @@ def demand_agreement(folder: Path) -> None:
     assert {name: (folder / name).read_bytes() for name in before} == before
 
 
-def demand_whole(out: Path) -> None:
+def assert_complete(out: Path) -> None:
     """Check the properties of every finished trial."""
     folder = trial_of(out)
     entries = journal.ended(journal.read(folder))
@@ -197,7 +197,7 @@ def demand_whole(out: Path) -> None:
     assert sorted(path.name for path in (folder / "repeats").iterdir()) == sorted(
         attempt.folder for attempt in entries
     )
-    demand_agreement(folder)
+    assert_consistent(folder)
     assert all(
         problems(plan(), attempt.repeat.protocol, folder / "repeats" / attempt.folder) == ()
         for attempt in entries
@@ -212,9 +212,9 @@ def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, monkeypat
     moments = 1 - stride
     while not run(out, moments := moments + stride):
         assert run(out)
-        demand_whole(out)
+        assert_complete(out)
         shutil.rmtree(out)
-    demand_whole(out)
+    assert_complete(out)
     assert moments > 40, "too few writes were interrupted"
 
 
@@ -223,11 +223,11 @@ def test_a_stop_at_any_write_is_recovered(stride: int, tmp_path: Path, monkeypat
     robots_with_evidence(monkeypatch)
     out = tmp_path / "trials"
     moments = 1 - stride
-    while not run(out, moments := moments + stride, be_told):
+    while not run(out, moments := moments + stride, receive_stop_signal):
         if any(out.glob(f"*/{store.MANIFEST_FILE}")):
-            demand_agreement(trial_of(out))
+            assert_consistent(trial_of(out))
         assert run(out)
-        demand_whole(out)
+        assert_complete(out)
         shutil.rmtree(out)
     assert moments > 40, "too few writes were interrupted"
 
@@ -242,5 +242,5 @@ def test_a_kill_during_recovery_is_recovered(
     for moment in moments:
         run(out, moment)
     assert run(out)
-    demand_whole(out)
+    assert_complete(out)
     shutil.rmtree(out)

@@ -134,10 +134,10 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
     chance = random.Random(seed)
     with tempfile.TemporaryDirectory() as place:
         attempt = of(protocol, Path(place))
-        aside = [
+        echoes = [
             _changed(changed_packet, 24, b"\x12\x34") for changed_packet in _waiting(attempt, "sender", _is_echo)
         ]
-        strays = [
+        stray_packets = [
             _changed(packet, 20, b"\x04\x00")
             for packet in _waiting(attempt, "sender", lambda packet: not _is_icmp(packet) and not _is_load(packet))
         ] if protocol is Protocol.TCP else []  # fmt: skip
@@ -148,8 +148,8 @@ def test_losses_and_packets_at_capture_edges_are_of_this_attempt(protocol: Proto
             return [packet for packet in packets if packet in own_packets or chance.random() >= lost]
 
         cut = chance.randrange(3)
-        sent = [*carried(sent, "sender"), *aside[1:]]
-        received = [*strays[:2], *aside[:2], *carried(received, "receiver")]
+        sent = [*carried(sent, "sender"), *echoes[1:]]
+        received = [*stray_packets[:2], *echoes[:2], *carried(received, "receiver")]
         replies = _own_packets(received, "receiver", _is_icmp)
         late = replies[len(replies) - cut :]
         attempt.capture("sender", lambda _: sent)

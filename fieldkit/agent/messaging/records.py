@@ -1,4 +1,6 @@
-"""The log of a publisher or subscriber: a magic number and records of fixed size. No record is lost by a kill.
+"""The log of a publisher or subscriber: a magic number and records of fixed size.
+
+No record is lost if the program is killed.
 
 The log is mapped into memory. Data in the mapping survive the process, like data passed to `write`, but a store needs
 no system call, so that logging does not delay samples. The file grows in pieces. A piece is allocated on disk before

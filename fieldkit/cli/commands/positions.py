@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             arguments.trial,
             files,
             offset_s=_offset_s(arguments.offset),
-            gap_s=parse_duration_s(arguments.gap),
+            gap_s=parse_duration_s(arguments.gap, "--gap"),
             heights=arguments.heights,
         )
         print_text(f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before")
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _offset_s(text: str) -> float:
     text = text.strip()
-    offset_s = parse_duration_s(text.removeprefix("-"))
+    offset_s = parse_duration_s(text.removeprefix("-"), "--offset")
     return -offset_s if text.startswith("-") else offset_s
 
 

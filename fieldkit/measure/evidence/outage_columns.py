@@ -8,6 +8,11 @@ from fieldkit.core.model import FaultKind
 _KINDS_IN_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind.REBOOT, FaultKind.KILL)
 
 
+def _recovered_state(kind: FaultKind) -> str:
+    """Return the state of a robot or process that has recovered, for labels."""
+    return "process runs" if kind is FaultKind.KILL else "reachable"
+
+
 def _observer(kind: FaultKind) -> str:
     """Return the name of the observer of an outage: `process` for a killed process, otherwise `ping`."""
     return "process" if kind is FaultKind.KILL else "ping"
@@ -20,7 +25,7 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
     bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
     index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
-    recovered = Figure(f"{_observer(kind)} back after {kind}", Kind.FLAG, rank=70 + index)
+    recovered = Figure(f"{_recovered_state(kind)} after {kind}", Kind.FLAG, rank=70 + index)
     recovery = Figure(f"{_observer(kind)} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=bound)
     times = columns(
         90,

@@ -152,7 +152,7 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
         "drive_back_turned_rad": None if home is None else home.yaw_rad,
         "drive_ended": log[-1].ended or None,
     }
-    return Measured.from_optional(values, "the log ends before that")
+    return Measured.from_optional(values, "the log has no line of this phase of the drive")
 
 
 def speeds_m_s(log: Sequence[DriveMoment]) -> list[float]:

@@ -130,4 +130,4 @@ def measure(log: Sequence[FlightMoment] | None) -> Measured:
         "fly_speed_max_m_s": max(moment.speed_m_s for moment in log),
         "fly_back_off_m": log[-1].off_m if log[-1].phase == _LAST_PHASE else None,
     }
-    return Measured.from_optional(values, "the log ends before that")
+    return Measured.from_optional(values, "the log has no line of this phase of the flight")

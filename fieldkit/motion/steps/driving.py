@@ -25,7 +25,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.ros.middlewares.middleware import MiddlewareName
 from fieldkit.steps import agent_commands
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Planned, Refusal, Scene
+from fieldkit.steps.scene import BY_EXIT, BY_FIELDKIT, Planned, Refusal, Scene
 
 ODOMETRY_S: Final = 0.5
 """The robot stops if it receives no odometry for this time."""
@@ -95,7 +95,7 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         ready="log:up,",
     )
     program = robot.profile.tools.python
-    return Planned(move.role, job, program=program, setup=setup, permitted_causes=BY_ITSELF | BY_FIELDKIT)
+    return Planned(move.role, job, program=program, setup=setup, permitted_causes=BY_EXIT | BY_FIELDKIT)
 
 
 def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:

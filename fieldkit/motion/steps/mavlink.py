@@ -25,10 +25,9 @@ from fieldkit.motion.profile_sections import mavlink_of
 from fieldkit.motion.steps.link_need import link_need
 from fieldkit.remote import agent
 from fieldkit.remote.jobs import Job
-from fieldkit.steps import agent_commands
+from fieldkit.steps import agent_commands, position_recording
 from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import ChecksPlacement, HasNeeds, SendsTraffic, Summarizes, UsesSpace, WritesOnLaptop
-from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Flow, Need, Planned, Scene
 from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
@@ -138,7 +137,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             folder=scene.folder,
             name=self.prefixed_name("mavlink"),
             argv=agent_commands.agent_command(robot, "mavlink", agent_commands.compact(arguments), self._file),
-            limit_s=follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
+            limit_s=position_recording.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene)),
             log=self._log,
             stdout=self._counters_file,
             ready="log:up,",
@@ -173,7 +172,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         agent.install(testbed.shells[self.recorder])
         announce("record MAVLink", None)
-        ((planned, code),) = follow.run_while_recording(
+        ((planned, code),) = position_recording.run_while_recording(
             self,
             scene,
             testbed,
@@ -199,7 +198,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             system=self.system,
         )
         return PositionSources(
-            {**follow.stationary_robots(self, scene), self.robot: position_source}, offsets, self.heights
+            {**position_recording.stationary_robots(self, scene), self.robot: position_source}, offsets, self.heights
         )
 
     @override
@@ -248,7 +247,9 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
-        return None if self.positions is None else follow.placement_error("mavlink with positions", within)
+        return (
+            None if self.positions is None else position_recording.placement_error("mavlink with positions", within)
+        )
 
     @override
     def check(self, view: View) -> Iterator[str]:
@@ -272,7 +273,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             elif name not in log.kinds:
                 yield f"{self._file}: no {name}, which was requested"
         if self.positions:
-            yield from follow.problems(view, (self.robot,))
+            yield from position_recording.problems(view, (self.robot,))
 
     def places_m(self, view: View) -> Floats:
         """Return the positions in the messages LOCAL_POSITION_NED: metres north, east and up. Shape (n, 3)."""
@@ -291,7 +292,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        return (*tlog.COLUMNS, *(follow.COLUMNS if self.positions else ()))
+        return (*tlog.COLUMNS, *(position_recording.COLUMNS if self.positions else ()))
 
     @override
     def measure(self, view: View) -> Measured:
@@ -301,7 +302,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             )
         except EvidenceError:
             measured = tlog.measure(None)
-        return measured | follow.measure(view) if self.positions else measured
+        return measured | position_recording.measure(view) if self.positions else measured
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

@@ -29,7 +29,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.remote.shell import Shell
 from fieldkit.steps import agent_commands
-from fieldkit.steps.scene import BY_ITSELF, Planned, Scene
+from fieldkit.steps.scene import BY_EXIT, Planned, Scene
 
 LEASE_S: Final = 15.0
 """Default time for which a drone continues without contact to the laptop."""
@@ -78,7 +78,7 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
     argv = agent_commands.agent_command(robot, "fly", agent_commands.compact(asdict(complete_plan)))
     log = f"{name}.log"
     job = Job(folder=scene.folder, name=name, argv=argv, limit_s=limit_s, log=log, ready=f"log:{READY}")
-    return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_ITSELF)
+    return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_EXIT)
 
 
 def guard(

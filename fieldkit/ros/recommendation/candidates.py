@@ -169,7 +169,7 @@ def assess_candidate(
 
 def _reason(judgement: Judgement) -> str:
     """Return the reason why a judgement does not hold, with the measured values."""
-    unknown, expectation_text = judgement.why or "not shown", judgement.expectation.text
+    unknown, expectation_text = judgement.why or "undecided", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
         return f"{expectation_text}: {unknown}"
     why = f"; {judgement.why}" if judgement.why else ""

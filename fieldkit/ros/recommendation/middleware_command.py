@@ -74,7 +74,7 @@ def recommend(arguments: argparse.Namespace) -> int:
     criterion = LinkCriterion(
         max_loss=_parse_share(arguments.max_loss, "--max-loss"),
         max_delay_s=None if arguments.max_delay is None else parse_amount(arguments.max_delay, "s", "--max-delay"),
-        size_bytes=None if arguments.size is None else parse_quantity(arguments.size, BYTES_PER_UNIT, "size"),
+        size_bytes=None if arguments.size is None else parse_quantity(arguments.size, BYTES_PER_UNIT, "--size"),
         repeats=arguments.repeats,
         share=None if arguments.share is None else _parse_share(arguments.share, "--share", maximum=MAX_SHARE),
     )

@@ -31,7 +31,7 @@ from fieldkit.steps.capabilities import (
     UsesSpace,
 )
 from fieldkit.steps.scene import (
-    BY_ITSELF,
+    BY_EXIT,
     BY_LIMIT,
     Announce,
     CommandResult,
@@ -146,7 +146,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
             program=ros.command.record[0],
             setup=ros.command.setup,
             tool=Tool.RECORDER,
-            permitted_causes=BY_ITSELF if has_duration else BY_LIMIT,
+            permitted_causes=BY_EXIT if has_duration else BY_LIMIT,
             least_s=self.duration,
         )
 

@@ -22,8 +22,8 @@ from fieldkit.steps import agent_commands
 from fieldkit.steps.along import AlongStep
 from fieldkit.steps.capabilities import HasNeeds, Listens, Prepares, SendsTraffic, Summarizes, UsesSpace
 from fieldkit.steps.scene import (
+    BY_EXIT,
     BY_FIELDKIT,
-    BY_ITSELF,
     Announce,
     Flow,
     ListeningPort,
@@ -107,7 +107,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         )
         setup, program = agent_commands.setup(robot), robot.profile.tools.python
         return Planned(
-            role, job, program=program, setup=setup, permitted_causes=BY_ITSELF if publishes else BY_FIELDKIT
+            role, job, program=program, setup=setup, permitted_causes=BY_EXIT if publishes else BY_FIELDKIT
         )
 
     def _server(self, scene: Scene, role: Role) -> Planned:

@@ -19,6 +19,7 @@ from fieldkit.measure.positions import position_checks, position_sources, sample
 from fieldkit.measure.positions.position_sources import PositionSource, PositionSources
 from fieldkit.measure.robot_clock import Offset
 from fieldkit.ros.steps.record import SUBSCRIBE_S, RecordStep
+from fieldkit.steps import position_recording
 from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import (
     ChecksPlacement,
@@ -29,7 +30,6 @@ from fieldkit.steps.capabilities import (
     UsesSpace,
     WritesOnLaptop,
 )
-from fieldkit.steps.kinds import follow
 from fieldkit.steps.nest import Nest
 from fieldkit.steps.scene import BY_FIELDKIT, Announce, Need, Planned, Refusal, Scene
 from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
@@ -148,7 +148,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
 
     def _recordings(self, scene: Scene) -> list[Planned]:
         """Return the jobs that record the topics until they are stopped."""
-        limit_s = follow.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
+        limit_s = position_recording.LIMIT_S + sum(planned.job.limit_s for planned in self.inside(scene))
         return [self._recording(scene, recorder) for recorder in self._recorders(limit_s).values()]
 
     def _recording(self, scene: Scene, recorder: RecordStep) -> Planned:
@@ -182,7 +182,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """Run the steps inside while the topics are recorded; `check` reads the bags, so exit codes are ignored."""
         announce("record positions", None)
-        follow.run_while_recording(
+        position_recording.run_while_recording(
             self,
             scene,
             testbed,
@@ -205,7 +205,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     def _position_sources(self, scene: Scene, began_utc_ns: int, offsets: Mapping[Role, Offset]) -> PositionSources:
         """Return the sources of the robots' positions in an attempt."""
         places_m = scene.places_m
-        sources = dict(follow.stationary_robots(self, scene))
+        sources = dict(position_recording.stationary_robots(self, scene))
         for role, tracked in self.robots.items():
             if tracked.at is not None:
                 sources[role] = tracked.at.position_source
@@ -268,20 +268,20 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         if any(isinstance(step, TrackStep) for step in earlier):
             return "a repeat can have only one track: list all robots in it, and put all steps into it"
-        return follow.placement_error("track", within)
+        return position_recording.placement_error("track", within)
 
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield the reasons why the recorded positions cannot be used."""
-        yield from follow.problems(view, list(self._recorders(1.0)))
+        yield from position_recording.problems(view, list(self._recorders(1.0)))
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        return follow.COLUMNS
+        return position_recording.COLUMNS
 
     @override
     def measure(self, view: View) -> Measured:
-        return follow.measure(view)
+        return position_recording.measure(view)
 
     @override
     def expected_s(self, protocol: Protocol) -> float:

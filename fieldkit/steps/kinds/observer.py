@@ -8,7 +8,7 @@ from fieldkit.core.model import Fault, FaultKind, Role
 from fieldkit.measure.evidence import outage
 from fieldkit.remote.jobs import Job
 from fieldkit.steps.kinds import ping
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF_OR_LIMIT, Planned, Scene
+from fieldkit.steps.scene import BY_EXIT_OR_LIMIT, BY_FIELDKIT, Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 RECOVERED_S: Final = 1.0
@@ -105,7 +105,7 @@ class Observer:
             log=step_prefixed(self.name, outage.log_file(self.fault.kind)),
             stdout=step_prefixed(self.name, outage.note_file(self.fault.kind)),
         )
-        return Planned(self.role, job, program="grep", permitted_causes=BY_ITSELF_OR_LIMIT)
+        return Planned(self.role, job, program="grep", permitted_causes=BY_EXIT_OR_LIMIT)
 
     @property
     def _is_kill(self) -> bool:

@@ -20,7 +20,7 @@ from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import Listens, SendsTraffic
 from fieldkit.steps.loads import PROGRAM, LoadOptions
 from fieldkit.steps.nest import Nest
-from fieldkit.steps.scene import BY_FIELDKIT, BY_ITSELF, Announce, Flow, ListeningPort, Planned, Scene
+from fieldkit.steps.scene import BY_EXIT, BY_FIELDKIT, Announce, Flow, ListeningPort, Planned, Scene
 from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
@@ -79,7 +79,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
                 ),
                 program=PROGRAM,
                 # The server exits after its client.
-                permitted_causes=BY_FIELDKIT | (BY_ITSELF if role == self.receiver else frozenset()),
+                permitted_causes=BY_FIELDKIT | (BY_EXIT if role == self.receiver else frozenset()),
             )
             for role, (argv, ready) in ends.items()
         )

@@ -44,7 +44,7 @@ from fieldkit.steps.capabilities import (
 from fieldkit.steps.nest import Nest, flows_inside
 from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import (
-    BY_ITSELF_OR_LIMIT,
+    BY_EXIT_OR_LIMIT,
     Announce,
     Flow,
     ListeningPort,
@@ -174,7 +174,7 @@ class TransferStep(
             ),
             program=listener,
             tool=Tool.NETCAT,
-            permitted_causes=BY_ITSELF_OR_LIMIT,
+            permitted_causes=BY_EXIT_OR_LIMIT,
         )
         yield Planned(
             self.sender,
@@ -188,7 +188,7 @@ class TransferStep(
             ),
             program=sender,
             tool=Tool.NETCAT,
-            permitted_causes=BY_ITSELF_OR_LIMIT,
+            permitted_causes=BY_EXIT_OR_LIMIT,
         )
 
     @override

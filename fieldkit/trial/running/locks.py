@@ -27,7 +27,7 @@ _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of a lock on robots, and its purpose. Of each text, at most 80 letters, digits and `._@-` are used.
+    """Holder of a lock on robots, and its purpose. At most 80 letters, digits and `._@-` of each text are used.
 
     Attributes:
         token: Identifies the trial; a holder with the same token can lock its robots again.

@@ -1,4 +1,7 @@
-"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot; bytes are reproduced."""
+"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot.
+
+The same version of fieldkit gives the same bytes.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +25,7 @@ class Rebuilt:
         cells: The summary.
         changed: Files whose bytes differ from before, or that were missing.
         expected: Names of the quantities that have an expectation.
-        has_manifest: Whether there is a manifest, so that the evidence was verified to be unchanged.
+        has_manifest: Whether there is a manifest, with which the evidence was verified.
     """
 
     cells: tuple[Cell, ...]

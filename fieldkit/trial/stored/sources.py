@@ -122,7 +122,7 @@ class Sources:
         """
         if name not in self.quantities:
             raise ConfigurationError(
-                f"{option}: repeats are not aggregated over {name!r}",
+                f"{option}: there is no quantity {name!r}",
                 remedy=did_you_mean(name, self.quantities, f"it is one of: {', '.join(self.quantities)}"),
             )
         return self.quantities[name]
@@ -275,7 +275,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
     folders = trial_folders(path)
     if not folders:
         raise ConfigurationError(
-            "no trial is there or below",
+            "there is no trial in this folder or its subfolders",
             where=str(path),
             remedy=f"name the folder that trials are in, or CSV files: {shell_command(path)}/*.csv",
         )

@@ -115,7 +115,7 @@ def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[floa
     """
     if not arguments.windows:
         return [chosen.policy.window]
-    windows = sorted({parse_duration_s(text) for text in arguments.windows.split(",")})
+    windows = sorted({parse_duration_s(text, "--window") for text in arguments.windows.split(",")})
     if windows[0] <= 0:
         raise ConfigurationError(
             f"--window: {arguments.windows!r} has a window that is not above 0", remedy="--window 1ms,10ms,100ms"
@@ -170,7 +170,7 @@ def deadline_s(text: str | None) -> float:
     """
     if text is None:
         return DEADLINE_S
-    seconds = parse_duration_s(text)
+    seconds = parse_duration_s(text, "--deadline")
     if seconds <= 0:
         raise ConfigurationError(f"--deadline: {text} is not above 0", remedy="write for example --deadline 30s")
     return seconds
@@ -193,7 +193,7 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
         factor = math.nan
     if not 0 < factor < math.inf:
         raise ConfigurationError(f"--realtime: {text!r} is not a number above 0", remedy="--realtime 1")
-    bound_s = LATE_BOUND_S if bound is None else parse_duration_s(bound)
+    bound_s = LATE_BOUND_S if bound is None else parse_duration_s(bound, "--late-bound")
     if bound_s <= 0:
         raise ConfigurationError(f"--late-bound: {bound} is not above 0", remedy="--late-bound 100ms")
     return Pace(factor, bound_s)

@@ -273,7 +273,7 @@ class Captures:
 
 
 def between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
-    """Return a capture of the packets of another capture with times from `begin_ns` until before `end_ns`.
+    """Return a capture with the packets of another capture from `begin_ns` to `end_ns`, without the latter.
 
     Args:
         capture: The content of the file.

@@ -78,7 +78,7 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "reason why the packet never arrived; empty if it did, or was under way at the end",
             ),
             _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
-            *_end_fields("known", "as the network knew it when the packet entered:"),
+            *_end_fields("known", "as the network assumed it when the packet entered:"),
             *_end_fields("true", "true value when the packet was sent:"),
         ]
     ),

@@ -118,7 +118,7 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
         system=drone.system,
         limits=FlightLimits(drone.max_speed_m_s, drone.max_height_m or DEFAULT_M[0], drone.fence_m or DEFAULT_M[1]),
         airframe_limits=quadrotor(drone.profile),
-        obstacles=Ground(world, None).around,
+        obstacles=Ground(world, None).obstacles,
         now_ns=power_on_ns,
         boot_s=drone.boot_s,
         make_airframe=None if drone.physics is None else simulated_airframe(drone.profile, drone.physics, reporter),

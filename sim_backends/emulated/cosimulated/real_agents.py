@@ -48,11 +48,11 @@ class Devices(Protocol):
         ...
 
     def first_ns(self) -> int | None:
-        """Return the time of the first packet that `packets` has not returned yet, or None."""
+        """Return the time of the first packet that `pop_packets` has not returned yet, or None."""
         ...
 
     def pop_packets(self, last_ns: int) -> list[RealPacket]:
-        """Return the packets that were read up to a time and not taken before, in order of time."""
+        """Remove and return the packets that were read up to a time, in order of time."""
         ...
 
     def receivers(self, source: str) -> Sequence[str]:

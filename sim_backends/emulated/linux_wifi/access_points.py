@@ -125,5 +125,5 @@ class AccessPoints:
 def configuration(interface: str, wifi: WifiSpec, number: int) -> str:
     """Return the configuration of hostapd for the access point of this number in a network with a bridge."""
     interval_tu = _BEACON_INTERVALS_TU[number % len(_BEACON_INTERVALS_TU)]
-    common = wireless.configuration(interface, replace(wifi, part="access point"))
+    common = wireless.configuration(interface, replace(wifi, mode="access point"))
     return f"{common}bridge={BRIDGE}\nbeacon_int={interval_tu}\n"

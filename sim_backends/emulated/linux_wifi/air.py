@@ -144,7 +144,7 @@ class _Channel:
 
     Attributes:
         frames: Frames whose status is not known, by identity.
-        events: Events since the last call of `take_events`.
+        events: Events since the last call of `pop_events`.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class _Channel:
     def next_event_ns(self) -> int | None:
         return self._wifi.next_event_ns()
 
-    def take_events(self, now_ns: int) -> AirEvents:
+    def pop_events(self, now_ns: int) -> AirEvents:
         for at_ns, name, frame, source, _ in self._wifi.deliveries(now_ns):
             signal_dbm = self.signal_dbm(self._index[source], self._index[name], at_ns)
             self.events.receptions.append(FrameReception(name, frame, frame.mode, signal_dbm))
@@ -278,11 +278,11 @@ class Air:
         times = [at_ns for channel in self._channels.values() if (at_ns := channel.next_event_ns()) is not None]
         return min(times, default=None)
 
-    def take_events(self, now_ns: int) -> AirEvents:
+    def pop_events(self, now_ns: int) -> AirEvents:
         """Return the events up to `now_ns` that were not returned before; receptions of a channel are in order."""
         events = AirEvents()
         for channel in self._channels.values():
-            new = channel.take_events(now_ns)
+            new = channel.pop_events(now_ns)
             events.receptions += new.receptions
             events.statuses += new.statuses
         return events

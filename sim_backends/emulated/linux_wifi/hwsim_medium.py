@@ -102,7 +102,7 @@ class HwsimMedium:
 
     def replies(self, now_ns: int) -> list[bytes]:
         """Return the messages for the kernel that are due at `now_ns`, in order."""
-        events = self.air.take_events(now_ns)
+        events = self.air.pop_events(now_ns)
         messages = [self._received(reception) for reception in events.receptions]
         messages += [self._status(frame) for frame in events.statuses]
         return [message for message in messages if message is not None]

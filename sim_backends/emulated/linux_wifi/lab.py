@@ -37,7 +37,7 @@ def parts(
         return dict.fromkeys(robots, replace(station, background_scan=scan, channels=roaming.channels))
     if Role.RELAY not in robots:
         return dict.fromkeys(robots, WifiSpec("ad hoc", has_monitor=settings.monitor))
-    return {key: replace(station, part="access point") if key == Role.RELAY else station for key in robots}
+    return {key: replace(station, mode="access point") if key == Role.RELAY else station for key in robots}
 
 
 def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict[str, HwsimRadio]:

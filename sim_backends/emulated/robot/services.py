@@ -164,9 +164,9 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
 def _network_services(spec: RobotSpec) -> Iterator[Service]:
     """Yield the programs of the robot's radio: hostapd or wpa_supplicant, and the routing daemon of a mesh."""
     wifi = spec.wifi
-    if wifi is not None and wifi.part in wireless.PROGRAMS:
+    if wifi is not None and wifi.mode in wireless.PROGRAMS:
         argv = wireless.command(spec.interface, wifi)
-        yield _program(wireless.PROGRAMS[wifi.part], argv, {}, partial(wireless.is_connected, wifi))
+        yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
         argv = network.command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))
         yield _program("babeld", argv, {}, network.PID.exists)

@@ -86,7 +86,7 @@ class WifiSpec:
     """The Wi-Fi of Linux on a robot.
 
     Attributes:
-        part: `ad hoc`, `mesh point`, `access point` or `station`.
+        mode: `ad hoc`, `mesh point`, `access point` or `station`.
         passphrase: Passphrase of the access point; empty without one.
         security: Security of the access point.
         has_monitor: True if the robot has a monitor interface.
@@ -94,7 +94,7 @@ class WifiSpec:
         channels: Number of channels of the 2.4 GHz band, from the first, that a station scans.
     """
 
-    part: Literal["ad hoc", "mesh point", "access point", "station"]
+    mode: Literal["ad hoc", "mesh point", "access point", "station"]
     passphrase: str = ""
     security: Literal["wpa2", "wpa3"] = "wpa2"
     has_monitor: bool = False
@@ -211,7 +211,7 @@ class RobotSpec:
     @property
     def waits_for_another(self) -> bool:
         """True if its startup waits for another robot: its ROS master, its Zenoh router or its access point."""
-        joins = self.wifi is not None and self.wifi.part == "station"
+        joins = self.wifi is not None and self.wifi.mode == "station"
         return self.shares_master or bool(self.ros2 and self.ros2.router) or joins
 
     @property

@@ -72,7 +72,7 @@ _INTERFACE_TYPES: Final = {"ad hoc": "ibss", "mesh point": "mp"}
 
 _CONFIGURATION: Final = Path(STATE, "wifi.conf")
 PROGRAMS: Final = {"access point": "hostapd", "station": "wpa_supplicant"}
-"""Program of each part that needs one."""
+"""Program of each mode that needs one."""
 _CONNECTED: Final = {"access point": "AP-ENABLED", "station": "CTRL-EVENT-CONNECTED"}
 
 
@@ -83,7 +83,7 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
         device: Present name of the interface.
         interface: Its new name.
         address: Its address with the prefix length.
-        wifi: Part of the robot in the Wi-Fi network; its program is started later.
+        wifi: Mode of the robot in the Wi-Fi network; the program of this mode is started later.
 
     Raises:
         RobotError: A tool rejected a setting.
@@ -92,8 +92,8 @@ def bring_up(device: str, interface: str, address: str, wifi: WifiSpec) -> None:
     if device != interface:
         network.run_ip(f"link set {device} name {interface}")
     _run("nft", "-f", "-", text=_PRIORITY_RULE)
-    if wifi.part in _INTERFACE_TYPES:
-        _run("iw", "dev", interface, "set", "type", _INTERFACE_TYPES[wifi.part])
+    if wifi.mode in _INTERFACE_TYPES:
+        _run("iw", "dev", interface, "set", "type", _INTERFACE_TYPES[wifi.mode])
     network.configure(interface, address)
     rejoin(interface, wifi)
     if wifi.has_monitor:
@@ -107,22 +107,22 @@ def rejoin(interface: str, wifi: WifiSpec) -> None:
     Raises:
         RobotError: The kernel rejected it.
     """
-    if wifi.part in _JOIN:
-        _run("iw", "dev", interface, *_JOIN[wifi.part])
+    if wifi.mode in _JOIN:
+        _run("iw", "dev", interface, *_JOIN[wifi.mode])
 
 
 def command(interface: str, wifi: WifiSpec) -> tuple[str, ...]:
     """Write the configuration of the robot's hostapd or wpa_supplicant, and return its command line."""
     _CONFIGURATION.touch(mode=0o600)
     _CONFIGURATION.write_text(configuration(interface, wifi), encoding="ascii")
-    program = PROGRAMS[wifi.part]
-    options = () if wifi.part == "access point" else ("-i", interface, "-c")
+    program = PROGRAMS[wifi.mode]
+    options = () if wifi.mode == "access point" else ("-i", interface, "-c")
     return (shutil.which(program) or program, *options, str(_CONFIGURATION))
 
 
 def configuration(interface: str, wifi: WifiSpec) -> str:
     """Return the configuration of hostapd for an access point, and of wpa_supplicant for a station."""
-    template = _ACCESS_POINT if wifi.part == "access point" else _STATION
+    template = _ACCESS_POINT if wifi.mode == "access point" else _STATION
     return template.format(
         interface=interface,
         ssid=SSID,
@@ -139,8 +139,8 @@ def configuration(interface: str, wifi: WifiSpec) -> str:
 
 def is_connected(wifi: WifiSpec) -> bool:
     """Return True if the robot's program has reported that its access point is on, or that it is connected."""
-    log = Path(STATE, f"{PROGRAMS[wifi.part]}.log")
-    return log.exists() and _CONNECTED[wifi.part] in log.read_text(encoding="utf-8", errors="replace")
+    log = Path(STATE, f"{PROGRAMS[wifi.mode]}.log")
+    return log.exists() and _CONNECTED[wifi.mode] in log.read_text(encoding="utf-8", errors="replace")
 
 
 def _run(*argv: str, text: str = "") -> None:

@@ -35,9 +35,15 @@ def field(lab: Path) -> list[RepeatRow]:
     rows = bursty(COMPARABLE, 20, seed=1)
     write(lab / "field", rows)
     worse = [
-        replace(row, backend="emulated", trial="another", ip_packets_received=got, ip_loss=1 - got / 216)
+        replace(
+            row,
+            backend="emulated",
+            trial="another",
+            ip_packets_received=packets_received,
+            ip_loss=1 - packets_received / 216,
+        )
         for row in rows
-        for got in ((row.ip_packets_received or 0) - 40,)
+        for packets_received in ((row.ip_packets_received or 0) - 40,)
     ]
     write(lab / "sim", worse)
     return rows
@@ -154,7 +160,7 @@ def test_more_than_two_runs_suggest_aggregate(lab: Path, capsys: pytest.CaptureF
     (lab / "field again").symlink_to("field")
     assert main(["compare", "field", "sim", "field again"]) == 2
     message = capsys.readouterr().err
-    assert "compare takes two runs, A and B, and 3 are given" in message
+    assert "compare needs two runs, A and B, and 3 are given" in message
     command = message.partition("in one table: fieldkit ")[2].strip()
     assert command == "aggregate field sim 'field again' --by trial,protocol"
     assert main(shlex.split(command)) == 0

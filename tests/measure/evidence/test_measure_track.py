@@ -79,10 +79,10 @@ def test_columns_have_the_distance_between_first_and_last_reply(tmp_path: Path) 
 
 
 @given(TRACKS)
-def test_a_written_track_is_read(tmp_path_factory: pytest.TempPathFactory, whereabouts: list[TrackPoint]) -> None:
+def test_a_written_track_is_read(tmp_path_factory: pytest.TempPathFactory, points: list[TrackPoint]) -> None:
     path = tmp_path_factory.getbasetemp() / "track.csv"
-    path.write_text(track.text(whereabouts), encoding="ascii")
-    assert track.read(path) == tuple(whereabouts)
+    path.write_text(track.text(points), encoding="ascii")
+    assert track.read(path) == tuple(points)
 
 
 TEXT = track.text(AWAY)

@@ -48,8 +48,8 @@ def _udp(
     ]
     arrivals = link.arrivals([frame.time_ns for frame in sent])
     received = [Frame(at, sent[which].data, 2000) for at, which in arrivals]
-    aim = _to(Protocol.UDP, ipv6=ids[0] is None)
-    counts = udp.count(udp.match_transfer(packets(sent), packets(received), aim))
+    transfer_filter = _to(Protocol.UDP, ipv6=ids[0] is None)
+    counts = udp.count(udp.match_transfer(packets(sent), packets(received), transfer_filter))
     return counts, PacketFates.of(len(sent), [which for _, which in arrivals])
 
 
@@ -237,8 +237,12 @@ def test_captures_of_different_link_types_match(protocol: Protocol) -> None:
         pcap.parse(file_bytes(ambiguous, link_type=1), where="test").packets,
         pcap.parse(file_bytes(reference, link_type=113), where="test").packets,
     )
-    aim = _to(protocol, ipv6=False)
+    transfer_filter = _to(protocol, ipv6=False)
     if protocol is Protocol.UDP:
-        assert udp.count(udp.match_transfer(*framed, aim)) == udp.count(udp.match_transfer(*plain, aim))
+        assert udp.count(udp.match_transfer(*framed, transfer_filter)) == udp.count(
+            udp.match_transfer(*plain, transfer_filter)
+        )
     else:
-        assert tcp.count(tcp.match_transfer(*framed, aim)) == tcp.count(tcp.match_transfer(*plain, aim))
+        assert tcp.count(tcp.match_transfer(*framed, transfer_filter)) == tcp.count(
+            tcp.match_transfer(*plain, transfer_filter)
+        )

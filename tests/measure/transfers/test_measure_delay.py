@@ -30,12 +30,12 @@ Wrong = tuple[float, float]  # offset in seconds, drift in seconds per second
 CLOCKS: list[Wrong] = [(0, 0), (3600, 0), (-3600, 0), (0, 100e-6), (0, -100e-6), (3600, -100e-6), (-3600, 100e-6)]
 
 
-def _measured(sender: Packets, receiver: Packets, aim: Transfer, sent: int | None = None) -> Measures:
-    if aim.protocol is Protocol.UDP:
-        pairs = delay.udp_packets(udp.match_transfer(sender, receiver, aim))
+def _measured(sender: Packets, receiver: Packets, transfer_filter: Transfer, sent: int | None = None) -> Measures:
+    if transfer_filter.protocol is Protocol.UDP:
+        pairs = delay.udp_packets(udp.match_transfer(sender, receiver, transfer_filter))
     else:
-        pairs = delay.tcp_frames(tcp.match_transfer(sender, receiver, aim))
-    columns = delay.measure(pairs, sender, receiver, aim, sent=len(pairs) if sent is None else sent)
+        pairs = delay.tcp_frames(tcp.match_transfer(sender, receiver, transfer_filter))
+    columns = delay.measure(pairs, sender, receiver, transfer_filter, sent=len(pairs) if sent is None else sent)
     assert not columns.values.keys() & columns.missing.keys(), "no column has both a value and a reason"
     assert columns.values.keys() | columns.missing.keys() == {
         column.name for column in (*delay.COLUMNS, *delay.SENT_COLUMNS)
@@ -71,8 +71,8 @@ def _real(protocol: Protocol, offset_s: float = 0.0, drift: float = 0.0) -> Meas
     sender, receiver = (pcap.read(TWO_WAY / f"{protocol}-{role}.pcap").packets for role in ("sender", "receiver"))
     start_ns = int(sender.time_ns.min()) - START_NS
     sender, receiver = (replace(capture, time_ns=capture.time_ns - start_ns) for capture in (sender, receiver))
-    aim = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
-    return _measured(sender, _on_another_clock(receiver, offset_s, drift), aim)
+    transfer_filter = replace(transfer(protocol), sender_address="10.42.0.1", receiver_address="10.42.0.2", port=1234)
+    return _measured(sender, _on_another_clock(receiver, offset_s, drift), transfer_filter)
 
 
 @pytest.mark.parametrize(("offset_s", "drift"), CLOCKS)

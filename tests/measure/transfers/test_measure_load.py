@@ -25,16 +25,16 @@ def udp_frames(count: int) -> list[Frame]:
     """A datagram of the setup with 4 bytes, then datagrams; among them packets with another port or size."""
     data = [datagram(index, PAYLOAD_BYTES)[0] for index in range(count)]
     frames = [Frame(START - 10**9, datagram(9_000, 4)[0]), *timed(data, start_ns=START, step_ns=EVERY_NS)]
-    strange = [datagram(9_001, PAYLOAD_BYTES, sport=40001)[0], datagram(9_002, PAYLOAD_BYTES, port=5202)[0]]
-    return [*frames, *timed(strange, start_ns=START + 5 * 10**8)]
+    other_datagrams = [datagram(9_001, PAYLOAD_BYTES, sport=40001)[0], datagram(9_002, PAYLOAD_BYTES, port=5202)[0]]
+    return [*frames, *timed(other_datagrams, start_ns=START + 5 * 10**8)]
 
 
 def tcp_frames(count: int, *, again: tuple[int, ...] = ()) -> list[Frame]:
     """A connection: SYN, cookie, then segments, some of them twice."""
     head = [segment(0, 0, flags=SYN), segment(1, COOKIE)]
-    whole = [segment(1 + COOKIE + index * PAYLOAD_BYTES, PAYLOAD_BYTES) for index in range(count)]
-    frames = [*timed(head, start_ns=START - 10**9), *timed(whole, start_ns=START, step_ns=EVERY_NS)]
-    return frames + [Frame(START + index * EVERY_NS + 1_000_000, whole[index]) for index in again]
+    segments = [segment(1 + COOKIE + index * PAYLOAD_BYTES, PAYLOAD_BYTES) for index in range(count)]
+    frames = [*timed(head, start_ns=START - 10**9), *timed(segments, start_ns=START, step_ns=EVERY_NS)]
+    return frames + [Frame(START + index * EVERY_NS + 1_000_000, segments[index]) for index in again]
 
 
 def measured(flow: LoadFlow, sent: list[Frame], received: list[Frame]) -> dict[str, object]:

@@ -30,7 +30,7 @@ LINE = {
 
 
 def drive(out_s: float, speed_m_s: float, back_m_s: float) -> Iterator[dict[str, Any]]:
-    """Lines of a robot that waits for 2 s, drives straight, stands for 1 s, and returns, 3 cm and 4 cm off."""
+    """Lines of a robot that waits for 2 s, drives straight, is stationary for 1 s, and returns, 3 cm and 4 cm off."""
     yield from ({**LINE, "at_s": tenth / 10} for tenth in range(20))
     for tenth in range(round(10 * out_s) + 1):
         at_s = tenth / 10

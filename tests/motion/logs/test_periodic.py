@@ -41,17 +41,17 @@ def late_messages(
 
     Its schedule is exact, and a router withholds 4 answers a second.
     """
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     period_ms = 1000 / rate_hz
     events = [
-        (period_ms * (slot + phase) + dice.choice((0, 0, 0, 10, 20, 30)), name)
+        (period_ms * (slot + phase) + rng.choice((0, 0, 0, 10, 20, 30)), name)
         for slot in range(200)
         for phase, name in ((0, "ATTITUDE"), (0.15, "LOCAL_POSITION_NED"))
     ]
-    events += [(250.0 * index + dice.uniform(0, 200), "") for index in range(800 // rate_hz)]
+    events += [(250.0 * index + rng.uniform(0, 200), "") for index in range(800 // rate_hz)]
     numbers, streams, lost, waiting = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0, Counter[str]()
     for number, (at_ms, name) in enumerate(sorted(events)):
-        if name and (name not in streams or dice.random() >= lost_share):
+        if name and (name not in streams or rng.random() >= lost_share):
             lost += waiting.pop(name, 0)
             numbers.append((round(at_ms * 1e3), number % 256))
             streams.setdefault(name, []).append(StreamMessage(round(at_ms * 1e3), round(at_ms), len(numbers) - 1))

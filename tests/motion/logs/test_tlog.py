@@ -258,13 +258,13 @@ def test_moved_frames_are_detected(tmp_path: Path) -> None:
 
 @given(st.floats(0, 0.3), st.integers(0, 2**32))
 def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float, seed: int) -> None:
-    dice = random.Random(seed)
+    rng = random.Random(seed)
     numbers, streams, truth = list[tuple[int, int]](), dict[str, list[StreamMessage]](), 0
     sent = 0
     for slot in range(400):
         for name in ("ATTITUDE", "LOCAL_POSITION_NED"):
-            sent += 1 + (dice.random() < 0.02)  # an answer to another station has a number too
-            if 0 < slot < 399 and dice.random() < share:
+            sent += 1 + (rng.random() < 0.02)  # an answer to another station has a number too
+            if 0 < slot < 399 and rng.random() < share:
                 truth += 1
                 continue
             numbers.append((100_000 * slot, sent % 256))

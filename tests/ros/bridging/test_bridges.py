@@ -80,11 +80,11 @@ def first_heard(pid: int, address: str) -> bytes:
     topic = json.dumps(topics.describe(shipped(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
     inside = ("timeout", "-k", "10", str(LONG_S), "nsenter", "-t", str(pid), "-n")
     command = (*inside, sys.executable, str(WIRE_END), "hear", "dds", network, topic)
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as ears:
-        assert ears.stdout is not None
-        line = ears.stdout.readline()
-        ears.terminate()
-        _, errors = ears.communicate()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as subscriber:
+        assert subscriber.stdout is not None
+        line = subscriber.stdout.readline()
+        subscriber.terminate()
+        _, errors = subscriber.communicate()
     assert line, errors
     return bytes.fromhex(line)
 

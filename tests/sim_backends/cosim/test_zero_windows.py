@@ -44,7 +44,7 @@ class BallProgram:
         return Action((Datagram(self._peer, 10, f"to {self._peer}", self._remaining),))
 
 
-def rally(returns: int, observer: WindowObserver | None = None) -> tuple[Coordinator, list[BallProgram]]:
+def ball_game(returns: int, observer: WindowObserver | None = None) -> tuple[Coordinator, list[BallProgram]]:
     """Return a co-simulation of two players that return a ball at one instant, over a network without delay."""
     programs = [BallProgram("b", returns, begins=True), BallProgram("a", returns)]
     physics = Paths([WayPoints(name, [(0.0, 0.0, 0.0)], 1.0) for name in "ab"])
@@ -53,7 +53,7 @@ def rally(returns: int, observer: WindowObserver | None = None) -> tuple[Coordin
 
 
 def test_events_at_one_instant_are_simulated_at_it_and_time_advances() -> None:
-    coordinator, programs = rally(20)
+    coordinator, programs = ball_game(20)
     run = coordinator.advance(100 * MS)
     assert len(run.fates) == 40
     assert {(fate.packet.sent_ns, fate.arrived_ns, fate.late_ns) for fate in run.fates.values()} == {
@@ -69,13 +69,13 @@ def test_events_at_one_instant_are_simulated_at_it_and_time_advances() -> None:
 
 def test_a_recording_of_empty_windows_equals_the_run(tmp_path: Path) -> None:
     with RunRecorder(tmp_path / "run", RunSettings("a: 1", "event_driven", {}, 1)) as recorder:
-        live = rally(20, recorder)[0].advance(100 * MS)
+        live = ball_game(20, recorder)[0].advance(100 * MS)
     replayed = read_recording(tmp_path / "run").run
     assert (replayed.digest, replayed.windows_ns) == (live.digest, live.windows_ns)
 
 
 def test_an_instant_that_never_ends_is_an_error() -> None:
-    coordinator, _ = rally(10_000)
+    coordinator, _ = ball_game(10_000)
     with pytest.raises(PolicyError, match=f"time does not advance beyond {BEGINS_NS} ns"):
         coordinator.advance(100 * MS)
     assert coordinator.run.windows_ns[-1] == BEGINS_NS
@@ -86,7 +86,7 @@ def test_a_window_that_ends_before_it_begins_is_an_error() -> None:
         def next_window(self, situation: Situation) -> int | None:
             return situation.now_ns - 1 if situation.now_ns else 5 * MS
 
-    coordinator, _ = rally(1)
+    coordinator, _ = ball_game(1)
     coordinator.policy = BackwardPolicy()
     with pytest.raises(PolicyError, match="time does not advance beyond 5000000 ns"):
         coordinator.advance(100 * MS)

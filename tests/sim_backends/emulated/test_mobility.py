@@ -131,11 +131,7 @@ def test_a_moving_robot_that_returns_into_range_is_at_its_current_position(
         mobility.set_out_of_range(None)
         assert medium.position_of(Role.SENDER) not in {None, place}
     since_ns = 0
-    absent = [
-        whereabouts
-        for whereabouts in mobility.track(since_ns)
-        if whereabouts.role is Role.SENDER and whereabouts.position_m is None
-    ]
+    absent = [point for point in mobility.track(since_ns) if point.role is Role.SENDER and point.position_m is None]
     assert len(absent) == 1, "one entry without a position until it is back"
 
 
@@ -158,13 +154,11 @@ def test_the_track_equals_the_positions_of_the_medium_and_discards_old_ones(
     with mobility.moving(MOVE):
         wait(lambda: not motion_threads())
     track = mobility.track(0)
-    assert [
-        whereabouts.position_m for whereabouts in track if whereabouts.role is Role.SENDER
-    ] == medium.positions_of(Role.SENDER)
-    assert all(whereabouts.utc_ns <= other.utc_ns for whereabouts, other in pairwise(track))
-    assert [whereabouts.role for whereabouts in track].count(Role.RELAY) == 1
+    assert [point.position_m for point in track if point.role is Role.SENDER] == medium.positions_of(Role.SENDER)
+    assert all(point.utc_ns <= other.utc_ns for point, other in pairwise(track))
+    assert [point.role for point in track].count(Role.RELAY) == 1
     last_known = mobility.track(time.time_ns())
-    assert sorted(whereabouts.role for whereabouts in last_known) == sorted(CAST)
+    assert sorted(point.role for point in last_known) == sorted(CAST)
     assert mobility.track(0) == last_known
 
 
@@ -245,7 +239,7 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
         assert medium.position_of(Role.RELAY) == place, "motion from before the placement is ignored"
     assert len(medium.calls) > calls
     assert not [thread for thread in threading.enumerate() if thread.name == "watch"]
-    track = [whereabouts.position_m for whereabouts in mobility.track(0) if whereabouts.role is Role.RELAY]
+    track = [point.position_m for point in mobility.track(0) if point.role is Role.RELAY]
     assert (7.0, 8.0, 12.0) in track
     assert track[0] == track[-1] == place
 

@@ -31,13 +31,13 @@ class ByHand:
         self.rest = frame[16:]
         assert (len(self.rest), reserved) == (size, 0)
 
-    def take(self, layout: str) -> tuple[Any, ...]:
+    def unpack_values(self, layout: str) -> tuple[Any, ...]:
         size = struct.calcsize(f"<{layout}")
         values, self.rest = struct.unpack(f"<{layout}", self.rest[:size]), self.rest[size:]
         return values
 
     def text(self) -> str:
-        (length,) = self.take("H")
+        (length,) = self.unpack_values("H")
         text, self.rest = self.rest[:length], self.rest[length:]
         return text.decode()
 
@@ -50,58 +50,66 @@ def test_the_page_has_a_vector_of_each_layout() -> None:
 
 def test_the_handshake_by_hand() -> None:
     join = ByHand(VECTORS["join"])
-    assert (join.kind, join.take("8sH"), join.text(), join.rest) == (1, (b"FIELDKIT", 1), "s3cret", b"")
+    assert (join.kind, join.unpack_values("8sH"), join.text(), join.rest) == (1, (b"FIELDKIT", 1), "s3cret", b"")
     hello = ByHand(VECTORS["hello"])
     assert (hello.kind, hello.request) == (2, 3)
-    assert hello.take("8sHBBIQqq") == (b"FIELDKIT", 1, 1, 0, 1000, 7, 1_000_000, 2_000_000_000)
-    assert hello.take("32s") == (hashlib.sha256(b"{}").digest(),)
-    assert (hello.text(), hello.text(), hello.take("I")) == ("s3cret", "demo", (1,))
-    assert (hello.text(), hello.text(), hello.take("Bd")) == ("ugv", "husky", (0, 0.5))
-    assert hello.take("IIddddddd d") == (*UGV, 3.0)
-    assert (hello.take("I"), hello.rest) == ((2,), b"{}")
+    assert hello.unpack_values("8sHBBIQqq") == (b"FIELDKIT", 1, 1, 0, 1000, 7, 1_000_000, 2_000_000_000)
+    assert hello.unpack_values("32s") == (hashlib.sha256(b"{}").digest(),)
+    assert (hello.text(), hello.text(), hello.unpack_values("I")) == ("s3cret", "demo", (1,))
+    assert (hello.text(), hello.text(), hello.unpack_values("Bd")) == ("ugv", "husky", (0, 0.5))
+    assert hello.unpack_values("IIddddddd d") == (*UGV, 3.0)
+    assert (hello.unpack_values("I"), hello.rest) == ((2,), b"{}")
     welcome = ByHand(VECTORS["welcome"])
     assert welcome.kind == 3
-    assert welcome.take("HBBIqq") == (1, 1, 0, 1 + 16, 1_000_000, -1)
-    assert welcome.take("32s") == (hashlib.sha256(b"{}").digest(),)
+    assert welcome.unpack_values("HBBIqq") == (1, 1, 0, 1 + 16, 1_000_000, -1)
+    assert welcome.unpack_values("32s") == (hashlib.sha256(b"{}").digest(),)
     assert (welcome.text(), welcome.text()) == ("carts", "carts 1.0")
-    assert (welcome.take("HHH"), welcome.take("H"), welcome.take("II")) == ((2, 1, 2), (0,), (0, 0))
+    assert (welcome.unpack_values("HHH"), welcome.unpack_values("H"), welcome.unpack_values("II")) == (
+        (2, 1, 2),
+        (0,),
+        (0, 0),
+    )
     assert not welcome.rest
 
 
 def test_requests_and_answers_by_hand() -> None:
     request = ByHand(VECTORS["advance physics"])
-    assert (request.kind, request.take("qqI")) == (4, (11_100_000, 10_000_000, 2))
-    assert request.take("IHHdd") == (0, 1, 16, 0.5, -0.125)
-    *velocity, yaw_rad = request.take("IHHdddd")
+    assert (request.kind, request.unpack_values("qqI")) == (4, (11_100_000, 10_000_000, 2))
+    assert request.unpack_values("IHHdd") == (0, 1, 16, 0.5, -0.125)
+    *velocity, yaw_rad = request.unpack_values("IHHdddd")
     assert (velocity, math.isnan(yaw_rad), request.rest) == ([1, 2, 32, 1.0, 0.0, 0.25], True, b"")
     states = ByHand(VECTORS["states"])
-    assert (states.kind, states.take("qII"), states.text()) == (5, (11_000_000, 1, 1), "uav")
-    assert (states.take("I"), states.take("II8d")) == ((2,), (*UGV, 3.0))
-    *drone, heading_rad, limit_m_s2 = states.take("II8d")
+    assert (states.kind, states.unpack_values("qII"), states.text()) == (5, (11_000_000, 1, 1), "uav")
+    assert (states.unpack_values("I"), states.unpack_values("II8d")) == ((2,), (*UGV, 3.0))
+    *drone, heading_rad, limit_m_s2 = states.unpack_values("II8d")
     assert drone == [1, 0, -1.5, 0.0, 10.0, 0.0, 0.5, -0.25]
     assert (math.isnan(heading_rad), limit_m_s2, states.rest) == (True, math.inf, b"")
     network = ByHand(VECTORS["advance network"])
-    assert (network.kind, network.take("qqqII")) == (6, (11_099_999, 10_000_000, 1_000_000, 0, 1))
-    assert (network.take("II8d"), network.take("I")) == ((*UGV, math.inf), (1,))
-    assert network.take("QqQqqII") == (9, 4, 300, 10_000_000, 10_500_000, 0, 1)
+    assert (network.kind, network.unpack_values("qqqII")) == (6, (11_099_999, 10_000_000, 1_000_000, 0, 1))
+    assert (network.unpack_values("II8d"), network.unpack_values("I")) == ((*UGV, math.inf), (1,))
+    assert network.unpack_values("QqQqqII") == (9, 4, 300, 10_000_000, 10_500_000, 0, 1)
     assert (network.text(), network.text(), network.rest) == ("pose", "udp", b"")
     outcomes = ByHand(VECTORS["outcomes"])
-    assert (outcomes.kind, outcomes.take("qqI")) == (7, (11_099_999, 12_000_000, 1))
-    assert (outcomes.take("QqII"), outcomes.take("IQ")) == ((9, 11_000_250, 1, 0), (1, 8))
-    assert (outcomes.text(), outcomes.take("3q"), outcomes.rest) == ("out of range", (100_000, 350_000, 33), b"")
+    assert (outcomes.kind, outcomes.unpack_values("qqI")) == (7, (11_099_999, 12_000_000, 1))
+    assert (outcomes.unpack_values("QqII"), outcomes.unpack_values("IQ")) == ((9, 11_000_250, 1, 0), (1, 8))
+    assert (outcomes.text(), outcomes.unpack_values("3q"), outcomes.rest) == (
+        "out of range",
+        (100_000, 350_000, 33),
+        b"",
+    )
     links = ByHand(VECTORS["links"])
-    assert (links.kind, links.take("IIIdqq")) == (17, (1, 0, 0, -95.0, 11_099_999, 2_000_000))
-    *link, rx_rate_bit_s = links.take("IIIdd d")
+    assert (links.kind, links.unpack_values("IIIdqq")) == (17, (1, 0, 0, -95.0, 11_099_999, 2_000_000))
+    *link, rx_rate_bit_s = links.unpack_values("IIIdd d")
     assert (link, math.isnan(rx_rate_bit_s)) == ([1, 0, 1, -61.5, 54e6], True)
-    assert (links.take("4Q"), links.rest) == ((12, 11, 3, 1), b"")
+    assert (links.unpack_values("4Q"), links.rest) == ((12, 11, 3, 1), b"")
 
 
 def test_short_messages_by_hand() -> None:
     for name, kind, number in (("ping", 8, 42), ("pong", 9, 42), ("busy", 10, 10_000_000)):
         frame = ByHand(example_frames()[name])
-        assert (frame.kind, frame.take("Q"), frame.rest) == (kind, (number,), b"")
+        assert (frame.kind, frame.unpack_values("Q"), frame.rest) == (kind, (number,), b"")
     fork = ByHand(VECTORS["fork"])
-    assert (fork.kind, fork.take("I"), fork.rest) == (11, (2,), b"")
+    assert (fork.kind, fork.unpack_values("I"), fork.rest) == (11, (2,), b"")
     for name, kind, copy in (("done", 12, 0), ("release", 13, 2), ("bye", 15, 0)):
         frame = ByHand(example_frames()[name])
         assert (frame.kind, frame.copy, frame.rest) == (kind, copy, b"")

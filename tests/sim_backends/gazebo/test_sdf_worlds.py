@@ -73,7 +73,7 @@ def test_a_ramp_rises_along_its_first_edge() -> None:
         assert pose[2] + up_m == pytest.approx(height_m, abs=1e-6)
 
 
-def test_robots_stand_at_their_starts_with_their_plugins() -> None:
+def test_robots_are_at_their_starts_with_their_plugins() -> None:
     world = fromstring(scenario_sdf(load_scenario("convoy", {"physics.step": "2ms", "policy.window": "2ms"})))
     models = {model.attrib["name"]: model for model in world.iter("model")}
     assert numbers(models["leader"], "pose") == [20, 12, 0, 0, 0, 0]

@@ -46,8 +46,8 @@ def session(mode: WifiMode) -> BlockAckSession[int]:
 class AggregatingPowers(FixedPowers):
     """Stations that aggregate frames and have the inter-frame space of best effort."""
 
-    def __init__(self, names: Sequence[str], mode: WifiMode, deaf: Sequence[tuple[str, str]] = ()) -> None:
-        super().__init__(names, mode, deaf=deaf)
+    def __init__(self, names: Sequence[str], mode: WifiMode, without_link: Sequence[tuple[str, str]] = ()) -> None:
+        super().__init__(names, mode, without_link=without_link)
         self.band = mode.band
         self.mode = mode
 
@@ -196,7 +196,7 @@ def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order(
 
 
 def test_frames_to_a_silent_receiver_are_given_up_after_the_retry_limit() -> None:
-    channel = AggregatingPowers("ab", HT20_7, deaf=[("a", "b")])
+    channel = AggregatingPowers("ab", HT20_7, without_link=[("a", "b")])
     wifi: Wifi[int] = Wifi(channel, 1)
     losses: list[tuple[int, str, str]] = []
     wifi.log_losses(lambda _, payload, station, reason: losses.append((payload, station, reason)))

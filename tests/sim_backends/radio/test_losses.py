@@ -101,7 +101,7 @@ def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
 
 def test_exhausted_retries_are_reported_at_the_sender_and_the_relay() -> None:
     for unheard_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
-        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[unheard_link]), 1)
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[unheard_link]), 1)
         wifi.set_relay("r")
         lost = losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
@@ -122,7 +122,7 @@ def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
 
 
 def test_queue_drops_and_undecoded_broadcasts_are_reported() -> None:
-    channel = FixedPowers("abc", G54, deaf=[("a", "c")])
+    channel = FixedPowers("abc", G54, without_link=[("a", "c")])
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=1)
     lost = losses(wifi)
     for number in range(3):

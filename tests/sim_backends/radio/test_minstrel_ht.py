@@ -154,9 +154,9 @@ def test_the_first_frames_are_sent_in_the_slowest_mode() -> None:
 
 @given(st.lists(st.tuples(st.integers(0, 40_000_000), st.integers(0, 16)), max_size=200), st.integers(1, 3))
 def test_any_results_leave_a_chain_of_known_modes(results: list[tuple[int, int]], streams: int) -> None:
-    known = groups("ac", "5 GHz", 40, min(streams, 2), 400)
-    rate = control(*known)
-    modes = {mode for group in known for mode in group}
+    rate_groups = groups("ac", "5 GHz", 40, min(streams, 2), 400)
+    rate = control(*rate_groups)
+    modes = {mode for group in rate_groups for mode in group}
     now_ns = 0
     for number, (step_ns, acknowledged) in enumerate(results):
         now_ns += step_ns

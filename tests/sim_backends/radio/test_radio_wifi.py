@@ -82,7 +82,7 @@ def test_the_goodput_of_many_stations_equals_bianchi_s_model(stations: int) -> N
 
 def test_hidden_stations_collide_more_than_visible_ones() -> None:
     visible = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
-    hidden = saturate(FixedPowers("abr", G6, deaf=[("a", "b")]), "ab", "r", seconds=4)
+    hidden = saturate(FixedPowers("abr", G6, without_link=[("a", "b")]), "ab", "r", seconds=4)
     assert sum(hidden.values()) < 0.75 * sum(visible.values())
 
 
@@ -95,7 +95,7 @@ def test_an_access_point_needs_twice_the_airtime() -> None:
 
 def test_an_ack_follows_each_received_frame_after_sifs() -> None:
     log: list[TransmissionAttempt] = []
-    saturate(FixedPowers("abr", G54, deaf=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
+    saturate(FixedPowers("abr", G54, without_link=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
     acks = [attempt for attempt in log if not attempt.number]
     arrived = {
         (attempt.end_ns, attempt.receiver, attempt.transmitter)
@@ -128,7 +128,7 @@ def test_a_broadcast_through_an_access_point_reaches_each_station_once() -> None
 
 def test_an_unreachable_receiver_causes_all_retries() -> None:
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[bytes] = Wifi(FixedPowers("ab", G54, deaf=[("a", "b")]), 1)
+    wifi: Wifi[bytes] = Wifi(FixedPowers("ab", G54, without_link=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
     wifi.send(0, "a", b"x", 100, "b")
     assert wifi.deliveries(10**9) == []
@@ -151,7 +151,7 @@ def test_interference_that_starts_late_corrupts_a_frame() -> None:
     r.
     """
     log: list[TransmissionAttempt] = []
-    wifi: Wifi[str] = Wifi(FixedPowers("abr", G6, deaf=[("a", "b")]), 1)
+    wifi: Wifi[str] = Wifi(FixedPowers("abr", G6, without_link=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
     wifi.send(0, "a", "first", 1000, "r")
     wifi.send(500_000, "b", "second", 1000, "r")
@@ -160,7 +160,7 @@ def test_interference_that_starts_late_corrupts_a_frame() -> None:
 
 
 def test_a_strong_frame_survives_weak_interference() -> None:
-    channel = FixedPowers("abr", G6, deaf=[("a", "b")])
+    channel = FixedPowers("abr", G6, without_link=[("a", "b")])
     channel.rows[1][2] = STRONG_MW / 1000
     wifi: Wifi[str] = Wifi(channel, 1)
     wifi.send(0, "a", "first", 1000, "r")
@@ -196,7 +196,7 @@ def test_below_4_db_the_preamble_is_not_detected() -> None:
 def test_equal_seeds_give_equal_results_in_order_of_time(seed: int, sent_frames: list[tuple[int, int]]) -> None:
     def run() -> tuple[list[Delivery[int]], list[TransmissionAttempt]]:
         log: list[TransmissionAttempt] = []
-        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, deaf=[("a", "b")]), seed)
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[("a", "b")]), seed)
         wifi.log_attempts(log.append)
         for number, (at_ns, size) in enumerate(sorted(sent_frames)):
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
@@ -262,7 +262,7 @@ def test_no_station_starts_while_it_detects_a_frame(seed: int, pairs_without_lin
     names = "abcde"
     pairs = [(names[first], names[second]) for first, second in pairs_without_link if first != second]
     log: list[TransmissionAttempt] = []
-    saturate(FixedPowers(names, G54, deaf=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
+    saturate(FixedPowers(names, G54, without_link=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
     hidden = {*pairs, *((second, first) for first, second in pairs)}
     sent = [attempt for attempt in log if attempt.number]
     frames = sorted(sent, key=lambda attempt: attempt.start_ns)

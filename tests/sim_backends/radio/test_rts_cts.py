@@ -25,9 +25,14 @@ class Protecting(FixedPowers):
     """Stations with RTS; in modes of 802.11n they aggregate frames and have the inter-frame space of best effort."""
 
     def __init__(
-        self, names: Sequence[str], mode: WifiMode, *, deaf: Sequence[tuple[str, str]] = (), threshold: int | None = 0
+        self,
+        names: Sequence[str],
+        mode: WifiMode,
+        *,
+        without_link: Sequence[tuple[str, str]] = (),
+        threshold: int | None = 0,
     ) -> None:
-        super().__init__(names, mode, deaf=deaf)
+        super().__init__(names, mode, without_link=without_link)
         self.mode = mode
         self.threshold = threshold
 
@@ -95,7 +100,7 @@ def test_hidden_stations_collide_in_rts_and_not_in_data() -> None:
     log: list[TransmissionAttempt] = []
     rates = {}
     for threshold in (0, None):
-        channel = Protecting("abr", HT20_7, deaf=[("a", "b")], threshold=threshold)
+        channel = Protecting("abr", HT20_7, without_link=[("a", "b")], threshold=threshold)
         log.clear()
         rates[threshold] = sum(saturate(channel, "ab", "r", seconds=1.0, queued=150, log=log).values())
         data = [attempt for attempt in log if attempt.number]
@@ -111,7 +116,7 @@ def test_hidden_stations_collide_in_rts_and_not_in_data() -> None:
 
 def test_a_station_that_has_heard_another_cts_does_not_answer_an_rts() -> None:
     """r hears the CTS of y, but not the data of x to y; a hears neither."""
-    wifi: Wifi[int] = Wifi(Protecting("arxy", G_MODES[0], deaf=[("a", "x"), ("a", "y"), ("r", "x")]), 1)
+    wifi: Wifi[int] = Wifi(Protecting("arxy", G_MODES[0], without_link=[("a", "x"), ("a", "y"), ("r", "x")]), 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
     wifi.send(0, "x", 0, 1500, "y")
@@ -137,7 +142,7 @@ def test_frames_up_to_the_threshold_are_sent_without_rts() -> None:
 
 @pytest.mark.parametrize("mode", [G54, HT20_7], ids=lambda mode: mode.name)
 def test_frames_without_cts_are_given_up_and_no_data_is_sent(mode: WifiMode) -> None:
-    channel = Protecting("ar", mode, deaf=[("a", "r")])
+    channel = Protecting("ar", mode, without_link=[("a", "r")])
     wifi: Wifi[int] = Wifi(channel, 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)
@@ -155,7 +160,7 @@ def test_frames_without_cts_are_given_up_and_no_data_is_sent(mode: WifiMode) -> 
 
 def test_after_rts_without_data_other_stations_wait_no_longer_than_for_the_cts() -> None:
     """The receiver does not hear the RTS; b waits 2 SIFS, CTS, 20 us, 2 slots (10.3.2.4), DIFS and its backoff."""
-    channel = Protecting("abr", G_MODES[0], deaf=[("a", "r")])
+    channel = Protecting("abr", G_MODES[0], without_link=[("a", "r")])
     wifi: Wifi[int] = Wifi(channel, 1)
     log: list[TransmissionAttempt] = []
     wifi.log_attempts(log.append)

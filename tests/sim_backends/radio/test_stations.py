@@ -48,7 +48,7 @@ class TrafficRun:
 
 @pytest.fixture(params=["clear", "noisy", "hidden"])
 def channel(request: pytest.FixtureRequest) -> FixedPowers:
-    by_hand = FixedPowers("abr", G54, deaf=[("a", "b")] if request.param == "hidden" else [])
+    by_hand = FixedPowers("abr", G54, without_link=[("a", "b")] if request.param == "hidden" else [])
     if request.param == "noisy":
         by_hand.noise_mw = [STRONG_MW / 10**2.22] * 3
     return by_hand
@@ -87,9 +87,9 @@ def test_a_failure_is_a_last_attempt_without_an_ack(channel: FixedPowers) -> Non
 
 def test_the_channel_is_busy_while_a_station_sends_or_detects_a_frame(channel: FixedPowers) -> None:
     traffic = TrafficRun(channel)
-    deaf = {("a", "b"), ("b", "a")} if channel.rows[0][1] == 0 else set()
+    without_link = {("a", "b"), ("b", "a")} if channel.rows[0][1] == 0 else set()
     for name in "abr":
-        detected = [attempt for attempt in traffic.log if (name, attempt.transmitter) not in deaf]
+        detected = [attempt for attempt in traffic.log if (name, attempt.transmitter) not in without_link]
         edges = sorted({edge for attempt in detected for edge in (attempt.start_ns, attempt.end_ns)})
         busy_ns = sum(
             stop - start

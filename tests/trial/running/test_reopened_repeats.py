@@ -22,9 +22,9 @@ from tests.trial.test_trial_crash import (
     KILLED,
     PING,
     STRIDES,
-    at_write,
-    demand_agreement,
-    die,
+    assert_consistent,
+    call_at_write,
+    exit_after_kill,
     plan,
     robots_with_evidence,
 )
@@ -57,7 +57,7 @@ def with_a_failed_repeat(out: Path, incomplete: set[str]) -> Path:
     return outcome.folder
 
 
-def redo(folder: Path, received: list[Event] | None = None) -> Outcome:
+def resume_failed(folder: Path, received: list[Event] | None = None) -> Outcome:
     events: list[Event] = [] if received is None else received
     outcome = resume_trial(folder, IdleTestbed(), events.append, failed=True)
     assert outcome is not None
@@ -70,7 +70,7 @@ def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path
     unasked = resume_trial(folder, IdleTestbed(), lambda _: None)
     assert unasked is not None
     assert unasked.failed == 1, "failed repeats are not repeated without the option"
-    outcome = redo(folder)
+    outcome = resume_failed(folder)
     assert (outcome.valid, outcome.failed) == (2, 0)
     table = rows(folder)
     assert [row["status"] for row in table if row["repeat"] == "1"] == ["void", "void", "void", "valid"]
@@ -78,19 +78,19 @@ def test_a_failed_repeat_is_repeated_and_its_attempts_become_void(tmp_path: Path
     assert all(row["reason"] for row in table if row["status"] == "void")
     names = {path.name for path in (folder / store.REPEATS).iterdir()}
     assert names == {"tcp-01", "tcp-01.void1", "tcp-01.void2", "tcp-01.void3", "tcp-02"}
-    demand_agreement(folder)
+    assert_consistent(folder)
 
 
 def test_a_reopened_repeat_has_all_attempts_again_and_may_fail_again(tmp_path: Path, incomplete: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, incomplete)
-    assert redo(folder).failed == 1
+    assert resume_failed(folder).failed == 1
     assert [row["status"] for row in rows(folder) if row["repeat"] == "1"] == ["void"] * 5 + ["failed"]
-    demand_agreement(folder)
+    assert_consistent(folder)
     incomplete.clear()
-    assert redo(folder).failed == 0
-    demand_agreement(folder)
+    assert resume_failed(folder).failed == 0
+    assert_consistent(folder)
     received: list[Event] = []
-    assert redo(folder, received).valid == 2
+    assert resume_failed(folder, received).valid == 2
     assert Note("no repeat of this trial failed") in received
 
 
@@ -102,8 +102,8 @@ def moments(folder: Path, stride: int) -> Iterator[Path]:
         moment += stride
         pid = os.fork()
         if pid == 0:
-            at_write(moment, die)
-            redo(folder)
+            call_at_write(moment, exit_after_kill)
+            resume_failed(folder)
             os._exit(0)
         code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
         yield folder
@@ -121,10 +121,10 @@ def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, incomplet
     count = 0
     for died in moments(folder, stride):
         count += stride
-        redo(died)
+        resume_failed(died)
         assert Status.FAILED not in {attempt.status for attempt in journal.ended(journal.read(died))}
         assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1
-        demand_agreement(died)
+        assert_consistent(died)
     assert count > 10, "too few writes were interrupted"
 
 
@@ -132,11 +132,11 @@ def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, incomplete: set[str
     folder = with_a_failed_repeat(tmp_path, incomplete)
     journal.append(folder, JournalEntry(1, Protocol.TCP, 2, 0, Status.PLANNED))
     with pytest.raises(EvidenceError, match="tcp-02 is planned again, although it was valid"):
-        redo(folder)
+        resume_failed(folder)
 
 
 def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(tmp_path: Path, incomplete: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, incomplete)
     (folder / store.REPEATS / "tcp-01.failed3" / "ping.txt").write_text(PING, encoding="utf-8")
     with pytest.raises(EvidenceError, match="evidence is not what was measured"):
-        redo(folder)
+        resume_failed(folder)

@@ -149,28 +149,28 @@ def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.
     assert verification.verify(trial) == [*before, "preflight.txt: changed"]
 
 
-def rot(path: Path) -> None:
+def change_file(path: Path) -> None:
     path.write_text(PING.replace("time=2 ms", "time=9 ms"), encoding="ascii")
 
 
 @pytest.mark.parametrize(
-    ("befalls", "changes"),
+    ("change", "changes"),
     [
-        (rot, {CHANGED: "changed"}),
+        (change_file, {CHANGED: "changed"}),
         (Path.unlink, {CHANGED: "missing"}),
-        (lambda path: rot(path.with_name("more.txt")), {"repeats/tcp-02/more.txt": "not in the manifest"}),
+        (lambda path: change_file(path.with_name("more.txt")), {"repeats/tcp-02/more.txt": "not in the manifest"}),
         (lambda path: path.parent.rename(path.parent.with_name("moved")), {CHANGED: "missing"}),
     ],
     ids=["changed", "missing", "more", "moved"],
 )
 def test_checksums_are_kept_and_differences_reported(
     trial: Path,
-    befalls: Callable[[Path], object],
+    change: Callable[[Path], object],
     changes: dict[str, str],
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     tables = {name: (trial / name).read_bytes() for name in (store.TRIAL_CSV, store.SUMMARY_CSV)}
-    befalls(trial / CHANGED)
+    change(trial / CHANGED)
     output_text = [f"{name}: {kind}" for name, kind in changes.items()]
     to = reopened(trial)
     assert to.differences == changes
@@ -228,7 +228,7 @@ def test_too_little_memory_leaves_the_table_unchanged(
 
 def test_a_table_is_not_rebuilt_from_changed_evidence(trial: Path) -> None:
     (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
-    rot(trial / CHANGED)
+    change_file(trial / CHANGED)
     with pytest.raises(EvidenceError, match=rf"evidence is not what was measured: {CHANGED}: changed"):
         reopened(trial)
 
@@ -252,7 +252,7 @@ def test_a_missing_or_invalid_manifest_is_reported(trial: Path) -> None:
 
 
 def test_a_report_leaves_out_changed_evidence_with_a_note(trial: Path) -> None:
-    rot(trial / CHANGED)
+    change_file(trial / CHANGED)
     page = trial.parent / "report.html"
     assert main(["report", str(trial), "-o", str(page)]) == 0
     assert f"evidence that differs from the manifest is left out: {CHANGED}: changed" in page.read_text(

@@ -99,13 +99,15 @@ def test_only_one_of_many_simultaneous_laptops_locks_the_robot(robot: LocalShell
     jobs.install(robot, Deadline.after(30))
     holders = [Holder(f"trial-{number}", f"laptop-{number}", "x") for number in range(12)]
 
-    def take(holder: Holder) -> bool:
+    def try_lock(holder: Holder) -> bool:
         argv = ("sh", jobs.SCRIPT_PATH, "lock", holder.token, "60", holder.user, holder.purpose)
         return robot.run(argv, deadline=Deadline.after(60), check=False).exit_code == 0
 
     for turn in range(3):
         with ThreadPoolExecutor(len(holders)) as pool:
-            won = [holder for holder, is_locked in zip(holders, pool.map(take, holders), strict=True) if is_locked]
+            won = [
+                holder for holder, is_locked in zip(holders, pool.map(try_lock, holders), strict=True) if is_locked
+            ]
         (winner,) = won
         assert record(robot)[:2] == ["held", winner.token]
         alter(robot, (4, "1"), (5, "0"), (6, "1"))  # expired: in the next round, laptops compete to replace it

@@ -65,7 +65,7 @@ def test_a_table_without_its_trial_cannot_be_rebuilt(tmp_path: Path) -> None:
         sources.find([trial(tmp_path, "1")], print, rebuild=True).read()
 
 
-@pytest.mark.parametrize(("name", "message"), [("gone", "no such file"), (".", "no trial is there")])
+@pytest.mark.parametrize(("name", "message"), [("gone", "no such file"), (".", "there is no trial in this folder")])
 def test_a_path_without_a_trial_is_rejected(tmp_path: Path, name: str, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         load([tmp_path / name])
@@ -73,7 +73,7 @@ def test_a_path_without_a_trial_is_rejected(tmp_path: Path, name: str, message: 
 
 def test_the_remedy_for_tables_in_a_folder_is_valid_in_a_shell(tmp_path: Path) -> None:
     write(tmp_path / "from Ann", [ROW], "lawn.csv")
-    with pytest.raises(ConfigurationError, match="no trial is there or below") as caught:
+    with pytest.raises(ConfigurationError, match="there is no trial in this folder or its subfolders") as caught:
         load([tmp_path / "from Ann"])
     assert caught.value.remedy.endswith(f"CSV files: '{tmp_path / 'from Ann'}'/*.csv")
 

@@ -239,7 +239,7 @@ def test_two_values_with_units_are_compared_in_both_forms(lab: Path, between: st
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ((), "compare takes two runs"),
+        ((), "compare needs two runs"),
         (("--between", "policy=sliding_window"), "write two values"),
         (("--between", "policy=scheduled,scheduled"), "two different values"),
         (("--between", "policy=scheduled,slidingwindow"), "did you mean 'sliding_window'"),

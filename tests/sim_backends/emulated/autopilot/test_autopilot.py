@@ -35,7 +35,7 @@ def take_off(gcs: GroundStation, height_m: float = 3.0) -> None:
     gcs.wait(8)
 
 
-def remarks(gcs: GroundStation) -> list[str]:
+def status_texts(gcs: GroundStation) -> list[str]:
     return [message.text for message in gcs.received if message.get_type() == "STATUSTEXT"]
 
 
@@ -125,8 +125,8 @@ class TestFlight:
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 0) == NOT_NOW
         assert gcs.command(d.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, 0, 0, 0, 5) == NOT_NOW
         gcs.wait(1)
-        assert "Takeoff denied: not armed" in remarks(gcs)
-        assert "Disarming denied: not landed" in remarks(gcs)
+        assert "Takeoff denied: not armed" in status_texts(gcs)
+        assert "Disarming denied: not landed" in status_texts(gcs)
 
     def test_a_takeoff_can_be_repeated_after_a_lost_answer(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
@@ -290,8 +290,8 @@ class TestMission:
 
     @pytest.mark.parametrize("loss", [0.0, 0.05, 0.3])
     def test_a_mission_is_flown_despite_loss(self, loss: float) -> None:
-        dice = random.Random(7)
-        gcs = GroundStation(is_lost=lambda: dice.random() < loss)
+        rng = random.Random(7)
+        gcs = GroundStation(is_lost=lambda: rng.random() < loss)
         items = [item(number, *place) for number, place in enumerate(self.PLACES)]
         items.append(item(len(items), 0, 0, 0, d.MAV_CMD_NAV_RETURN_TO_LAUNCH))
         assert upload(gcs, items) == d.MAV_MISSION_ACCEPTED

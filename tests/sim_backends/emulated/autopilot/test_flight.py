@@ -17,7 +17,7 @@ from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import World
 
 STEP_S = STEP_NS / 1e9
-FLOOR = Ground(None, None).around
+FLOOR = Ground(None, None).obstacles
 OVERSHOOT = 1e-2
 """Fraction by which a speed may exceed its limit for a short time, because the attitude lags."""
 
@@ -108,7 +108,7 @@ def house() -> Sequence[Footprint]:
     """Return a house of 3 m, from 4 m to 8 m east."""
     box = {"name": "house", "kind": "box", "material": "concrete", "centre_m": [6, 0], "size_m": [4, 4, 3]}
     world = World.model_validate({"name": "w", "summary": "", "area_m": [40, 40], "obstacles": [box]})
-    return Ground(world, None).around
+    return Ground(world, None).obstacles
 
 
 def test_it_lands_on_the_roof_below_it_and_a_wall_stops_it() -> None:

@@ -81,7 +81,7 @@ class Drone:
         assert flight is not None
         return flight
 
-    def fall(self) -> list[FlightMotion]:
+    def fall_to_ground(self) -> list[FlightMotion]:
         """Return the recorded motion until it has landed, without the autopilot."""
         flights, deadline = [self.flight()], Deadline.after(30)
         while not (flights[-1].is_supported and flights[-1].velocity_m_s == (0.0, 0.0, 0.0)):
@@ -108,7 +108,7 @@ def drone(folder: Path, physics: str) -> Iterator[Drone]:
             system=1,
             limits=LIMITS,
             airframe_limits=DUCKIEDRONE,
-            obstacles=Ground(None, None).around,
+            obstacles=Ground(None, None).obstacles,
             now_ns=now_ns,
             make_airframe=simulated_airframe("duckiedrone", files, motion),
         )
@@ -138,7 +138,7 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
         assert not vehicle.body.on_ground
 
         last_ns = time.monotonic_ns()
-        flights = flown.fall()
+        flights = flown.fall_to_ground()
         contact = next(flight for flight in flights if flight.is_supported)
         fall_s = math.sqrt(2 * flights[0].place_m[2] / GRAVITY_M_S2)
         assert (contact.time_ns - last_ns - TIMEOUT_NS) / 1e9 == pytest.approx(fall_s, abs=0.1)

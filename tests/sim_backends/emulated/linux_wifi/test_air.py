@@ -1,4 +1,4 @@
-"""The air between radios: each try of a frame, its airtime, and who receives it."""
+"""The air between radios: each try of a frame, its airtime, and its receivers."""
 
 import math
 from itertools import count
@@ -38,7 +38,7 @@ def run(air: Air) -> tuple[AirEvents, int]:
     """Run until no frame is on the air; return the events and the time of the last one."""
     events, now_ns = AirEvents(), 0
     while (next_ns := air.next_event_ns()) is not None:
-        new = air.take_events(next_ns)
+        new = air.pop_events(next_ns)
         events.receptions += new.receptions
         events.statuses += new.statuses
         if new.statuses:
@@ -130,7 +130,7 @@ def test_a_broadcast_arrives_at_all_in_range_without_acknowledgement() -> None:
 def test_a_rate_that_the_model_does_not_have_fails_without_airtime() -> None:
     air = air_with(3.0)
     air.transmit(START_NS, frame(RateStage(15, 2, RATE_MCS)), "a", "b")
-    events = air.take_events(START_NS)
+    events = air.pop_events(START_NS)
     (status,) = events.statuses
     assert (status.acknowledged, status.attempts, events.receptions) == (False, 0, [])
 
@@ -158,7 +158,7 @@ def test_frames_sent_together_wait_for_each_other() -> None:
     air = Air(1, STEADY, dict.fromkeys("abc", ANTENNA))
     air.place(0, {"a": (0.0, 0.0, 1.0), "b": (3.0, 0.0, 1.0), "c": (0.0, 3.0, 1.0)})
     air.transmit(START_NS, frame(RateStage(4, 1)), "a", "b")
-    assert not air.take_events(START_NS).statuses  # a is on the air
+    assert not air.pop_events(START_NS).statuses  # a is on the air
     air.transmit(START_NS + 100_000, frame(RateStage(4, 1)), "c", "b")
     events, end_ns = run(air)
     assert [status.acknowledged for status in events.statuses] == [True, True]

@@ -72,10 +72,10 @@ def test_state_and_moves_are_those_of_the_lab(lab: GuestLab, directory: Path) ->
 
 
 def test_ssh_logs_in_on_a_robot_through_the_channel(lab: GuestLab, directory: Path, tmp_path: Path) -> None:
-    key, known = tmp_path / "key", tmp_path / "known"
+    key, known_hosts = tmp_path / "key", tmp_path / "known"
     key.touch(mode=0o600)
     key.write_text(lab.login.private_key)
-    known.write_text("".join(f"{name} {host_key}\n" for name, host_key in lab.login.host_keys.items()))
+    known_hosts.write_text("".join(f"{name} {host_key}\n" for name, host_key in lab.login.host_keys.items()))
     robot = lab.connect("robot-2", WITHIN_S)
     robot.settimeout(None)
     listener = socket.create_server(("127.0.0.1", 0))
@@ -88,7 +88,7 @@ def test_ssh_logs_in_on_a_robot_through_the_channel(lab: GuestLab, directory: Pa
     with listener:
         thread = threading.Thread(target=join)
         thread.start()
-        options = ("-i", str(key), "-o", f"UserKnownHostsFile={known}", "-o", "HostKeyAlias=robot-2", "-n")
+        options = ("-i", str(key), "-o", f"UserKnownHostsFile={known_hosts}", "-o", "HostKeyAlias=robot-2", "-n")
         port = str(listener.getsockname()[1])
         argv = ("ssh", "-F", "none", *options, "-p", port, f"{lab.login.user}@127.0.0.1", "hostname; seq 50000")
         done = subprocess.run(argv, capture_output=True, text=True, timeout=WITHIN_S, check=False)

@@ -43,16 +43,16 @@ def settings_of(text: str) -> dict[str, str]:
 
 def test_the_relay_has_the_access_point_and_the_others_its_passphrase() -> None:
     specs = parts(TRIO)
-    assert [specs[role].part for role in TRIO] == ["station", "station", "access point"]
+    assert [specs[role].mode for role in TRIO] == ["station", "station", "access point"]
     (passphrase,) = {spec.passphrase for spec in specs.values()}
     assert 8 <= len(passphrase) <= 63, "WPA-PSK, IEEE 802.11-2020, J.4.1"
     assert passphrase not in {spec.passphrase for spec in parts(TRIO).values()}, "a new one for each lab"
-    assert {spec.part for spec in parts(PAIR).values()} == {"ad hoc"}
+    assert {spec.mode for spec in parts(PAIR).values()} == {"ad hoc"}
 
 
 @pytest.mark.parametrize("robots", [TRIO, PAIR], ids=["with a relay", "without"])
 def test_in_a_mesh_all_robots_are_mesh_points(robots: dict[Role, Robot]) -> None:
-    assert {(spec.part, spec.passphrase) for spec in parts(robots, mesh=True).values()} == {("mesh point", "")}
+    assert {(spec.mode, spec.passphrase) for spec in parts(robots, mesh=True).values()} == {("mesh point", "")}
 
 
 @pytest.mark.parametrize("mesh", [False, True])
