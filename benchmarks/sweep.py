@@ -40,6 +40,10 @@ agents:
 traffic:
   - {{kind: stream, name: pose, from: a, to: b, rate: 97Hz, size_bytes: 100}}
 """
+COUNTS: Final = (1, 2)
+"""Numbers of processes for the runs per second."""
+PROCESSES: Final = 2
+"""Number of processes for empty tasks."""
 WINDOWS: Final = "window=7ms,13ms,17ms,19ms"
 
 
@@ -75,7 +79,7 @@ def runs_per_s(plan: SweepPlan, folder: Path, rounds: int) -> dict[str, list[flo
     rates: dict[str, list[float]] = {}
     generator = random.Random(1)
     for number in range(rounds):
-        for count in (1, 2):
+        for count in COUNTS:
             out = folder / f"{number}-{count}"
             # One worker of a sweep is this process, so the peer with one process has its start in addition.
             methods: list[tuple[str, Callable[[], object]]] = [
@@ -96,8 +100,8 @@ def empty_task_s(workers: Workers, tasks: int) -> float:
 
 
 def bare_empty_task_s(tasks: int) -> float:
-    """Return the wall time per empty task of a bare pool of two processes, without their start."""
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+    """Return the wall time per empty task of a bare pool of processes, without their start."""
+    with ProcessPoolExecutor(PROCESSES, get_context("spawn")) as pool:
         pool.submit(nothing, 0).result()
         return timed(lambda: [future.result() for future in [pool.submit(nothing, n) for n in range(tasks)]]) / tasks
 
@@ -111,7 +115,7 @@ def state_costs(plan: SweepPlan, folder: Path) -> dict[str, float]:
         for run in plan.runs:
             state.write_result(run, content)
         write_s = (time.monotonic() - start_s) / len(plan.runs)
-        continue_s = timed(lambda: run_sweep(plan, state, Workers(2), sink=lambda _: None))
+        continue_s = timed(lambda: run_sweep(plan, state, Workers(PROCESSES), sink=lambda _: None))
         dataset_s = timed(lambda: write_dataset(plan, state))
         return {"to write a result": write_s, "to continue if all are finished": continue_s, "dataset": dataset_s}
 
@@ -130,10 +134,10 @@ def main() -> None:
         plan = plan_sweep("pair.yaml", factors, range(1, arguments.seeds + 1), {})
         show_rates(runs_per_s(plan, Path("sweeps"), arguments.rounds))
         show_empty("bare pool", arguments.tasks, bare_empty_task_s(arguments.tasks))
-        show_empty("processes", arguments.tasks, empty_task_s(Workers(2), arguments.tasks))
+        show_empty("processes", arguments.tasks, empty_task_s(Workers(PROCESSES), arguments.tasks))
         memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         print(f"largest memory of the submitting process: {memory_mb:.0f} MB", flush=True)
-        with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:  # type: ignore[no-untyped-call]
+        with LocalCluster(n_workers=PROCESSES, threads_per_worker=1, dashboard_address=None) as cluster:  # type: ignore[no-untyped-call]
             show_empty(
                 "dask", arguments.tasks, empty_task_s(Workers(cluster=cluster.scheduler_address), arguments.tasks)
             )
@@ -146,7 +150,7 @@ def show_rates(rates: Mapping[str, Sequence[float]]) -> None:
     """Print runs per second, and the ratio of both methods in each round."""
     for key, values in rates.items():
         print(f"{key}: {statistics.median(values):.1f} runs/s ({min(values):.1f} to {max(values):.1f})")
-    for count in (1, 2):
+    for count in COUNTS:
         ratios = [ours / bare for ours, bare in zip(rates[f"sweep {count}"], rates[f"bare {count}"], strict=True)]
         print(f"sweep / bare, {count}: {statistics.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})")
 

@@ -14,6 +14,7 @@ import pytest
 
 from fieldkit.core.deadline import Deadline
 from tests.helpers.host import alive
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import run_here
 from tests.helpers.sshd import wait_until
 from tests.helpers.task_workers import (
@@ -106,7 +107,7 @@ def test_slurm_jobs_that_are_cancelled(lab: Path, one_core: Mapping[str, bytes],
     assert dataset(lab / "slurm") == one_core
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("how", mark_nightly([signal.SIGINT, signal.SIGKILL]))
 def test_a_stopped_sweep_continues_and_repeats_nothing(
     how: signal.Signals, lab: Path, one_core: Mapping[str, bytes]
 ) -> None:

@@ -261,7 +261,7 @@ def _short_detour(module: ModuleType, folder: Path) -> None:
 
 CASES: Final[Mapping[str, MinimalRun]] = {
     "aggregate": MinimalRun("--rounds 1 --tables 1 --rows 80"),
-    "archive": MinimalRun("--rounds 1 --trials 100 --repeats 2", {"AGE_S": 2.5}),
+    "archive": MinimalRun("--rounds 1 --trials 20 --repeats 2", {"AGE_S": 2.5}),
     "bridge": MinimalRun(
         "--rounds 1", {"COUNT": 10, "BURST_S": 0.1, "SETTLING_S": 0.5}, shrink=_two_bridge_paths, emulated=True
     ),
@@ -298,7 +298,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     ),
     "minstrel_vs_kernel": MinimalRun("", {"SEEDS": 1}),
     "moves": MinimalRun("--sizes 2", {"STEPS": 10, "WORLDS": ("lawn",)}, emulated=True),
-    "pcap": MinimalRun("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 400}),
+    "pcap": MinimalRun("--rounds 1", {"PACKETS": 6_000, "SCAPY_PACKETS": 100, "BIG_BYTES": 100_000_000}),
     "radio_vs_ns3": MinimalRun("", {"DISTANCES_M": (5,), "STATIONS": (1,), "SECONDS": 0.1}),
     "startup": MinimalRun("--rounds 1", shrink=_two_commands),
     "stop": MinimalRun("--rounds 1", emulated=True),
@@ -308,7 +308,7 @@ CASES: Final[Mapping[str, MinimalRun]] = {
     "telemetry": MinimalRun("--seconds 0.5", {"SLOWER": (1,)}, shrink=_stand_in_iw),
     "topics": MinimalRun("--rounds 1", {"PLAIN": {"zenoh": ("plain", "attached")}, "STREAM_S": 1.0, "BURST_S": 0.1}),
     "trial_overhead": MinimalRun("--rounds 1 --record 1s --round-trips 0s", emulated=True),
-    "sweep": MinimalRun("--rounds 1 --seeds 1 --tasks 8 --duration 100ms"),
+    "sweep": MinimalRun("--rounds 1 --seeds 1 --tasks 8 --duration 100ms", {"COUNTS": (1,), "PROCESSES": 1}),
     "studies.zenoh_images": MinimalRun(
         "--rounds 1", {"SAMPLES": 2, "BYTES": 10_000}, shrink=_one_setting, emulated=True
     ),

@@ -19,6 +19,7 @@ from fieldkit.trial.running.robots import Robots
 from fieldkit.trial.running.runner import run_trial
 from tests.helpers.casts import CAST
 from tests.helpers.idle_testbed import IdleTestbed
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.plans import write_states
 from tests.trial.test_trial_crash import robots_with_evidence
 
@@ -68,7 +69,7 @@ def trials(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("now", UNITS)
-@pytest.mark.parametrize("was", VALUES)
+@pytest.mark.parametrize("was", mark_nightly(VALUES, in_ci=("V", "text")))
 def test_every_command_prints_a_table_or_an_error(
     trials: dict[str, Path],
     tmp_path: Path,

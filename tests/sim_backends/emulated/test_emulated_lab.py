@@ -38,6 +38,7 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import load_world
 from tests.helpers.casts import ros_of
 from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
@@ -266,7 +267,7 @@ def test_sigkill_of_the_owner_leaves_no_processes(untouched: NamespaceComparison
     untouched()
 
 
-@pytest.mark.parametrize("parent", ["/tmp", "/opt", "/root"])
+@pytest.mark.parametrize("parent", mark_nightly(["/root", "/tmp", "/opt"]))
 def test_a_clone_anywhere_works(parent: str) -> None:
     folder = Path(parent, f"fieldkit clone {os.getpid()}")
     try:
