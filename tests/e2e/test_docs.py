@@ -26,6 +26,7 @@ from fieldkit.steps.base import Step
 from fieldkit.steps.kinds.run import RunStep
 from tests.helpers.labs import built_in_ros
 from tests.helpers.paths import ROOT
+from tests.helpers.runs import run_here
 
 PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
 COMMAND_S = 600.0
@@ -33,6 +34,9 @@ DEBIAN_ROS = {"README.md", "tutorial.md"}
 """Pages whose trials use Debian's ROS if it is installed; the others use the built-in one to save time."""
 OWN_SITE = re.compile(r"fieldkit\.yaml|^ls|fieldkit (init|lab)|fieldkit --?")
 """Commands that need a folder without a site file."""
+
+PLAIN = re.compile(r"fieldkit (?P<words>[^|<>;&$'\"\n]*)(?P<rest>[|>][^\n]*)?")
+"""A command that this process can run."""
 
 TOPIC = re.compile(r"fieldkit docs ([a-z][a-z0-9_-]*)")
 MARKDOWN_FILE = re.compile(r"[\w/-]+\.md\b")
@@ -94,29 +98,56 @@ def make_targets() -> set[str]:
     return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
 
+def run_command(text: str, folder: Path) -> tuple[int, str]:
+    """Run a command in a folder; return its exit code and its output.
+
+    `fieldkit` with plain words runs in this process, and a shell runs only the rest of its line, `| grep 'x'`.
+    """
+    if (plain := PLAIN.fullmatch(text)) is None:
+        return run_in_shell(text, folder)
+    words = [path for word in plain["words"].split() for path in expanded(word, folder)]
+    with Path(os.devnull).open(encoding="utf-8") as nothing, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdin", nothing)
+        run = run_here(folder, *words)
+    if not plain["rest"]:
+        return run.code, run.err + run.out
+    code, output = run_in_shell(f"cat {plain['rest']}", folder, run.out)
+    return code, run.err + output
+
+
+def expanded(word: str, folder: Path) -> list[str]:
+    """Return the paths that match a pattern, relative to the folder; the word itself if none does."""
+    paths = sorted(folder.glob(word)) if "*" in word else []
+    return [str(path.relative_to(folder)) for path in paths] or [word]
+
+
+def run_in_shell(text: str, folder: Path, stdin: str = "") -> tuple[int, str]:
+    process = subprocess.run(
+        ("bash", "-euc", text),
+        cwd=folder,
+        env=os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"},
+        input=stdin,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=COMMAND_S,
+        check=False,
+    )
+    return process.returncode, process.stdout
+
+
 def run_commands(page: Path, folder: Path) -> None:
     """Run the commands of a page in an empty folder."""
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     if page.name not in DEBIAN_ROS and not any(OWN_SITE.search(command.text) for command in commands(page)):
         built_in_ros(folder)
     for command in commands(page):
         if target := re.fullmatch(r"make ([a-z]+)", command.text):
             assert target[1] in make_targets()
             continue
-        process = subprocess.run(
-            ("bash", "-euc", command.text),
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            timeout=COMMAND_S,
-            check=False,
-        )
-        assert process.returncode == command.exit_code, f"$ {command.text}\n{process.stdout}"
+        code, output = run_command(command.text, folder)
+        assert code == command.exit_code, f"$ {command.text}\n{output}"
         if command.output and REPRODUCIBLE.search(command.text):
-            assert shape(command.output) == shape(process.stdout), f"$ {command.text}\n{process.stdout}"
+            assert shape(command.output) == shape(output), f"$ {command.text}\n{output}"
 
 
 COMMAND_PAGES = sorted(
