@@ -22,7 +22,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # A busy machine makes any example slow. `make test` uses `ci`, which is the profile of hypothesis with fewer
 # examples, the same ones each time. `make nightly` uses `nightly`, with other examples each time.
 settings.register_profile("fieldkit", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("ci", settings.get_profile("ci"), max_examples=50)
+settings.register_profile("ci", settings.get_profile("ci"), max_examples=25)
 settings.register_profile("nightly", settings.get_profile("fieldkit"), print_blob=True)
 settings.load_profile("fieldkit")
 

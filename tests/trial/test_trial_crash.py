@@ -60,7 +60,7 @@ PING 10.42.0.2 (10.42.0.2) 502(530) bytes of data.
 1 packets transmitted, 1 received, 0% packet loss, time 0ms
 """
 
-STRIDES = mark_nightly([3, 1])
+STRIDES = mark_nightly([4, 1])
 """Distances between the writes at which a test interrupts a trial: CI interrupts at every third one."""
 
 # Calls that write something to disk or remove it.
