@@ -41,7 +41,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("trial los 30ft --site nope.yaml", "No such file"),
         ("trial los 30ft --out /proc/trials", "no trial can be stored there"),
         ("trial los 30ft --answers nope.txt", "the answers cannot be read"),
-        ("robots show turtlebot", "did you mean 'turtlebot3_burger'?"),
+        ("robots show turtlebot3_burgr", "did you mean 'turtlebot3_burger'?"),
         ("procedures show loss", "did you mean 'los'?"),
         ("columns show iploss", "did you mean 'ip_loss'?"),
         ("rebuild .", "there is no trial.yaml"),

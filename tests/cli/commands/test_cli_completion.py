@@ -23,7 +23,7 @@ LINES = {
     "fieldkit tria": "fieldkit trial ",
     "fieldkit trial driv": "fieldkit trial driveaway ",
     "fieldkit trial los 30ft --topo": "fieldkit trial los 30ft --topology ",
-    "fieldkit robots show duck": "fieldkit robots show duckiedrone ",
+    "fieldkit robots show duckied": "fieldkit robots show duckiedrone ",
     "fieldkit resume trials/on": "fieldkit resume trials/one ",
 }
 
