@@ -15,8 +15,15 @@ from fieldkit.config.profiles import PublishedTopic, RobotProfile
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.emulated_options import HOST_TOOLS, EmulatedOptions, RosChoice, uses_debian_ros
 from sim_backends.emulated.motion_sections import drive_of, mavlink_of
-from sim_backends.emulated.robot import network
-from sim_backends.emulated.robot.spec import ANTENNA_M, LOOPBACK, Base, RobotSpec, Ros2Spec
+from sim_backends.emulated.robot.spec import (
+    ANTENNA_M,
+    LOOPBACK,
+    LOOPBACK_INTERFACE,
+    SHARED_NETWORK,
+    Base,
+    RobotSpec,
+    Ros2Spec,
+)
 from sim_backends.emulated.ros import static_frames
 from sim_backends.emulated.ros.sensor_specs import (
     GENERATED_TYPES,
@@ -203,10 +210,10 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
     last_byte = int(IPv4Address(address)) - int(NETWORK.network_address)
     networks = {name: NETWORK.network_address + 256 * number for number, name in enumerate(sorted(options.links), 1)}
     for name, interface in profile.further_links.items():
-        if interface == network.LOOPBACK and options.mesh is not None:
-            networks[name] = network.SHARED_NETWORK.network_address
+        if interface == LOOPBACK_INTERFACE and options.mesh is not None:
+            networks[name] = SHARED_NETWORK.network_address
         if name not in networks:
-            has_address_only = interface == network.LOOPBACK
+            has_address_only = interface == LOOPBACK_INTERFACE
             example = (
                 "mesh: {daemon: babeld, hello: 0.5s}"
                 if has_address_only
@@ -221,7 +228,7 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
 
 
 def _prefix_length(interface: str) -> int:
-    return 32 if interface == network.LOOPBACK else NETWORK.prefixlen
+    return 32 if interface == LOOPBACK_INTERFACE else NETWORK.prefixlen
 
 
 def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:

@@ -24,7 +24,7 @@ from sim_backends.emulated.process.worker import Message
 from sim_backends.emulated.robot import mounts, network, rootfs, services, wireless
 from sim_backends.emulated.robot.commanded import COMMANDED
 from sim_backends.emulated.robot.services import Service
-from sim_backends.emulated.robot.spec import HOME, STATE, RobotSpec, WifiSpec
+from sim_backends.emulated.robot.spec import HOME, LOOPBACK_INTERFACE, STATE, RobotSpec, WifiSpec
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.laser import Neighbourhood
 from sim_backends.emulated.ros.own_motion import AssignedPath
@@ -264,7 +264,7 @@ def _open_devices(request: Message) -> list[int]:
     """Bring up a link, and the routing daemon of a mesh guest; return the descriptor of its device, if it has one."""
     interface, address = request["interface"], request["address"]
     if request["do"] == "open link":
-        if interface == network.LOOPBACK:
+        if interface == LOOPBACK_INTERFACE:
             network.add_loopback_address(address)
             return []
         return [network.add_link(interface, address, mesh=request["mesh"])]

@@ -8,21 +8,17 @@ import socket
 import struct
 import subprocess
 from collections.abc import Mapping
-from ipaddress import IPv4Interface, IPv4Network
+from ipaddress import IPv4Interface
 from pathlib import Path
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, RobotError
 from sim_backends.emulated.medium.framing import mac_of
-from sim_backends.emulated.robot.spec import STATE
+from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
 
 PID: Final = Path(STATE, "babeld.pid")
 """Written when the daemon has its socket and its interface, before its first hello."""
 
-LOOPBACK: Final = "lo"
-"""Interface of the link whose address is reached over any other link of the robots."""
-SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
-"""Addresses of the robots on that link."""
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""
 
@@ -36,12 +32,12 @@ def command(interface: str, address: str, hello_s: float, links: Mapping[str, st
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
         address: The robot's address with the prefix length; each robot announces its own address as a host route.
         hello_s: Hello interval.
-        links: Address with the prefix length by the interface of each further link. With an address on `LOOPBACK`,
-            the daemon also uses the other links, each at `LINK_COST`, and announces that address over all of them,
-            but the address on the radio only over the radio.
+        links: Address with the prefix length by the interface of each further link. With an address on
+            `LOOPBACK_INTERFACE`, the daemon also uses the other links, each at `LINK_COST`, and announces that address
+            over all of them, but the address on the radio only over the radio.
     """
-    either = links.get(LOOPBACK)
-    others = [name for name in links if name != LOOPBACK] if either else []
+    either = links.get(LOOPBACK_INTERFACE)
+    others = [name for name in links if name != LOOPBACK_INTERFACE] if either else []
     more = [f"out if {name} ip {IPv4Interface(address).network} deny" for name in others]
     more += [f"interface {name} type tunnel rxcost {LINK_COST} hello-interval {hello_s:g}" for name in others]
     if either is not None:
@@ -219,7 +215,7 @@ def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
 
 def add_loopback_address(address: str) -> None:
     """Give the robot an address that it has on no link; errors as `run_ip`."""
-    run_ip(f"address add {address} dev {LOOPBACK}")
+    run_ip(f"address add {address} dev {LOOPBACK_INTERFACE}")
 
 
 def switch_on_link(interface: str) -> None:

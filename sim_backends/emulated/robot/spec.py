@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from ipaddress import IPv4Network
 from typing import Any, Final, Literal, Self
 
 from fieldkit.core.model import ROS_MASTER_PORT
@@ -25,6 +26,10 @@ HOME: Final = "/root"
 STATE: Final = "/run/robot"
 """Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
 
+LOOPBACK_INTERFACE: Final = "lo"
+"""Interface of the link whose address is reached over any other link of the robots."""
+SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
+"""Addresses of the robots on that link."""
 LOOPBACK: Final = "127.0.0.1"
 
 ANTENNA_M: Final = 0.2
