@@ -32,9 +32,9 @@ def command(interface: str, address: str, hello_s: float, links: Mapping[str, st
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
         address: The robot's address with the prefix length; each robot announces its own address as a host route.
         hello_s: Hello interval.
-        links: Address with the prefix length by the interface of each further link. With an address on
-            `LOOPBACK_INTERFACE`, the daemon also uses the other links, each at `LINK_COST`, and announces that address
-            over all of them, but the address on the radio only over the radio.
+        links: Address with the prefix length by the interface of each further link. If `LOOPBACK_INTERFACE` has one,
+            the daemon also uses the other links, each at `LINK_COST`, and announces that address over all of them.
+            It announces the address on the radio only over the radio.
     """
     either = links.get(LOOPBACK_INTERFACE)
     others = [name for name in links if name != LOOPBACK_INTERFACE] if either else []

@@ -25,13 +25,12 @@ from sim_backends.emulated import emulated_options, placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
 from sim_backends.emulated.medium.air_log import LIMIT_BYTES
-from sim_backends.emulated.provisioning import KeyPair, definition, robot_spec
+from sim_backends.emulated.provisioning import KeyPair, _sensor, definition, robot_spec
 from sim_backends.emulated.robot import mounts, rootfs
 from sim_backends.emulated.ros import messages, sensor_specs, tcpros
 from sim_backends.emulated.ros.sensor_specs import LaserTarget, Sensor
 from sim_backends.ros1 import framing
 from sim_backends.world.world import load_world
-from tests.helpers.casts import ros_of
 from tests.helpers.labs import replace_text
 
 STORE = shipped().ros1
@@ -257,8 +256,8 @@ class TestMessages:
 
     @pytest.mark.parametrize("profile", locations.names("robots"))
     def test_every_profile_s_topics_can_be_published(self, profile: str) -> None:
-        for topic in ros_of(load_profile(profile)).topics:
-            sensor_specs.check(Sensor(topic.name, topic.type, topic.rate, topic.frame, topic.points))
+        for topic in load_profile(profile).topics:
+            sensor_specs.check(_sensor(topic))
 
     def test_a_scan_has_the_real_size_and_is_within_the_laser_s_range(self) -> None:
         data = messages.Source(sensor(), [ROOM]).message(0, 0)

@@ -25,7 +25,7 @@ from sim_backends.emulated.ros.own_motion import AT_REST, Odometer, OwnMotion
 from sim_backends.emulated.ros.sensor_specs import GENERATED_TYPES, LaserTarget, Sensor
 from sim_backends.world.motion import GRAVITY_M_S2
 from sim_backends.world.world import load_world
-from tests.helpers.casts import CAST, ros_of
+from tests.helpers.casts import CAST
 
 S: Final = 10**9
 PROFILES: Final = locations.names("robots")
@@ -40,14 +40,18 @@ STORE: Final = shipped().ros1
 @cache
 def of_profile(name: str) -> dict[str, Sensor]:
     """Return the sensors of a shipped robot by their topics."""
-    return {topic.name: _sensor(topic) for topic in ros_of(load_profile(name)).topics}
+    return {topic.name: _sensor(topic) for topic in load_profile(name).topics}
 
 
 def sensors(kind: str = "") -> list[Sensor]:
-    """Return the sensors of all shipped robots, or those of one type."""
-    result = [sensor for name in PROFILES for sensor in of_profile(name).values()]
+    """Return the sensors of all shipped robots, or those of one type; of equal sensors of several robots only one."""
+    result = {
+        (sensor.type, sensor.frame, sensor.points): sensor
+        for name in PROFILES
+        for sensor in of_profile(name).values()
+    }
     assert result
-    return [sensor for sensor in result if kind in (sensor.type, "")]
+    return [sensor for sensor in result.values() if kind in (sensor.type, "")]
 
 
 def publish(sensor: Sensor, now: OwnMotion = AT_REST, *, source: Source | None = None, number: int = 1) -> Any:  # noqa: ANN401 (of rosbags)
@@ -80,7 +84,7 @@ def yaw_rad(quaternion: Any) -> float:  # noqa: ANN401 (as above)
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_topic_of_a_shipped_robot_has_a_generator(profile: str) -> None:
-    assert {topic.type for topic in ros_of(load_profile(profile)).topics} <= GENERATORS.keys()
+    assert {sensor.type for sensor in of_profile(profile).values() if sensor.template is None} <= GENERATORS.keys()
 
 
 def test_the_generated_types_are_those_with_a_generator() -> None:
@@ -89,7 +93,7 @@ def test_the_generated_types_are_those_with_a_generator() -> None:
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_message_has_a_frame_that_tf2_accepts(profile: str) -> None:
-    for topic in ros_of(load_profile(profile)).topics:
+    for topic in load_profile(profile).topics:
         for header in headers(publish(_sensor(topic))):
             assert header.frame_id == topic.frame
             assert not header.frame_id.startswith("/"), "tf2 rejects these"
@@ -143,7 +147,7 @@ def test_a_transform_is_the_pose_of_its_robot_s_odometry(now: OwnMotion) -> None
         )
         assert odom.header.frame_id == transform.header.frame_id == "odom"
         assert odom.child_frame_id == transform.child_frame_id
-        assert odom.child_frame_id in {"base_link", "base_footprint"}
+        assert odom.child_frame_id in {"base_link", "base_footprint", "body"}
         pose, moved = odom.pose.pose, transform.transform
         assert (pose.position.x, pose.position.y, 0.0) == (moved.translation.x, moved.translation.y, pose.position.z)
         assert pose.orientation == moved.rotation

@@ -9,11 +9,10 @@ from fieldkit.config.profiles import load_profile
 from fieldkit.ros.interfaces.types import shipped
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import static_frames
-from tests.helpers.casts import ros_of
 
 
 def links_of(profile: str) -> tuple[static_frames.Link, ...]:
-    return static_frames.links(map(_sensor, ros_of(load_profile(profile)).topics))
+    return static_frames.links(map(_sensor, load_profile(profile).topics))
 
 
 @pytest.mark.parametrize("profile", locations.names("robots"))
@@ -21,7 +20,7 @@ def test_every_frame_of_a_shipped_robot_has_one_path_to_the_world(profile: str) 
     links = links_of(profile)
     parent_of = {child: parent for parent, child in links}
     assert len(parent_of) == len(links), "tf2 accepts one parent"
-    topics = ros_of(load_profile(profile)).topics
+    topics = load_profile(profile).topics
     moving_frames = {topic.child_frame for topic in topics if topic.child_frame} or {static_frames.BASE}
     world_frames = {topic.frame for topic in topics if topic.child_frame} | {"", "map"}
     for topic in topics:
