@@ -68,6 +68,17 @@ class Moves(Capability):
         """Yield a sentence for each of these robots: what it does if the attempt is stopped immediately."""
 
 
+class Roams(Capability):
+    """A step during which robots may change their access point, and with it the channel.
+
+    Any other change of a robot's channel makes an attempt void.
+    """
+
+    @abstractmethod
+    def roams(self) -> frozenset[Role]:
+        """Return the roles of these robots."""
+
+
 class Restarts(Capability):
     """A step that restarts robots. Any other restart makes an attempt void."""
 

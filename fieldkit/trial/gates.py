@@ -14,11 +14,12 @@ from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.evidence import link, link_samples, oracle_delays, track
 from fieldkit.measure.positions import position_columns
 from fieldkit.measure.robot_state import attempt_states
+from fieldkit.steps.capabilities import Roams
 from fieldkit.steps.scene import Scene
 from fieldkit.steps.view import View
 from fieldkit.trial import hosts
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.procedure import PlacedStep
+from fieldkit.trial.procedure import PlacedStep, Procedure
 from fieldkit.trial.step_errors import StepErrors
 
 _TIME_UNITS: Final = frozenset(("s", "bit/s", "m/s", "ppm"))
@@ -99,13 +100,20 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     names = {role: scene.robot(role).name for role in sort_roles(plan.procedure.roles())}
-    problems += attempt_states.problems(evidence, names)
+    roaming = _roaming(plan.procedure)
+    problems += attempt_states.problems(evidence, {role: name for role, name in names.items() if role not in roaming})
     measured = attempt_states.measure(evidence, names, measured)
     # Otherwise an optional file would count as missing, and the error of its reader would be lost.
     problems += (
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
     )
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
+
+
+def _roaming(procedure: Procedure) -> frozenset[Role]:
+    """Return the roles of the robots whose channel may change."""
+    steps = (placed.step for placed in procedure.walk())
+    return frozenset[Role]().union(*(step.roams() for step in steps if isinstance(step, Roams)))
 
 
 def _with_telemetry(

@@ -14,14 +14,14 @@ from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import handovers, ping
 from fieldkit.steps.base import StepEntry
-from fieldkit.steps.capabilities import DescribesActions, Summarizes
+from fieldkit.steps.capabilities import DescribesActions, Roams, Summarizes
 from fieldkit.steps.kinds.ping import PingStep
 from fieldkit.steps.nest import Nest, steps_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
 
 
-class RoamStep(Nest, DescribesActions, Summarizes):
+class RoamStep(Nest, DescribesActions, Roams, Summarizes):
     """Measures the handovers of a station between access points while the steps in `during` run.
 
     One of them must be a `ping` that the robot sends, so that the times of answers and of link samples have one
@@ -87,6 +87,10 @@ class RoamStep(Nest, DescribesActions, Summarizes):
         output = view.evidence.read_or_none(ping.read, step.ping_source().file)
         samples = view.evidence.links(self.robot)
         return handovers.measure(samples, output, step.interval, self.ping_pong)
+
+    @override
+    def roams(self) -> frozenset[Role]:
+        return frozenset({self.robot})
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

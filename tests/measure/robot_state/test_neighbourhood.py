@@ -1,16 +1,22 @@
 """Networks and airtime of others on a channel: real outputs of several versions of `iw`, and useless ones."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from fieldkit.core.columns import Measured
-from fieldkit.core.model import Role
+from fieldkit.core.model import Protocol, Role, Topology
+from fieldkit.core.units import parse_distance
 from fieldkit.measure.attempt import AttemptEvidence
 from fieldkit.measure.robot_state import attempt_states, neighbourhood
 from fieldkit.measure.robot_state.neighbourhood import RadioState, WifiChannel
 from fieldkit.measure.robot_state.snapshots import SourceOutput
+from fieldkit.trial.procedure import load_procedure
+from fieldkit.trial.request import TrialRequest, make_plan
+from tests.helpers.casts import CAST
 from tests.helpers.paths import DATA
+from tests.helpers.plans import problems
 
 INFO = "Interface wlan0\n\taddr 02:00:00:00:01:00\n\tssid lab\n\ttype managed\n\tchannel {0}\n\ttxpower 20.00 dBm\n"
 CHANNEL_1 = "1 (2412 MHz), width: 20 MHz, center1: 2412 MHz"
@@ -115,14 +121,14 @@ def test_the_regulatory_domain() -> None:
     assert parse(reg="command failed: No such file or directory (-2)").country is None
 
 
-def write(folder: Path, when: str, channel: str, busy_ms: int) -> None:
+def write(folder: Path, when: str, channel: str, busy_ms: int, *, role: str = "sender") -> None:
     outputs = {"iw-info": INFO.format(channel), "iw-survey": survey((0, 0, 0), (500, busy_ms, 0))}
     outputs |= {"iw-scan": text("scan-hwsim-5"), "iw-reg": text("reg-ath10k-ct")}
     lines = "".join(
         f"==> {name} <==\n" + "".join(f" {line}\n" for line in (*output.split("\n"), "code 0"))
         for name, output in outputs.items()
     )
-    (folder / f"sender-sources-{when}.txt").write_text(lines, encoding="utf-8")
+    (folder / f"{role}-sources-{when}.txt").write_text(lines, encoding="utf-8")
 
 
 def test_a_busy_channel_marks_the_repeat(tmp_path: Path) -> None:
@@ -149,4 +155,20 @@ def test_a_changed_channel_is_a_problem(tmp_path: Path) -> None:
     assert problem == (
         "rover-1: the channel of its radio changed during the repeat, from 1 (2412 MHz), width 20 MHz to "
         "6 (2437 MHz), width 40 MHz"
+    )
+
+
+@pytest.mark.parametrize(("procedure", "is_problem"), [("los", True), ("roam", False)])
+def test_only_a_robot_that_roams_may_change_its_channel(tmp_path: Path, procedure: str, is_problem: bool) -> None:
+    for role in ("sender", "receiver"):
+        write(tmp_path, "before", CHANNEL_1, 0, role=role)
+        write(tmp_path, "after", CHANNEL_6, 0, role=role)
+    request = TrialRequest(load_procedure(procedure), parse_distance("5m"), topology=Topology.MASTERLESS, seed=1)
+    cast = {role: CAST[role] for role in (Role.SENDER, Role.RECEIVER)}
+    plan = make_plan(request, backend="field", cast=cast, now=datetime(2026, 11, 20, tzinfo=UTC))
+    reasons = [
+        reason for reason in problems(plan, Protocol.UDP, tmp_path) if "channel of its radio changed" in reason
+    ]
+    assert [reason.partition(":")[0] for reason in reasons] == (
+        ["turtlebot-1", "turtlebot-2"] if is_problem else ["turtlebot-1"]
     )
