@@ -22,6 +22,8 @@ SIZES = {MULTICAST: 200, UNICAST: 200, FRAGMENTED: 8000}
 """Bytes of payload of each kind; 8,000 bytes are 6 fragments at an MTU of 1,500 bytes."""
 
 _POLL_S = 0.2
+_LAST_S = 0.2
+"""Time after a stop in which datagrams are counted that arrived before it."""
 _MAX_BYTES = 65_536
 _MAX_SENDERS = 64
 """Number of sender addresses that are counted; others are ignored."""
@@ -98,8 +100,13 @@ def _count(
     sockets: Sequence[socket.socket], token: str, stop_event: threading.Event, end_s: float
 ) -> dict[str, dict[str, int]]:
     numbers: dict[str, dict[str, set[bytes]]] = {}
-    while not stop_event.is_set() and time.monotonic() < end_s:
-        readable, _, _ = select.select(sockets, [], [], _POLL_S)
+    while True:
+        if stop_event.is_set():
+            end_s = min(end_s, time.monotonic() + _LAST_S)
+        readable, _, _ = select.select(sockets, [], [], _LAST_S if stop_event.is_set() else _POLL_S)
+        # Datagrams that arrived before the stop are still counted.
+        if time.monotonic() >= end_s or (stop_event.is_set() and not readable):
+            break
         for endpoint in readable:
             data, (address, _port) = endpoint.recvfrom(_MAX_BYTES)
             words = data[:128].split(b" ")

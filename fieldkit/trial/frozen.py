@@ -11,7 +11,7 @@ from fieldkit.config import schema
 from fieldkit.config.schema import AfterValidator, Field, Int, Number, Strict
 from fieldkit.core.columns import Column, Figure, Kind
 
-MAX_COLUMNS: Final = 2000
+MAX_COLUMNS: Final = 3000
 """Maximum number of columns of a trial that not every trial has."""
 _MAX_FLOAT: Final = sys.float_info.max  # the YAML reader rejects infinity, and no column has such a value
 

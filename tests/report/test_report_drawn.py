@@ -184,7 +184,7 @@ def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
     path.write_text(to_csv(rows, columns), encoding="utf-8")
     (chart,) = curves(read([path], columns), name)
     assert chart.caption == "Share of the valid repeats in which it is true, with its 95 % interval."
-    assert chart.panels[0].y_label == "Ping back after reboot [% of repeats]"
+    assert chart.panels[0].y_label == "Reachable after reboot [% of repeats]"
     assert chart.panels[0].series[0].behind == []
 
 

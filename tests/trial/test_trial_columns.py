@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps import kinds
 from fieldkit.steps.base import step_types
 from fieldkit.trial import frozen, rows
-from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_steps, trial_columns
+from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_robots, of_steps, trial_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.stored import plans, tables
@@ -90,10 +90,10 @@ def test_common_columns_are_first_independently_of_their_rank() -> None:
     assert len({column.name for column in trial_columns()}) == len(trial_columns())
 
 
-def test_the_paper_s_procedure_freezes_nothing() -> None:
-    assert los_plan().columns is None
-    assert los_plan().table == trial_columns()
-    assert "columns:" not in schema.dump(los_plan())
+def test_the_paper_s_procedure_freezes_only_the_columns_of_robots() -> None:
+    plan = los_plan()
+    assert plan.columns == freeze(of_robots(plan.procedure.roles()))
+    assert names(plan.table) == names((*trial_columns(), *of_robots(plan.procedure.roles())))
 
 
 def test_a_named_column_has_named_figures_and_counts() -> None:
@@ -181,7 +181,7 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     assert filled[-3:] == names(columns)
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
-    plan = los_plan().model_copy(update={"procedure": parsed_procedure})
+    plan = los_plan().model_copy(update={"procedure": parsed_procedure, "columns": None})
     assert plan.table == (*trial_columns(), *columns), "a plan of an earlier version, without columns"
 
 

@@ -8,8 +8,8 @@ from typing_extensions import override
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field
-from fieldkit.core.columns import Measured, Value
-from fieldkit.core.crosschecks import CrossCheck
+from fieldkit.core.columns import Column, Measured, Value
+from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.model import Protocol, Role
 from fieldkit.core.units import format_count
 from fieldkit.measure.evidence import handovers, ping
@@ -35,7 +35,6 @@ class RoamStep(Nest, DescribesActions, Roams, Summarizes):
         during: Steps that run at the same time, usually a `move` with the `ping`.
     """
 
-    columns = handovers.COLUMNS
     cross_checks = (
         CrossCheck(
             "access points",
@@ -43,6 +42,7 @@ class RoamStep(Nest, DescribesActions, Roams, Summarizes):
             "`ROLE-link.txt`, or `link.csv` of a lab",
             (),
             "only the driver of the robot reports its access point",
+            CheckOutcome.UNCHECKED,
         ),
         CrossCheck(
             "gaps of handovers",
@@ -80,6 +80,11 @@ class RoamStep(Nest, DescribesActions, Roams, Summarizes):
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         for entry in self.during:
             entry.step.run(scene, testbed, announce)
+
+    @override
+    def output_columns(self) -> tuple[Column, ...]:
+        """Return the columns of handovers, which only trials with this step have."""
+        return handovers.COLUMNS
 
     @override
     def measure(self, view: View) -> Measured:

@@ -85,6 +85,8 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     assert {path.name for path in into.iterdir()} == {
         "receiver-before.txt",
         "receiver-after.txt",
+        "receiver-sources-before.txt",
+        "receiver-sources-after.txt",
         "sender-unfetched.txt",
     }
     assert robots.unfetched.by_robot() == {"turtlebot-1": [attempts["udp-01-1"]]}

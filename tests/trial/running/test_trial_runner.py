@@ -13,6 +13,7 @@ from fieldkit.core.errors import ConfigurationError, LockLostError, RobotError
 from fieldkit.core.events import Event, ExpectationJudged, Note, RepeatEnded, TrialEnded
 from fieldkit.core.model import Protocol, RepeatId, Role, Status
 from fieldkit.measure.attempt import AttemptEvidence
+from fieldkit.measure.robot_state.exchanges import Exchanges
 from fieldkit.trial import gates, journal, store
 from fieldkit.trial.gates import EvidenceVerdict
 from fieldkit.trial.journal import JournalEntry
@@ -93,9 +94,10 @@ def test_after_an_abort_by_another_user_fetched_folders_are_deleted(
 ) -> None:
     removed: list[str | None] = []
 
-    def begin(_self: Robots, remote: str, *, old: str | None) -> None:
+    def begin(_self: Robots, remote: str, *, old: str | None) -> Exchanges:
         if old is not None:
             raise LockLostError("the trial was aborted by anna@one at 12:00:00 UTC", where="turtlebot-1")
+        return {}
 
     monkeypatch.setattr(Robots, "begin", begin)
     monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))

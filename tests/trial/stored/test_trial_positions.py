@@ -91,7 +91,7 @@ def test_added_positions_fill_columns_have_checksums_and_can_be_removed(
         (["receiver=bad.csv"], 4, "bad.csv:2: 'noon' is not a time"),
         (["receiver=huge.gpx"], 2, "huge.gpx: it has 67 MB"),
         (["receiver=walk.csv", "--offset", "3"], 2, "has no unit"),
-        (["receiver=walk.csv", "--gap", "soon"], 2, "is not a duration"),
+        (["receiver=walk.csv", "--gap", "soon"], 2, "'soon' is not a --gap"),
         (["receiver=walk.csv", "--clear"], 2, "--clear removes the stored files"),
     ],
 )
