@@ -132,7 +132,7 @@ def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(field_robo
         )
         evidence.begin(sender[Role.SENDER], job.folder, "sender", "wlan0")
         jobs.start(sender[Role.SENDER], job)
-        run = run_here(lab, *CHECK)
+        run = run_here(lab, *CHECK, "--ros")
         evidence.end_jobs(sender[Role.SENDER], job.folder)
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "lock")}, "a process of anna is no leftover"
@@ -140,6 +140,8 @@ def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(field_robo
     assert "anna@one holds the robot for trial-a" in lock["detail"]
     assert lock["remedy"].endswith(": fieldkit abort")
     assert ("turtlebot-1", "topic /scan") not in findings_by_check(run)
+    assert findings_by_check(run)["laptop", "network"]["status"] == "warn"
+    assert not [check for _, check in findings_by_check(run) if check.startswith("UDP")]
 
 
 def test_a_changed_host_key_names_both_fingerprints(field_robots: FieldRobots, lab: Path) -> None:

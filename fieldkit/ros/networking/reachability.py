@@ -78,7 +78,8 @@ def _judge_count(
 
 def advertised_name(state: RosState) -> str:
     """Return the name under which nodes of ROS 1 are reached (wiki.ros.org/ROS/EnvironmentVariables)."""
-    return state.variables.get("ROS_HOSTNAME") or state.variables.get("ROS_IP") or state.hostname
+    name = state.variables.get("ROS_HOSTNAME") or state.variables.get("ROS_IP") or state.hostname
+    return name.lstrip("-")  # otherwise getent would take it as an option
 
 
 def _host(uri: str) -> str | None:

@@ -82,21 +82,24 @@ def check(
         shells: The robots.
         out: Folder of the trial.
         all_checks: Whether to also check locks, and to run the checks that packages add (`plugins.CHECKS`).
-        fleet_checks: Checks of all robots together, which run last.
+        fleet_checks: Checks of all robots together, which run last, unless a robot is locked.
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
 
-    def check_robot(role: Role) -> None:
-        _check(plan, role, shells[role], variants_by_role, reports[role], all_checks=all_checks)
+    def check_robot(role: Role) -> bool:
+        return _check(plan, role, shells[role], variants_by_role, reports[role], all_checks=all_checks)
 
-    run_parallel(check_robot, plan.cast)
+    are_unlocked = run_parallel(check_robot, plan.cast)
     for refusal in plan.refusals(variants_by_role):
         reports[refusal.role].fail("tools", refusal.what, refusal.remedy)
     reachable = {role: shells[role] for role in plan.cast if role in variants_by_role}
-    for fleet_check in fleet_checks:
-        fleet_check(plan, reachable, reports)
     laptop = Report(LAPTOP)
+    if all(are_unlocked):
+        for fleet_check in fleet_checks:
+            fleet_check(plan, reachable, reports)
+    elif fleet_checks:  # their packets would disturb the radio of the other user
+        laptop.warn("network", "not checked, because a robot is locked", HELD_REMEDY)
     system.judge_laptop(plan, out, laptop)
     return Checked(_all_findings([*reports.values(), laptop]), variants_by_role)
 
@@ -141,7 +144,8 @@ def require_passed(findings: Sequence[Finding]) -> None:
 
 def _check(
     plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
-) -> None:
+) -> bool:
+    """Add the findings on a robot; return False if another user has locked it."""
     stage, robot = _CONNECTION, plan.cast[role]
     try:
         offset = contact.judge(shell, report)
@@ -156,12 +160,12 @@ def _check(
         jobs.install(shell, Deadline.after(JOBS_S))
         # A trial has locked its robots already. A recording would disturb jobs of another user.
         if all_checks and not _judge_lock(locks.holder(shell), report):
-            return
+            return False
         _judge_jobs(plan, jobs.list_running(shell, Deadline.after(JOBS_S)), report)
         stage = "agent"
         software.check_agent(plan, role, sections, shell, report)
         if not all_checks:
-            return
+            return True
         from fieldkit.trial.check import time_sources  # noqa: PLC0415 (a trial does not need it)
 
         stage = time_sources.CHECK
@@ -172,6 +176,7 @@ def _check(
             robot_check(plan, role, shell, Probed(sections, variants_by_role[role]), report)
     except FieldkitError as error:
         report.fail(stage, error.what, error.remedy)
+    return True
 
 
 def _judge_jobs(plan: Plan, running_jobs: Sequence[str], report: Report) -> None:
