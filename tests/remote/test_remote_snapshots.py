@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fieldkit.core.deadline import Deadline
-from fieldkit.measure.robot_state import chrony, clocks, health, snapshots
+from fieldkit.measure.robot_state import chrony, clock_states, health, snapshots
 from fieldkit.remote import evidence, fetching, jobs, script
 from tests.helpers.paths import DATA
 from tests.helpers.sshd import wait_until
@@ -72,7 +72,7 @@ def test_programs_that_hang_fail_or_flood_give_no_value_and_delay_little(shell: 
     assert taken["chrony"].failure == "did not answer in time"
     assert taken["ptp"].failure is not None
     assert len(taken["ptp"].text) <= 64 * 1024
-    assert all(report.offset_s is None for report in clocks.reports(taken))
+    assert all(report.offset_s is None for report in clock_states.reports(taken))
 
 
 def test_a_robot_without_these_programs_reports_its_computer(shell: LocalShell, tmp_path: Path) -> None:

@@ -70,13 +70,13 @@ def _measure_clocks(
     has_source = any(CLOCK_SOURCES & snapshot.keys() for pair in of_robots.values() for snapshot in pair)
     if not has_source and not any(offset and exchanges.is_wrong(offset) for offset in offsets.values()):
         return result, [], False
-    from fieldkit.measure.robot_state import clocks  # noqa: PLC0415 (see the docstring)
+    from fieldkit.measure.robot_state import clock_states  # noqa: PLC0415 (see the docstring)
 
-    robot_clocks = {role: clocks.read(name, of_robots[role], offsets[role]) for role, name in names.items()}
+    robot_clocks = {role: clock_states.read(name, of_robots[role], offsets[role]) for role, name in names.items()}
     for role, clock in robot_clocks.items():
-        result |= clocks.measure(role, clock)
+        result |= clock_states.measure(role, clock)
     is_known = any(clock.report is not None for clock in robot_clocks.values())
-    return result, list(clocks.marks(robot_clocks, measured)), is_known
+    return result, list(clock_states.marks(robot_clocks, measured)), is_known
 
 
 def _measure_radios(names: Mapping[Role, str], of_robots: _Snapshots) -> tuple[Measured, list[RepeatMark], bool]:

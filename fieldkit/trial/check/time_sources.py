@@ -7,7 +7,7 @@ from typing import Final
 
 from fieldkit.core.deadline import Deadline
 from fieldkit.measure.robot_clock import Offset, offset
-from fieldkit.measure.robot_state import clocks, snapshots
+from fieldkit.measure.robot_state import clock_states, snapshots
 from fieldkit.measure.robot_state.clock_report import ClockReport
 from fieldkit.remote import jobs, script
 from fieldkit.remote.shell import Shell
@@ -52,7 +52,7 @@ def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
         RobotError: The script failed.
     """
     output = script.call(shell, "snapshot", deadline=Deadline.after(SNAPSHOT_S))
-    return clocks.reports(snapshots.parse(output.decode(errors="replace")))
+    return clock_states.reports(snapshots.parse(output.decode(errors="replace")))
 
 
 def read(shell: Shell) -> RobotTime:
@@ -95,6 +95,6 @@ def contradictions(times: Mapping[str, RobotTime]) -> Iterator[str]:
             second_time.offset.offset_s - first_time.offset.offset_s,
             second_time.offset.error_s + first_time.offset.error_s,
         )
-        reports = clocks.chosen(first_time.reports), clocks.chosen(second_time.reports)
-        if sentence := clocks.contradiction((first, second), reports, measured):
+        reports = clock_states.chosen(first_time.reports), clock_states.chosen(second_time.reports)
+        if sentence := clock_states.contradiction((first, second), reports, measured):
             yield sentence

@@ -8,7 +8,7 @@ import pytest
 from fieldkit.measure.robot_state import (
     attempt_states,
     chrony,
-    clocks,
+    clock_states,
     health,
     neighbourhood,
     ptp,
@@ -135,17 +135,17 @@ def test_ptp_reports_the_local_clock() -> None:
 
 
 def test_the_program_with_a_source_is_chosen() -> None:
-    found = clocks.reports(
+    found = clock_states.reports(
         {"chrony": output("chrony/none-4.3.csv"), "ptp": output("linuxptp/current-1.2.txt")},
     )
     assert [report.program for report in found] == ["chrony", "ptp4l"]
-    report = clocks.chosen(found)
+    report = clock_states.chosen(found)
     assert report is not None
     assert report.program == "ptp4l"
-    none = clocks.chosen(clocks.reports({"timedatectl": SourceOutput("NTP=no\nNTPSynchronized=no", 0)}))
+    none = clock_states.chosen(clock_states.reports({"timedatectl": SourceOutput("NTP=no\nNTPSynchronized=no", 0)}))
     assert none is not None
     assert none.problem == "no program synchronizes the clock"
-    assert clocks.chosen(clocks.reports({})) is None
+    assert clock_states.chosen(clock_states.reports({})) is None
 
 
 def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:
