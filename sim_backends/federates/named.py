@@ -72,7 +72,7 @@ def federates() -> dict[str, NamedFederate]:
     return {point.name: _load(point) for point in plugins.entry_points(plugins.FEDERATES)}
 
 
-def named(where: str, role: int) -> NamedFederate | None:
+def named_federate(where: str, role: int) -> NamedFederate | None:
     """Return the federate with a name; None if `where` is a command or an address.
 
     Args:
@@ -98,9 +98,9 @@ def default_options(where: str, role: int) -> dict[str, Any]:
     """Return the default options of the federate with a name; empty if `where` is a command or an address.
 
     Raises:
-        ConfigurationError: As for `named`.
+        ConfigurationError: As for `named_federate`.
     """
-    federate = named(where, role)
+    federate = named_federate(where, role)
     return {} if federate is None or federate.options is None else federate.options().to_json()
 
 
@@ -117,9 +117,9 @@ def is_single_threaded(where: str, role: int) -> bool:
     """Return True if `where` is the name of a program that declares one thread; False for a command or an address.
 
     Raises:
-        ConfigurationError: As for `named`.
+        ConfigurationError: As for `named_federate`.
     """
-    federate = named(where, role)
+    federate = named_federate(where, role)
     return isinstance(federate, ProgramFederate) and federate.is_single_threaded
 
 
@@ -129,7 +129,7 @@ def command_line(where: str, role: int) -> str:
     Raises:
         ConfigurationError: The federate cannot be used; the remedy states how to install what is missing.
     """
-    federate = named(where, role)
+    federate = named_federate(where, role)
     if isinstance(federate, ProgramFederate):
         return federate.command()
     if isinstance(federate, PythonFederate):

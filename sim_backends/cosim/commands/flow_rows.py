@@ -25,9 +25,9 @@ def flow_rows(
     number: int,
     result: SeedResult,
     *,
-    without: Collection[str] = (),
+    excluded_flows: Collection[str] = (),
 ) -> Iterator[dict[str, Value]]:
-    """Yield a row for each flow of a run; values that are not known are missing.
+    """Yield a row for each flow of a run; unknown values are omitted.
 
     Args:
         trial: Name of the folder of all runs.
@@ -35,12 +35,12 @@ def flow_rows(
         policy: The sync policy, as text.
         number: Number of the run, from 1.
         result: The result of the run.
-        without: Names of flows that get no row.
+        excluded_flows: Names of flows for which no row is yielded.
     """
     for flow in result.flows:
-        if flow.name not in without:
-            measured = {name: value for name, value in _measured(flow).items() if not _is_missing(value)}
-            yield _identity(trial, scenario, policy, result, flow) | {"repeat": number} | measured
+        if flow.name not in excluded_flows:
+            values = {name: value for name, value in _measured_columns(flow).items() if not _is_missing(value)}
+            yield _identity(trial, scenario, policy, result, flow) | {"repeat": number} | values
 
 
 def _identity(
@@ -70,12 +70,12 @@ def _identity(
 
 def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
     """Return the columns with the hashes of the agents and of the procedure of a scenario."""
-    dumped = scenario.model_dump(mode="json", by_alias=True)
-    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
-    return {"profiles_sha256": _digest(dumped["agents"]), "procedure_sha256": _digest(procedure)}
+    scenario_data = scenario.model_dump(mode="json", by_alias=True)
+    procedure = {key: value for key, value in scenario_data.items() if key not in _NOT_PROCEDURE}
+    return {"profiles_sha256": _digest(scenario_data["agents"]), "procedure_sha256": _digest(procedure)}
 
 
-def _measured(flow: FlowResult) -> dict[str, Value]:
+def _measured_columns(flow: FlowResult) -> dict[str, Value]:
     delay_s = flow.delay_s
     datagrams: dict[str, Value] = {}
     if flow.protocol == "udp":

@@ -28,7 +28,7 @@ class FlowRecovery:
         flow: Name of the flow.
         end_ns: Time when the fault ended.
         lost: Number of packets that were sent during the fault and never arrived.
-        recovered_s: Time from `end_ns` to the first arrival of a packet sent after it; None if there was none.
+        recovered_s: Time from `end_ns` to the first arrival of a packet that was sent after it; None without one.
     """
 
     fault: int
@@ -47,11 +47,11 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
         scenario: The scenario with the faults.
         run: A run of the scenario.
     """
-    reached_ns = run.windows_ns[-1] if run.windows_ns else 0
+    end_of_run_ns = run.windows_ns[-1] if run.windows_ns else 0
     all_recoveries = []
     for number, fault in enumerate(scenario.faults):
         end_ns = None if isinstance(fault, StalledFederateFault) else fault.end_ns
-        if end_ns is None or end_ns > reached_ns:
+        if end_ns is None or end_ns > end_of_run_ns:
             continue
         flows = (flow_ends for traffic in scenario.traffic for flow_ends in traffic.flow_ends)
         for flow in sorted(flow for flow, *ends in flows if _affects(fault, set(ends), scenario)):
@@ -87,7 +87,7 @@ _JITTER_GAIN = 1 / 16
 
 @dataclass(frozen=True)
 class FlowSpread:
-    """Statistics of times of packets that arrived, in seconds; nan if no packet arrived.
+    """Statistics of the times of packets that arrived, in seconds; nan if no packet arrived.
 
     Attributes:
         minimum: The minimum.
@@ -142,9 +142,10 @@ class FlowResult:
         first_to_last_s: Time from the first arrival to the last.
         jitter_s: Interarrival jitter after the last packet (RFC 3550, section 6.4.1); nan for fewer than two packets.
         added_s: Mean delay that the sync policy added, before and after the network.
-        distances_m: Distance of sender and receiver at the first packet; minimum, mean and maximum over all packets.
+        distances_m: Distance between sender and receiver: at the first packet, then minimum, mean and maximum over
+            all packets.
         sender_m_s: Mean speed of the sender at the times of sending.
-        relative_m_s: Mean magnitude of its velocity relative to the receiver.
+        relative_m_s: Mean magnitude of the sender's velocity relative to the receiver.
         round_trips: The round trips of a ping; None for other flows.
         last_arrived_ns: Simulated time of the last arrival; None without arrivals.
     """
@@ -184,27 +185,32 @@ def flow_results(run: Run) -> tuple[FlowResult, ...]:
 
 def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) -> FlowResult:
     packet = fates[0].packet
-    decided = [fate for fate in fates if fate.is_decided]
+    decided_fates = [fate for fate in fates if fate.is_decided]
     times = [
         (fate.packet.sent_ns, fate.packet.enters_ns, fate.arrived_ns, fate.counted_ns)
-        for fate in decided
+        for fate in decided_fates
         if fate.arrived_ns is not None and fate.counted_ns is not None
     ]
-    arrived = [fate for fate in decided if fate.arrived_ns is not None]
+    arrived_fates = [fate for fate in decided_fates if fate.arrived_ns is not None]
     sent_ns, enters_ns, arrived_ns, counted_ns = np.array(times, np.int64).reshape(-1, 4).T
     delay_s = (arrived_ns - enters_ns) / 1e9
-    distances_m = _distances([fate.true[0].position_m for fate in fates], [fate.true[1].position_m for fate in fates])
-    velocities = [fate.true[0].velocity_m_s for fate in fates], [fate.true[1].velocity_m_s for fate in fates]
+    distances_m = _distances(
+        [fate.true_states[0].position_m for fate in fates], [fate.true_states[1].position_m for fate in fates]
+    )
+    velocities = (
+        [fate.true_states[0].velocity_m_s for fate in fates],
+        [fate.true_states[1].velocity_m_s for fate in fates],
+    )
     return FlowResult(
         name=name,
         source=packet.source,
         destination=packet.destination,
         protocol=packet.protocol,
-        sent=len(decided),
-        arrived=len(arrived),
-        under_way=len(fates) - len(decided),
-        sent_bytes=sum(fate.packet.size_bytes for fate in decided),
-        arrived_bytes=sum(fate.packet.size_bytes for fate in arrived),
+        sent=len(decided_fates),
+        arrived_fates=len(arrived_fates),
+        under_way=len(fates) - len(decided_fates),
+        sent_bytes=sum(fate.packet.size_bytes for fate in decided_fates),
+        arrived_bytes=sum(fate.packet.size_bytes for fate in arrived_fates),
         delay_s=_spread(delay_s),
         first_to_last_s=float(np.ptp(arrived_ns)) / 1e9 if len(arrived_ns) else np.nan,
         jitter_s=_jitter_s(delay_s[np.argsort(arrived_ns, kind="stable")]),
@@ -267,13 +273,15 @@ def _jitter_s(delays_s: Floats) -> float:
 
 
 FORMATION: Final = (
-    SheetColumn("spacing_mean_m", "spacing (cm)", "error of the distance behind a leader, magnitude, mean", 1e2),
+    SheetColumn("spacing_mean_m", "spacing (cm)", "mean absolute error of the distance behind a leader", 1e2),
     SheetColumn("spacing_max_m", "max", "its maximum", 1e2),
-    SheetColumn(
-        "station_mean_m", "station (cm)", "distance of a drone from its station above its leaders, mean", 1e2
-    ),
+    SheetColumn("station_mean_m", "station (cm)", "mean distance of a drone from its station above its leaders", 1e2),
     SheetColumn("station_max_m", "max", "its maximum", 1e2),
-    SheetColumn("amplification", "amplified", "acceleration over the leader's; up to 1 the row is string stable"),
+    SheetColumn(
+        "amplification",
+        "amplified",
+        "ratio of a follower's acceleration to its leader's; a row of vehicles is string stable up to 1",
+    ),
 )
 """Columns of a `Formation`, in the order of `formation_values`."""
 

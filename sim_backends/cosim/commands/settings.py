@@ -27,9 +27,9 @@ from sim_backends.cosim.wall_time import DEADLINE_S
 
 
 def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, float], None]:
-    """Return a function that reports progress to a sink; its arguments are the activity, the total and the part done.
+    """Return a function that reports progress to a sink; its arguments are the activity, the total and the done part.
 
-    The time left is estimated from the time since the first call for the same activity.
+    The remaining time is estimated from the time since the first call for the same activity.
 
     Args:
         sink: Receives the events.
@@ -51,7 +51,7 @@ ENOUGH_SEEDS: Final = 20
 
 
 def scenario(arguments: argparse.Namespace) -> CosimScenario:
-    """Return the scenario that the arguments name, with their changes.
+    """Return the scenario that the arguments name, with the changes of other arguments.
 
     Raises:
         ConfigurationError: It does not exist, or a change is invalid; the message states the key and its place.
@@ -87,7 +87,7 @@ def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ..
 
 
 def workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers:
-    """Return the workers that the options choose; without options, this process if there are few packets.
+    """Return the workers from the options; without such options, only this process if there are few packets.
 
     Args:
         arguments: The options.
@@ -118,7 +118,8 @@ def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[floa
     windows = sorted({parse_duration_s(text, "--window") for text in arguments.windows.split(",")})
     if windows[0] <= 0:
         raise ConfigurationError(
-            f"--window: {arguments.windows!r} has a window that is not above 0", remedy="--window 1ms,10ms,100ms"
+            f"--window: {arguments.windows!r} contains a window that is not above 0",
+            remedy="write for example --window 1ms,10ms,100ms",
         )
     return windows
 
@@ -138,7 +139,7 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
 
     Args:
         path: The file.
-        option: Name of the option that gave it, for messages.
+        option: Name of the option with the path, for messages.
 
     Raises:
         ConfigurationError: The suffix or the folder is invalid. The returned function raises it if the file cannot be
@@ -180,7 +181,7 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
     """Return the pace of runs in real time, or None if they run as fast as possible.
 
     Raises:
-        ConfigurationError: A value is invalid, or there is a bound without a pace.
+        ConfigurationError: A value is invalid, or there is a bound but no factor.
     """
     text, bound = arguments.realtime, arguments.late_bound
     if text is None:
@@ -192,10 +193,14 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
     except ValueError:
         factor = math.nan
     if not 0 < factor < math.inf:
-        raise ConfigurationError(f"--realtime: {text!r} is not a number above 0", remedy="--realtime 1")
+        raise ConfigurationError(
+            f"--realtime: {text!r} is not a number above 0", remedy="write for example --realtime 1"
+        )
     bound_s = LATE_BOUND_S if bound is None else parse_duration_s(bound, "--late-bound")
     if bound_s <= 0:
-        raise ConfigurationError(f"--late-bound: {bound} is not above 0", remedy="--late-bound 100ms")
+        raise ConfigurationError(
+            f"--late-bound: {bound} is not above 0", remedy="write for example --late-bound 100ms"
+        )
     return Pace(factor, bound_s)
 
 
@@ -219,7 +224,7 @@ def note_commensurate_events(
         chosen: The scenario.
         policies: Names of the sync policies that run it.
         windows_s: Windows of the policies that have one.
-        seeds: Number of seeds, each of which draws other phases.
+        seeds: Number of seeds; each seed draws different phases.
     """
     if seeds >= ENOUGH_SEEDS:
         return
@@ -236,7 +241,7 @@ def note_commensurate_events(
         instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
         show_note(
             f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}; errors and added "
-            "delays are those of these phases of the window, which the seed draws, and not of the policy: use "
+            "delays therefore depend on these phases, which the seed draws, and do not characterize the policy: use "
             f"{instead}" + ("" if other_s is None else f", or --seeds {ENOUGH_SEEDS}")
         )
 

@@ -1,9 +1,9 @@
 """Programs that follow other agents, using only the states that the network delivers.
 
-The age of a received state is its transmission delay, which is known from its time stamp. The state is extrapolated
+The age of a received state is its transmission delay, which follows from its time stamp. The state is extrapolated
 to the present time with its velocity. Every delay, and every error of a delivery time, therefore becomes a position
 error: after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower
-that receives no state for longer than a timeout stops.
+stops if it receives no state for longer than a timeout.
 
 `FollowAtHeadway` keeps a constant time headway h: at the speed v, the distance is r + h v, where r is the distance at
 standstill. With the error e = gap - r - h v its acceleration is ((v_leader - v) + k e) / h, so that e decays as
@@ -25,7 +25,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
 from sim_backends.cosim.programs.way_points import PERIOD_NS, NeverSends, PeriodicTimer, drive_towards
-from sim_backends.network.packets import Received
+from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State, extrapolate
 
@@ -34,7 +34,7 @@ TIMEOUT_NS: Final = 1_000_000_000
 
 
 class LatestStates:
-    """The latest states received from other agents.
+    """The latest states that were received from other agents.
 
     Args:
         names: The other agents.
@@ -52,9 +52,9 @@ class LatestStates:
             )
         self._names = tuple(names)
         self._timeout_ns = timeout_ns
-        self._latest: dict[str, Received] = {}
+        self._latest: dict[str, ReceivedDatagram] = {}
 
-    def update(self, received: Sequence[Received]) -> None:
+    def update(self, received: Sequence[ReceivedDatagram]) -> None:
         """Store the state with the latest time stamp for each agent."""
         for datagram in received:
             latest = self._latest.get(datagram.source)
@@ -118,7 +118,7 @@ class FollowAtHeadway(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         """Store received states; if a command is due, steer, or stop if there is no valid state."""
         self._leader.update(received)
         if not self._timer.fire_if_due(now_ns):
@@ -182,7 +182,7 @@ class HoldStation(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         """Store received states; if a command is due, steer, or hover if there is no valid state."""
         self._leaders.update(received)
         if not self._timer.fire_if_due(now_ns):

@@ -1,6 +1,7 @@
 """A pcap file per robot, with the internet headers of its packets.
 
-A network in another process reports no IP packets; `PacketObserver` makes them from the programs' packets.
+A network in another process reports no IP packets. `PacketObserver` therefore creates them from the packets of
+programs.
 """
 
 import os
@@ -104,13 +105,13 @@ class IpEncoder:
         protocol, transport_header = self._transport(packet)
         begin = fragment.offset_bytes
         payload_part = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
-        more = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
+        fragment_flag = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
         words = (
             0x45,
             0,
             fragment.size_bytes,
             fragment.ip_id & 0xFFFF,
-            more | begin // 8,
+            fragment_flag | begin // 8,
             64,
             protocol,
         )
@@ -272,13 +273,13 @@ class Captures:
         self._written_bytes[name], self._pending[name] = at + done, bytearray()
 
 
-def between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
-    """Return a capture with the packets of another capture from `begin_ns` to `end_ns`, without the latter.
+def packets_between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
+    """Return a copy of a capture that contains only the packets of an interval of simulated time.
 
     Args:
         capture: The content of the file.
-        begin_ns: First simulated time.
-        end_ns: Simulated time after the last one.
+        begin_ns: Start of the interval.
+        end_ns: End of the interval, which does not belong to it.
     """
     records = (capture[begin:end] for at_ns, begin, end in _records(capture) if begin_ns <= at_ns < end_ns)
     return capture[: _FILE_HEADER.size] + b"".join(records)
@@ -294,7 +295,7 @@ def _records(capture: bytes) -> Iterator[tuple[int, int, int]]:
         begin = end
 
 
-def first_tcp_ns(capture: bytes, port: int) -> int | None:
+def first_tcp_packet_ns(capture: bytes, port: int) -> int | None:
     """Return the time of the first TCP packet to a port in a capture; None if there is no such packet.
 
     Args:
@@ -329,11 +330,11 @@ class PacketObserver:
         self._recorder.begin(states)
 
     def window(self, window: Window) -> None:
-        """Log the packets of a window in order of time, and pass it on."""
-        events = [(fate.packet.enters_ns, fate.packet.source, fate.packet) for fate in window.entered]
+        """Log the packets of a window in order of time, and forward the window to the recorder."""
+        events = [(fate.packet.enters_ns, fate.packet.source, fate.packet) for fate in window.entered_fates]
         events += [
             (fate.arrived_ns, fate.packet.destination, fate.packet)
-            for fate in window.ended
+            for fate in window.decided_fates
             if fate.arrived_ns is not None
         ]
         for at_ns, name, packet in sorted(events, key=itemgetter(0)):

@@ -1,6 +1,6 @@
 """The results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
 
-Equal results give equal bytes: rows have the order of the plan; the order in which the runs ended does not matter.
+Equal results give equal bytes: rows are in the order of the plan, not in the order in which the runs ended.
 """
 
 import json
@@ -20,7 +20,7 @@ from sim_backends.cosim.sweeps.factors import Factor
 from sim_backends.cosim.sweeps.sweep_folder import SweepFolder
 from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepSetting
 
-_ADDED: Final[Mapping[str, Mapping[str, str]]] = {
+_SWEEP_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
     "flow": {"unit": "text", "meaning": "Stream of packets and its receiver."},
     "added_delay_mean_s": {
         "unit": "s",
@@ -50,8 +50,8 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
     schema = _schema((row for setting_rows in rows.values() for row in setting_rows), plan.factors)
     new, old = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
     with folder.error_conversion():
-        for leftover in (new, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        for old_folder in (new, old):
+            shutil.rmtree(old_folder, ignore_errors=True)
         for setting in plan.settings:
             if rows[setting.digest]:
                 parts = [
@@ -78,8 +78,8 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
 def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Value]]:
     numbers: dict[str, Value] = {}
     for factor in plan.factors:
-        if (declared := factor.numbers) is not None:
-            name, _, values = declared
+        if (number_column := factor.numbers) is not None:
+            name, _, values = number_column
             numbers[name] = values[factor.values.index(setting.values[factor.name])]
     runs = (run for run in plan.runs if run.setting is setting)
     hashes = scenario_hashes(plan.scenario)  # a factor changes a setting, not the procedure
@@ -87,22 +87,22 @@ def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> lis
 
 
 def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> pa.Schema:
-    """Return the schema of all files; columns that are folders are not in it."""
+    """Return the schema of all files, without the columns that are folders of the dataset."""
     types: dict[str, set[type]] = {}
     for row in rows:
         for name, value in row.items():
             types.setdefault(name, set()).add(type(value))
-    declarations = dict(_ADDED)
-    by, partitions = [], {}
+    declarations = dict(_SWEEP_COLUMNS)
+    group_columns, partitions = [], {}
     for factor in factors:
         meaning = f"Value of the setting {factor.name}, as in the command."
         partitions[factor.column] = meaning
-        if (declared := factor.numbers) is None:
-            by.append(factor.column)
+        if (number_column := factor.numbers) is None:
+            group_columns.append(factor.column)
         else:
-            name, unit, _ = declared
+            name, unit, _ = number_column
             declarations[name] = {"unit": unit, "meaning": meaning.replace("as in the command", "as a number")}
-            by.append(name)
+            group_columns.append(name)
     fields = [
         pa.field(name, _arrow_type(column_type), metadata=declarations.get(name))
         for name, column_type in types.items()
@@ -112,7 +112,7 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
         "fieldkit_version": version("fieldkit"),
         "schema_version": str(SCHEMA_VERSION),
         "partitions": json.dumps(partitions),
-        "by": json.dumps(["flow", *by]),
+        "by": json.dumps(["flow", *group_columns]),
     }
     return pa.schema(fields, metadata=metadata)
 

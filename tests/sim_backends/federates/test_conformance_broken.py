@@ -514,7 +514,7 @@ NETWORK_CASES = [
     BrokenFederate("fork", physics(SharedNet), "the copy and the original"),
     BrokenFederate("next_event", physics(AnnouncesTooLate), "before the announced next event"),
     BrokenFederate("next_event", physics(AnnouncesDropsTooLate), "packet 2 was dropped until 4000000 ns"),
-    BrokenFederate("next_event", physics(AnnouncesNothing), "it has no next event, and packets [1, 2, 3] neither"),
+    BrokenFederate("next_event", physics(AnnouncesNothing), "it has no next event, but packets [1, 2, 3] neither"),
     BrokenFederate("seed", physics(IgnoresSeed), "4 seeds gave the same arrivals and drops"),
 ]
 

@@ -55,7 +55,7 @@ def test_jitter_equals_that_of_the_harness_in_the_order_of_arrival() -> None:
 
 
 def test_values_without_arrivals_are_nan() -> None:
-    ends = fate(0, None).true
+    ends = fate(0, None).true_states
     under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), ends, ends)
     lost, waiting = flow_results(run_of(fate(0, None), under_way))
     assert (lost.loss, lost.arrived_bytes) == (1.0, 0)
