@@ -32,14 +32,14 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         FieldkitError: The federate cannot be started or connected.
     """
-    federate = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
+    endpoint = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.deadline_s(arguments.deadline)
     changes = settings.changes(arguments)
-    if _is_federate_with_role(federate, NETWORK):
+    if _is_federate_with_role(endpoint, NETWORK):
         changes |= {"traffic": _udp_traffic(load_scenario(arguments.scenario, changes))}
-    scenario = load_scenario(arguments.scenario, changes | _named_federate(federate))
-    role, name = _role(federate, scenario, arguments.role, deadline_s)
-    opener = partial(open_session, role, federate, deadline_s=deadline_s)
+    scenario = load_scenario(arguments.scenario, changes | _named_federate(endpoint))
+    role, name = _role(endpoint, scenario, arguments.role, deadline_s)
+    opener = partial(open_session, role, endpoint, deadline_s=deadline_s)
     target = Target(opener, _hello(scenario, role), arguments.windows)
     results = []
     for result in run_checks(target):
@@ -59,7 +59,7 @@ def _hello(scenario: CosimScenario, role: int) -> Hello:
     return make_hello(scenario, world, bodies(scenario, world), scenario.seeds[0], role)
 
 
-def _role(federate: str, scenario: CosimScenario, requested: str | None, deadline_s: float) -> tuple[int, str]:
+def _role(endpoint: str, scenario: CosimScenario, requested: str | None, deadline_s: float) -> tuple[int, str]:
     """Return the role of a federate, and its name for messages: the requested role, or the first that it accepts.
 
     Raises:
@@ -67,23 +67,23 @@ def _role(federate: str, scenario: CosimScenario, requested: str | None, deadlin
     """
     roles = [role for role in (PHYSICS, NETWORK) if requested in {None, ROLES[role]}]
     if requested is None:
-        roles = [role for role in roles if _is_federate_with_role(federate, role)] or roles
+        roles = [role for role in roles if _is_federate_with_role(endpoint, role)] or roles
     for role in roles:
         try:
-            session, _, _ = open_session(role, federate, _hello(scenario, role), deadline_s)
+            session, _, _ = open_session(role, endpoint, _hello(scenario, role), deadline_s)
         except FederateError:
             if role == roles[-1]:
                 raise
             continue
         session.close()
         return role, session.name
-    raise FieldkitError(f"{federate} accepts no role")
+    raise FieldkitError(f"{endpoint} accepts no role")
 
 
-def _named_federate(federate: str) -> dict[str, str]:
+def _named_federate(endpoint: str) -> dict[str, str]:
     """Return the change that makes a scenario use a named federate, so that its options are validated."""
     return {
-        f"{ROLES[role]}.federate": federate for role in (PHYSICS, NETWORK) if _is_federate_with_role(federate, role)
+        f"{ROLES[role]}.federate": endpoint for role in (PHYSICS, NETWORK) if _is_federate_with_role(endpoint, role)
     }
 
 
@@ -97,10 +97,10 @@ def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
     return entries
 
 
-def _is_federate_with_role(federate: str, role: int) -> bool:
+def _is_federate_with_role(endpoint: str, role: int) -> bool:
     """Return True if there is a federate with this name and this role."""
     try:
-        return named_federate(federate, role) is not None
+        return named_federate(endpoint, role) is not None
     except ConfigurationError:  # the federate has the other role, or its package cannot be loaded
         return False
 

@@ -43,13 +43,13 @@ def without_federates(scenario: CosimScenario) -> CosimScenario:
 def has_addresses(scenario: CosimScenario) -> bool:
     """Return True if a federate of the scenario has the address of a transport instead of a command."""
     federates = (scenario.physics.federate, scenario.network.federate)
-    return any(where is not None and parse_address(where) is not None for where in federates)
+    return any(endpoint is not None and parse_address(endpoint) is not None for endpoint in federates)
 
 
 def writes_captures(scenario: CosimScenario) -> bool:
     """Return True if the network is a program that writes captures of its IP packets."""
-    where = None if scenario.network.transports == "builtin" else scenario.network.federate
-    federate = None if where is None else named_federate(where, NETWORK)
+    endpoint = None if scenario.network.transports == "builtin" else scenario.network.federate
+    federate = None if endpoint is None else named_federate(endpoint, NETWORK)
     return isinstance(federate, ProgramFederate) and federate.writes_captures
 
 
@@ -142,15 +142,15 @@ def open_physics(
         ConfigurationError: The name, the command or the address cannot be used.
         FederateError: The federate failed, or has not connected or answered in time.
     """
-    where = scenario.physics.federate
-    if where is None:
+    endpoint = scenario.physics.federate
+    if endpoint is None:
         return None
     hello = make_hello(scenario, world, bodies, seed, PHYSICS)
-    federate = named_federate(where, PHYSICS)
+    federate = named_federate(endpoint, PHYSICS)
     if isinstance(federate, PythonFederate):
-        physics: PhysicsFederate = _make_federate(federate, where, hello)
+        physics: PhysicsFederate = _make_federate(federate, endpoint, hello)
         return physics
-    return remote.open_physics(where, hello, deadline_s)
+    return remote.open_physics(endpoint, hello, deadline_s)
 
 
 def open_network(
@@ -172,18 +172,18 @@ def open_network(
         deadline_s: The deadline.
         captures: Settings of the captures for a network with `writes_captures`; None if it writes no captures.
     """
-    where = scenario.network.federate
-    if where is None:
+    endpoint = scenario.network.federate
+    if endpoint is None:
         return None
     hello = make_hello(scenario, world, bodies, seed, NETWORK)
     if captures is not None:
         configuration = json.loads(hello.configuration) | {"captures": captures}
         hello = dataclasses.replace(hello, configuration=json.dumps(configuration).encode())
-    federate = named_federate(where, NETWORK)
+    federate = named_federate(endpoint, NETWORK)
     if isinstance(federate, PythonFederate):
-        network: NetworkFederate = _make_federate(federate, where, hello)
+        network: NetworkFederate = _make_federate(federate, endpoint, hello)
         return network
-    network = remote.open_network(where, hello, deadline_s)
+    network = remote.open_network(endpoint, hello, deadline_s)
     supported_transports = network.welcome.transports
     is_builtin = scenario.network.transports == "builtin"
     used_transports = (

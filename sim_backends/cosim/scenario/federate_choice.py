@@ -35,8 +35,8 @@ def _options_of(role: int) -> Callable[[Any, ValidationInfo], Options]:
     def validated(value: Any, info: ValidationInfo) -> Options:  # noqa: ANN401 (any YAML value)
         if not isinstance(value, dict | SimulatorOptions | None):
             raise schema.validation_error("this is not a mapping of keys to values")
-        where = info.data.get("federate")
-        federate = None if where is None else named_federate(where, role)
+        endpoint = info.data.get("federate")
+        federate = None if endpoint is None else named_federate(endpoint, role)
         if federate is None or federate.options is None or isinstance(value, SimulatorOptions):
             return value
         return federate.options.model_validate(value or {})

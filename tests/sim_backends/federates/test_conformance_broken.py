@@ -401,7 +401,7 @@ PHYSICS_CASES = [
     BrokenFederate("start", physics(StartsElsewhere), "ann starts 1 m away"),
     BrokenFederate("remainders", replace(physics(Carts), alter=later(MessageKind.STATES, 1)), "instead of 0 ns"),
     BrokenFederate("remainders", physics(LosesAnAgent), "there is no state of bob"),
-    BrokenFederate("remainders", physics(AddsAnAgent), "an agent appeared, dan"),
+    BrokenFederate("remainders", physics(AddsAnAgent), "the agent dan appeared"),
     BrokenFederate("remainders", replace(physics(Carts), alter=silent, deadline_s=0.2), "has not answered for 0.2 s"),
     BrokenFederate("remainders", physics(IsNotFinite), "with a malformed frame: byte 32: the state of agent 0"),
     BrokenFederate("drift", physics(DriftingPhysics), "windows instead of one: the positions of ann differ"),
@@ -409,7 +409,9 @@ PHYSICS_CASES = [
     BrokenFederate("motion", physics(JumpingPhysics), "moved by 3 m in a step"),
     BrokenFederate("motion", physics(IgnoresCommands), "moved by 0 m in 1000 steps"),
     BrokenFederate("limits", physics(HasWrongLimits), "its limit of 0.1 m/s^2 allows"),
-    BrokenFederate("command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command from 100000000 ns on"),
+    BrokenFederate(
+        "command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command that applies from 100000000 ns"
+    ),
     BrokenFederate(
         "unknown_command", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a command"
     ),

@@ -106,7 +106,7 @@ def test_a_subscriber_that_was_off_for_less_than_a_lease_gets_the_history_of_its
         fate for (flow, _), fate in run.fates.items() if flow == "cb/b" and fate.packet.sent_ns > DISCOVERED_MS * MS
     ]
     lost = [fate for fate in fates if fate.reason]
-    assert {fate.reason for fate in lost} == {"pushed out of the writer's history before it was acknowledged"}
+    assert {fate.reason for fate in lost} == {"evicted from the writer's history before it was acknowledged"}
     assert within([fate.packet.sent_ns / MS for fate in lost], 990, 1910)
     # The writer keeps the last ten samples; each arrives within a heartbeat period after b is on.
     delivered = [fate for fate in fates if not fate.reason and 1000 * MS < fate.packet.sent_ns < 2000 * MS]
@@ -138,7 +138,7 @@ def test_a_topic_removes_a_subscriber_whose_lease_has_expired_and_discovers_it_a
     lost = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > DISCOVERED_MS]
     assert within(lost, 5000, 20_000 + 1000 * recovery.recovered_s)
     reasons = {fate.reason for (flow, _), fate in run.fates.items() if flow == "cb/b"}
-    assert ("the subscriber's lease ran out" in reasons) == (reliability == "reliable")
+    assert ("the lease of the subscriber expired" in reasons) == (reliability == "reliable")
     assert "not matched yet" in reasons
 
 
