@@ -144,7 +144,7 @@ class Agents:
         try:
             states = self.physics.advance(now_ns, commands)
         except Exception as error:
-            request = f"advance from {seconds_text(self._at_ns)} to {seconds_text(now_ns)}"
+            request = f"advance from {seconds_text(self._states_ns)} to {seconds_text(now_ns)}"
             raise federate_error(error, "physics", request) from error
         self._states_ns = now_ns
         try:
@@ -254,7 +254,7 @@ class Agents:
             try:
                 at_ns = next_send_ns(program)
             except Exception as error:
-                request = f"return its next send time after {seconds_text(self._at_ns)}"
+                request = f"return its next send time after {seconds_text(self._states_ns)}"
                 raise federate_error(error, f"the program of {name}", request) from error
             if at_ns is not None and (earliest_ns is None or at_ns < earliest_ns):
                 earliest_ns = at_ns
@@ -272,7 +272,7 @@ class Agents:
             try:
                 wake_ns = self.programs[name].next_wake_ns()
             except Exception as error:
-                request = f"return its next wake time after {seconds_text(self._at_ns)}"
+                request = f"return its next wake time after {seconds_text(self._states_ns)}"
                 raise federate_error(error, f"the program of {name}", request) from error
             if wake_ns is None:
                 self._wake_times_ns.pop(name, None)

@@ -38,7 +38,7 @@ def position_error_m(fate: Fate) -> float:
     """
     if fate.position_error_m is not None:
         return fate.position_error_m
-    return _max_distance_m(_offsets_m(fate.assumed_states, fate.true))
+    return _max_distance_m(_offsets_m(fate.assumed_states, fate.true_states))
 
 
 def max_position_error_m(

@@ -109,7 +109,7 @@ def _load(point: EntryPoint) -> NamedFederate:
     if isinstance(federate, NamedFederate):
         return federate
     raise ConfigurationError(
-        "it is not a ProgramFederate or PythonFederate", endpoint=plugins.location(point), remedy=plugins.REMEDY
+        "it is not a ProgramFederate or PythonFederate", where=plugins.location(point), remedy=plugins.REMEDY
     )
 
 

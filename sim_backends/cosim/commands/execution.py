@@ -111,7 +111,7 @@ def simulate(
         simulation.coordinator.run,
         states,
         ended_by=ended_by,
-        start_states=start_states,
+        starts=start_states,
         lateness=lateness,
     )
     if folder is not None:

@@ -207,7 +207,7 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
         destination=packet.destination,
         protocol=packet.protocol,
         sent=len(decided_fates),
-        arrived_fates=len(arrived_fates),
+        arrived=len(arrived_fates),
         under_way=len(fates) - len(decided_fates),
         sent_bytes=sum(fate.packet.size_bytes for fate in decided_fates),
         arrived_bytes=sum(fate.packet.size_bytes for fate in arrived_fates),

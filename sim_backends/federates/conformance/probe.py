@@ -113,7 +113,7 @@ class FederateProbe:
     ) -> Any:  # noqa: ANN401 (of `decode`)
         """Send a request, and return the decoded answer; errors as for `FederateSession.request`."""
         request_name = kind.name.lower().replace("_", " ")
-        return self._session.request(kind, copy, body, answer, decode=decode, request_name=lambda: request_name)
+        return self._session.request(kind, copy, body, answer, decode=decode, describe=lambda: request_name)
 
     def physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0

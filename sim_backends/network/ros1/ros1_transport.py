@@ -123,7 +123,7 @@ class Ros1:
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
 
     def _request_topic(self, name: str) -> None:
-        """Send the request for connection parameters from the subscriber to a publisher, unless it was sent before."""
+        """Send the request for connection parameters from the subscriber to a publisher, once per flow."""
         if name in self._requested_topics:
             return
         self._requested_topics.add(name)

@@ -48,7 +48,7 @@ NAN = math.nan
         (Printed("5.377", per_si=1000), IntervalEstimate(0.0053774, NAN, NAN), Agreement.AGREES),
         (Printed("5.377", per_si=1000), IntervalEstimate(0.0053776, NAN, NAN), Agreement.ABOVE),
         (Printed("-12", per_si=100), IntervalEstimate(-0.20, -0.25, -0.15), Agreement.BELOW),
-        (Printed("0.4"), IntervalEstimate(NAN, NAN, NAN), Agreement.NOTHING),
+        (Printed("0.4"), IntervalEstimate(NAN, NAN, NAN), Agreement.NO_VALUE),
     ],
 )
 def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agreement) -> None:
@@ -162,7 +162,7 @@ def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     assert row.delay.ours.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
     assert row.delay.agreement is Agreement.AGREES
     assert not row.delay.agrees_by_mean
-    assert row.delay.off == pytest.approx(0.1)
+    assert row.delay.difference == pytest.approx(0.1)
     assert row.loss.ours.value == pytest.approx((0.02 + 0.02 + 1) / 3)
     assert row.loss.ours.high == 1, "Student's interval would end at 1.75"
     assert row.reason == "not matched yet"
