@@ -168,7 +168,7 @@ def test_a_robot_that_drives_cannot_follow_several_leaders(tmp_path: Path) -> No
 def test_an_unknown_scenario_is_reported_with_the_existing_ones() -> None:
     with pytest.raises(ConfigurationError, match=r"no scenario 'bayland'.*\n.*did you mean 'baylands'"):
         load_scenario("bayland")
-    with pytest.raises(ConfigurationError, match=r"scenarios: baylands, .*; or name a file that ends in .yaml"):
+    with pytest.raises(ConfigurationError, match=r"scenarios: baylands, .*; or give a file that ends in .yaml"):
         load_scenario("xyz")
     with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
         load_scenario("nowhere.yaml")
