@@ -230,12 +230,12 @@ class Agents:
             return begin
         new_agents, self._new_agents = self._new_agents, frozenset()
         lost_names, self._last_states = self._last_states, {}
-        added = {
+        added_states = {
             name: end.get(name) or lost_names[name]
             for name in sorted(new_agents | lost_names.keys())
             if name not in begin
         }
-        return {**added, **begin} if added else begin
+        return {**added_states, **begin} if added_states else begin
 
     def next_wake_ns(self) -> int | None:
         """Return the next time at which a program's timer wakes it, or None if no timer is set."""
@@ -298,10 +298,10 @@ class Agents:
             heapq.heappop(queue)
         self._next_ns = queue[0][0] if queue else None
 
-    def deliver(self, receiver: str, received: ReceivedDatagram) -> None:
+    def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
         """Store a datagram for the program of an agent; the next call of `advance` delivers it."""
         if receiver in self.programs and receiver not in self.absent:
-            self._received.setdefault(receiver, []).append(received)
+            self._received.setdefault(receiver, []).append(received_datagram)
 
     def is_absent(self, names: Iterable[str], at_ns: int) -> bool:
         """Return True if any of these agents is absent now and has been absent since `at_ns` or earlier."""
@@ -329,8 +329,8 @@ class Agents:
         """
         sent_datagrams: list[SentDatagram] = []
         if self._received:
-            received, self._received = self._received, {}
-            sent_datagrams += self._wake(now_ns, received)
+            received_by_name, self._received = self._received, {}
+            sent_datagrams += self._wake(now_ns, received_by_name)
         previous_wake_ns, repeats = -1, 0
         while (wake_ns := self._next_ns) is not None and wake_ns <= last_ns:
             names = self._pop_due(wake_ns)
@@ -354,18 +354,20 @@ class Agents:
                 names.append(name)
         return names
 
-    def _wake(self, now_ns: int, received: Mapping[str, Sequence[ReceivedDatagram]]) -> list[SentDatagram]:
+    def _wake(self, now_ns: int, received_by_name: Mapping[str, Sequence[ReceivedDatagram]]) -> list[SentDatagram]:
         states = self.states(now_ns)
-        if self.absent or _CHANGE in received:
-            received = {name: received[name] for name in received if name in states and name in self.programs}
+        if self.absent or _CHANGE in received_by_name:
+            received_by_name = {
+                name: received_by_name[name] for name in received_by_name if name in states and name in self.programs
+            }
         sent_datagrams: list[SentDatagram] = []
-        for name in sorted(received):
+        for name in sorted(received_by_name):
             try:
-                action = self.programs[name].wake(now_ns, states[name], received[name])
+                action = self.programs[name].wake(now_ns, states[name], received_by_name[name])
             except Exception as error:
                 raise federate_error(error, f"the program of {name}", f"act at {seconds_text(now_ns)}") from error
             sent_datagrams += [SentDatagram(now_ns, name, datagram, states) for datagram in action.datagrams]
             if action.command is not None:
                 self._commands[name] = action.command
-        self._schedule(received)
+        self._schedule(received_by_name)
         return sent_datagrams

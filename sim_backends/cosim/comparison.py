@@ -46,7 +46,7 @@ class Errors:
         first_disagreement: The first of these packets by time of sending, or None.
         first_disagreement_s: Time when that packet was sent, or nan.
         causality_violations: Number of arrivals at a time that was already in the past of the receiver.
-        late_s: How far the time of each arrival was in the past of the receiver; 0 if it was not.
+        late_s: For all arrivals: time from the arrival to the receiver's simulated time, if that is later; else 0.
         delay_added_s: Mean delay that the policy added, before a packet entered the network and after its delivery.
         exchanges_per_s: Windows per simulated second.
         wall_s: Wall time by part.
@@ -79,15 +79,17 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
     """
     fate_pairs = [(fate, run.fates[identity]) for identity, fate in reference.fates.items() if identity in run.fates]
     decided_pairs = [
-        (expected, actual) for expected, actual in fate_pairs if expected.is_decided and actual.is_decided
+        (reference_fate, fate) for reference_fate, fate in fate_pairs if reference_fate.is_decided and fate.is_decided
     ]
     differing_packets = [
-        expected.packet for expected, actual in decided_pairs if bool(expected.reason) != bool(actual.reason)
+        reference_fate.packet
+        for reference_fate, fate in decided_pairs
+        if bool(reference_fate.reason) != bool(fate.reason)
     ]
     counted_ns = [
-        (expected.counted_ns, actual.counted_ns)
-        for expected, actual in decided_pairs
-        if expected.counted_ns is not None and actual.counted_ns is not None
+        (reference_fate.counted_ns, fate.counted_ns)
+        for reference_fate, fate in decided_pairs
+        if reference_fate.counted_ns is not None and fate.counted_ns is not None
     ]
     late_ns = [fate.late_ns for fate in run.fates.values() if fate.arrived_ns is not None]
     simulated_s = run.windows_ns[-1] / 1e9 if run.windows_ns else math.nan
@@ -162,8 +164,8 @@ def delay_added_s(run: Run) -> float:
 
 def lost_share(run: Run) -> float:
     """Return the share of lost packets among the packets whose fate is decided; nan without such packets."""
-    lost = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
-    return sum(lost) / len(lost) if lost else math.nan
+    losses = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
+    return sum(losses) / len(losses) if losses else math.nan
 
 
 def _spread(values: Sequence[float] | Floats) -> Spread:

@@ -315,9 +315,9 @@ class Coordinator:
             sent_datagrams, self._deferred = self._deferred, sent_datagrams
         elif self._deferred:
             sent_datagrams, self._deferred = [*self._deferred, *sent_datagrams], ()
-        absent = self._agents.absent if self._agents.has_changed else None
+        absences = self._agents.absent if self._agents.has_changed else None
         entered_fates = [
-            self._ledger.enter(datagram, max(datagram.at_ns, begin_ns), assumed_states, absent)
+            self._ledger.enter(datagram, max(datagram.at_ns, begin_ns), assumed_states, absences)
             for datagram in sent_datagrams
         ]
         for fate in entered_fates:
@@ -342,11 +342,11 @@ class Coordinator:
         if not self._agents.has_changed:
             return
         situation = self.situation
-        present = set(situation.states)
+        present_names = set(situation.states)
         if situation.assumed_states is not None:
-            present &= situation.assumed_states.keys()
-        situation.pairs = tuple(pair for pair in self._pairs if present >= {*pair})
-        situation.other_agents = tuple(name for name in self._other_agents if name in present)
+            present_names &= situation.assumed_states.keys()
+        situation.pairs = tuple(pair for pair in self._pairs if present_names >= {*pair})
+        situation.other_agents = tuple(name for name in self._other_agents if name in present_names)
 
     def _record_outcomes(
         self, arrivals: Sequence[Arrival], drops: Sequence[Drop], begin_ns: int, last_ns: int, end_ns: int
@@ -367,8 +367,8 @@ class Coordinator:
                 continue
             fate.counted_ns = end_ns if self.policy.defers_arrivals else arrival.at_ns
             fate.late_ns = end_ns - fate.counted_ns
-            received = ReceivedDatagram(packet.source, payload, packet.sent_ns, fate.counted_ns)
-            agents.deliver(packet.destination, received)
+            received_datagram = ReceivedDatagram(packet.source, payload, packet.sent_ns, fate.counted_ns)
+            agents.deliver(packet.destination, received_datagram)
             decided_fates.append(fate)
         for drop in drops:
             if ledger.is_withdrawn(drop.packet_id):

@@ -89,13 +89,13 @@ class Program(Protocol):
         """Return the time when its timer fires next, or None without a timer; only `wake` changes this time."""
         ...
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Return the action at this time.
 
         Args:
             now_ns: The current time.
             own_state: State of its agent at the last step of the physics.
-            received: Datagrams that have arrived since the previous call.
+            received_datagrams: Datagrams that have arrived since the previous call.
         """
         ...
 

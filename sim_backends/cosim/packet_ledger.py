@@ -79,7 +79,8 @@ class PacketLedger:
     Args:
         fates: The ledger adds the fate of every packet that enters the network to it, by flow and number.
         step_ns: The physics step.
-        measured: Agents that the position error of every packet includes, besides its sender and receiver.
+        measured_agents: Agents that the position error of every packet includes, in addition to its sender and
+            receiver.
         has_fixed_emitters: True if the position error includes a point that never moves.
     """
 
@@ -101,32 +102,32 @@ class PacketLedger:
 
     def enter(
         self,
-        sent: SentDatagram,
+        sent_datagram: SentDatagram,
         enters_ns: int,
         assumed_states: Mapping[str, State],
-        absent: Mapping[str, AgentAbsence] | None = None,
+        absences: Mapping[str, AgentAbsence] | None = None,
     ) -> Fate:
         """Record a datagram as a packet that enters the network; it is dropped if one of its ends is absent.
 
         Args:
-            sent: The datagram, as its program sent it.
+            sent_datagram: The datagram, as its program sent it.
             enters_ns: Time when it enters the network.
             assumed_states: States that the network assumes during the window, or at its beginning (`DeadReckoned`).
-            absent: The agents that are absent at the end of the window; None if all have always been present.
+            absences: The agents that are absent at the end of the window; None if all have always been present.
 
         Raises:
             FederateError: Its destination is not an agent, or its flow already has a packet of this number.
         """
-        at_ns, source, datagram, true_states = sent
+        at_ns, source, datagram, true_states = sent_datagram
         destination = datagram.destination
         if isinstance(assumed_states, DeadReckoned):
             assumed_states = assumed_states.at(enters_ns)
         is_dropped = False
-        if absent is not None:
+        if absences is not None:
             is_dropped = destination not in true_states or any(
-                name in absent and absent[name].since_ns <= enters_ns for name in (source, destination)
+                name in absences and absences[name].since_ns <= enters_ns for name in (source, destination)
             )
-            last_states = {name: absence.state for name, absence in absent.items()}
+            last_states = {name: absence.state for name, absence in absences.items()}
             assumed_states, true_states = (
                 {**true_states, **last_states, **assumed_states},
                 {**assumed_states, **last_states, **true_states},
@@ -225,5 +226,7 @@ class PacketLedger:
         try:
             return self._under_way.pop(packet_id)
         except KeyError:
-            why = "which was reported before" if 0 < packet_id <= self._packet_count else "which never entered it"
-            raise FederateError(f"the network reported the fate of packet {packet_id}, {why}") from None
+            explanation = (
+                "which was reported before" if 0 < packet_id <= self._packet_count else "which never entered it"
+            )
+            raise FederateError(f"the network reported the fate of packet {packet_id}, {explanation}") from None

@@ -39,12 +39,12 @@ class WallTime:
 
     def __init__(self, total_s: dict[str, float], *, agents: Iterable[object], network: Iterable[object]) -> None:
         self._total_s = total_s
-        self._waiting: dict[str, Sequence[HasWaitingTime]] = {
+        self._waiting_federates: dict[str, Sequence[HasWaitingTime]] = {
             "agents": [federate for federate in agents if isinstance(federate, HasWaitingTime)],
             "network": [federate for federate in network if isinstance(federate, HasWaitingTime)],
             "exchange": (),
         }
-        self._waited_s = {part: self._total_waited_s(part) for part in self._waiting}
+        self._waited_s = {part: self._total_waited_s(part) for part in self._waiting_federates}
         self._spent_s = dict.fromkeys(total_s, 0.0)
         self._lap_start_s = time.perf_counter()
 
@@ -57,7 +57,7 @@ class WallTime:
         now_s = time.perf_counter()
         self._spent_s[part] += now_s - self._lap_start_s
         self._lap_start_s = now_s
-        if self._waiting[part]:
+        if self._waiting_federates[part]:
             waited_s = self._total_waited_s(part)
             new_s = waited_s - self._waited_s[part]
             self._waited_s[part] = waited_s
@@ -72,7 +72,7 @@ class WallTime:
         return spent_s
 
     def _total_waited_s(self, part: str) -> float:
-        return sum(federate.waited_s for federate in self._waiting[part])
+        return sum(federate.waited_s for federate in self._waiting_federates[part])
 
 
 DEADLINE_S: Final = 30.0
@@ -131,7 +131,7 @@ class _StallingFederate:
 
     @property
     def waited_s(self) -> float:
-        """The waiting time of the stall and of the federate itself (`wall_time.Waits`)."""
+        """The waiting time of the stall and of the federate itself (`wall_time.HasWaitingTime`)."""
         return self._stall.waited_s + (self._federate.waited_s if isinstance(self._federate, HasWaitingTime) else 0.0)
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (depends on the federate)

@@ -153,11 +153,11 @@ class _Heartbeat:
         previous = None
         while not self._stopped.wait(self._interval_s):
             with self._lock, suppress(ClosedError):
-                current = self._request
-                if current is not None and current is previous and not self._stopped.is_set():
-                    request, copy_number, at_ns = current
+                current_request = self._request
+                if current_request is not None and current_request is previous and not self._stopped.is_set():
+                    request, copy_number, at_ns = current_request
                     self._channel.send(encode(MessageKind.BUSY, request, copy_number, encode_number(at_ns)), None)
-                previous = current
+                previous = current_request
 
 
 @dataclass

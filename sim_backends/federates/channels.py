@@ -118,12 +118,12 @@ class StreamChannel:
             os.close(fd)
         self._fds = set()
 
-    def _read(self, deadline_s: float | None, pending: int = 0) -> bytes:
+    def _read(self, deadline_s: float | None, bytes_before: int = 0) -> bytes:
         """Return the next bytes, at least one.
 
         Args:
             deadline_s: As for `receive`.
-            pending: Number of bytes of the same frame that were read before, for the error.
+            bytes_before: Number of bytes of the same frame that were read before, for the error.
         """
         if not self._fds:
             raise ClosedError("the connection was closed")
@@ -136,7 +136,7 @@ class StreamChannel:
             except OSError as error:
                 raise ClosedError("the connection was closed") from error
             if not chunk:
-                position_text = f" after {pending} bytes of a frame" if pending else ""
+                position_text = f" after {bytes_before} bytes of a frame" if bytes_before else ""
                 raise ClosedError(f"the connection was closed{position_text}")
             return chunk
 

@@ -82,11 +82,11 @@ class MalformedFrameError(ValueError):
 
     Args:
         position: Number of the wrong byte, from the beginning of the frame.
-        what: Description of the error.
+        description: Description of the error.
     """
 
-    def __init__(self, position: int, what: str) -> None:
-        super().__init__(f"byte {position}: {what}")
+    def __init__(self, position: int, description: str) -> None:
+        super().__init__(f"byte {position}: {description}")
         self.position = position
 
 

@@ -146,9 +146,9 @@ class FederateSession:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
             self._released_copies.clear()
             self._request_number = (self._request_number + 1) % _REQUEST_NUMBERS
-            expected = Header(0, answer, self._request_number, copy)
+            expected_header = Header(0, answer, self._request_number, copy)
             with self.exchange_context:
-                frame = self._exchange(encode(kind, self._request_number, copy, body), expected)
+                frame = self._exchange(encode(kind, self._request_number, copy, body), expected_header)
             if frame.header.kind is MessageKind.ERROR:
                 text = printable(decode_text(frame.body))
                 self.fail(f"{self.name} failed at the request to {describe()}: {text}")
@@ -169,7 +169,7 @@ class FederateSession:
                 f"{self.name} failed at the request to {describe()}: {error}{self._progress()}{self._exit_text()}"
             )
 
-    def _exchange(self, request: bytes, expected: Header) -> ProtocolFrame:
+    def _exchange(self, request: bytes, expected_header: Header) -> ProtocolFrame:
         """Send a request, and return the answer or the error; each `busy` message extends the wait for it."""
         start_s = time.monotonic()
         limit_s, final_limit_s = start_s + self._deadline_s, start_s + PATIENCE * self._deadline_s
@@ -181,35 +181,37 @@ class FederateSession:
             frame = self._channel.receive(limit_s)
             _, kind, number, copy = frame.header
             if kind is MessageKind.BUSY:
-                if number == expected.request:  # otherwise it belongs to an earlier request
+                if number == expected_header.request:  # otherwise it belongs to an earlier request
                     self._busy_ns = decode_number(frame.body)
                     limit_s = min(time.monotonic() + self._deadline_s, final_limit_s)
                 continue
             if self.observer is not None:
                 self.observer(request, frame)
-            if number != expected.request or copy != expected.copy:
+            if number != expected_header.request or copy != expected_header.copy:
                 raise MalformedFrameError(
-                    8, f"it is for request {number} and copy {copy}, not {expected.request} and {expected.copy}"
+                    8,
+                    f"it is for request {number} and copy {copy}, not {expected_header.request} and "
+                    f"{expected_header.copy}",
                 )
-            if kind is not expected.kind and kind is not MessageKind.ERROR:
-                raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected.kind.name.lower()}")
+            if kind is not expected_header.kind and kind is not MessageKind.ERROR:
+                raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected_header.kind.name.lower()}")
             return frame
 
-    def fail(self, what: str, remedy: str = "") -> NoReturn:
+    def fail(self, message: str, remedy: str = "") -> NoReturn:
         """Close the session, kill the child process, and raise an error.
 
         Raises:
             FederateError: Always.
         """
-        error = FederateError(what, remedy=remedy)
+        error = FederateError(message, remedy=remedy)
         self._end()
         raise error
 
-    def _fail_unanswered(self, what: str) -> NoReturn:
+    def _fail_unanswered(self, request_text: str) -> NoReturn:
         limit_s = self._deadline_s if self._busy_ns is None else PATIENCE * self._deadline_s
         busy_text = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
         error = UnansweredError(
-            f"{self.name} has not answered for {limit_s:g} s: request to {what}{self._progress()}{busy_text}"
+            f"{self.name} has not answered for {limit_s:g} s: request to {request_text}{self._progress()}{busy_text}"
             f"{self._output_text()}",
             remedy="find out why it waits, or set a longer deadline",
         )

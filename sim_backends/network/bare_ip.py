@@ -42,7 +42,7 @@ class BareIp:
         self._wire.deliver(packet.body)
 
     def record_loss(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`."""
+        """Implement `Transport.record_loss`."""
         self._wire.drop(packet.body, reason)
 
 
@@ -91,7 +91,7 @@ class BareBroadcast:
             self._wire.deliver(packet_id)
 
     def record_loss(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`; it is called for packets with one receiver only."""
+        """Implement `Transport.record_loss`; it is called only for packets with one receiver."""
 
     def record_miss(self, packet: IpPacket, host: str, reason: str) -> None:
         """Implement `CountsMisses.record_miss`."""

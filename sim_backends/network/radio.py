@@ -96,7 +96,7 @@ class RadioNetwork:
         self._log_ip: IpLog | None = None
         self._log_delay: DelayLog | None = None
         self._reassembly = ip.Reassembly(self._on_packet_lost)
-        self._pending: dict[int, Packet] = {}
+        self._pending_packets: dict[int, Packet] = {}
         self._arrivals: list[Arrival] = []
         self._drops: list[Drop] = []
         self._transports = {name: make(self) for name, make in transports.items()}
@@ -131,7 +131,7 @@ class RadioNetwork:
             if self._place(packet.enters_ns):
                 self._run(packet.enters_ns)
             self.now_ns = packet.enters_ns
-            self._pending[packet.packet_id] = packet
+            self._pending_packets[packet.packet_id] = packet
             self._transport(packet.protocol).send(packet)
             self._collect()
         self._run(to_ns)
@@ -178,13 +178,13 @@ class RadioNetwork:
 
     def deliver(self, packet_id: int) -> None:
         """Implement `Wire.deliver`."""
-        packet = self._pending.pop(packet_id, None)
+        packet = self._pending_packets.pop(packet_id, None)
         if packet is not None:
             self._arrivals.append(Arrival(packet_id, packet.destination, self.now_ns))
 
     def drop(self, packet_id: int, reason: str) -> None:
         """Implement `Wire.drop`."""
-        if self._pending.pop(packet_id, None) is not None:
+        if self._pending_packets.pop(packet_id, None) is not None:
             self._drops.append(Drop(packet_id, reason))
 
     def _run(self, to_ns: int) -> None:

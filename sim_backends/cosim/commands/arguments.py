@@ -56,7 +56,7 @@ def _add_run(commands: Commands) -> None:
         "--realtime",
         metavar="FACTOR",
         help="run at this number of simulated seconds per second, for example 1, one run after the other; a run that "
-        "cannot keep up has no results",
+        "is slower has no results",
     )
     parser.add_argument(
         "--late-bound",

@@ -178,7 +178,7 @@ def simulate_all(
         for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result
             report(len(results))
-            if result.is_interrupted:  # with a single worker, the run itself catches Ctrl-C
+            if result.is_interrupted:  # with a single worker, the run catches Ctrl-C
                 is_interrupted = True
                 break
     except KeyboardInterrupt:

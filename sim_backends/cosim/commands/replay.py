@@ -22,8 +22,8 @@ def run(arguments: argparse.Namespace) -> int:
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
     show_results(arguments.format, title(recording), scenario, [result])
     if recording.manifest.ending is not RunEnding.COMPLETE:
-        why = f": {recording.manifest.why}" if recording.manifest.why else ""
-        show_note(f"the run did not complete ({recording.manifest.ending}){why}")
+        reason_text = f": {recording.manifest.why}" if recording.manifest.why else ""
+        show_note(f"the run did not complete ({recording.manifest.ending}){reason_text}")
     if arguments.mcap is not None:
         _write_mcap(arguments.mcap, recording)
     return 0

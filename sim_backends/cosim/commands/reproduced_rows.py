@@ -43,8 +43,8 @@ class ReproducedRows:
         self._policy = policy
         self._has_captures = scenario.network.federate is None or writes_captures(scenario)
         self._repeats = trial.repeats(scenario.traffic, scenario.duration_ns)
-        first = self._repeats[0]
-        self._agents = {Role.SENDER: first.transfer.source, Role.RECEIVER: first.transfer.to[0]}
+        first_repeat = self._repeats[0]
+        self._agents = {Role.SENDER: first_repeat.transfer.source, Role.RECEIVER: first_repeat.transfer.to[0]}
         if scenario.topology is Topology.MASTER and scenario.relay is not None:
             self._agents[Role.RELAY] = scenario.relay
         self._addresses = {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()}
@@ -110,7 +110,7 @@ class ReproducedRows:
             if (transfer := flows.get(transfer_name)) is None:
                 continue
             ping = flows.get(ping_name)
-            reason = result.stopped or ("the run ended before the transfer" if transfer.under_way else "")
+            reason = result.stop_reason or ("the run ended before the transfer" if transfer.packets_under_way else "")
             captures = self._captures(repeat, recording)
             values = self._values(repeat, transfer, ping)
             if repeat.protocol is Protocol.TCP and not reason and Role.RECEIVER in captures:
@@ -146,9 +146,10 @@ class ReproducedRows:
                 f"[{seconds}.{microseconds:06}] {payload_bytes + 8} bytes from {address}: icmp_seq={sequence + 1} "
                 f"ttl={_TTL} time={1e3 * trip_s:.6f} ms"
             )
-        loss = 1 - trips.answered / trips.sent if trips.sent else 0.0
+        loss = 1 - trips.reply_count / trips.request_count if trips.request_count else 0.0
         summary = (
-            f"{trips.sent} packets transmitted, {trips.answered} received, {100 * loss:g}% packet loss, time 0ms"
+            f"{trips.request_count} packets transmitted, {trips.reply_count} received, "
+            f"{100 * loss:g}% packet loss, time 0ms"
         )
         return "\n".join((*lines, "", f"--- {address} ping statistics ---", summary, ""))
 
@@ -167,8 +168,8 @@ class ReproducedRows:
             values["tcp_congestion_control"] = self._scenario.tcp.congestion
         if repeat.protocol is Protocol.UDP:
             values |= {
-                "datagrams_sent": transfer.sent,
-                "datagrams_received": transfer.arrived,
+                "datagrams_sent": transfer.sent_packets,
+                "datagrams_received": transfer.arrived_packets,
                 "datagram_loss": transfer.loss,
             }
         return values

@@ -103,10 +103,10 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
     for result in results:
         if isinstance(result.error, RealTimeError):
             show_note(f"seed {result.seed}: it was slower than real time, so it has no results")
-        elif result.stopped:
+        elif result.stop_reason:
             # The command reports the full error when it ends.
-            why = result.stopped if result.error is None else f"stopped at {result.simulated_s:g} s"
-            show_note(f"seed {result.seed}: {why}; the numbers are from the time before")
+            reason = result.stop_reason if result.error is None else f"stopped at {result.simulated_s:g} s"
+            show_note(f"seed {result.seed}: {reason}; the numbers are from the time before")
 
 
 def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
@@ -115,8 +115,8 @@ def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
             result.seed,
             flow.name,
             flow.protocol,
-            flow.sent,
-            flow.under_way,
+            flow.sent_packets,
+            flow.packets_under_way,
             flow.loss,
             flow.delay_s.mean,
             flow.delay_s.p95,
@@ -127,10 +127,10 @@ def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
         for result in results
         for flow in result.flows
     ]
-    hidden = {"seed"} if len(results) == 1 else set()
-    if not any(flow.under_way for result in results for flow in result.flows):
-        hidden.add("under_way")
-    return Sheet(_COLUMNS, rows, [SheetPart(title, {column.name for column in _COLUMNS} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    if not any(flow.packets_under_way for result in results for flow in result.flows):
+        hidden_columns.add("under_way")
+    return Sheet(_COLUMNS, rows, [SheetPart(title, {column.name for column in _COLUMNS} - hidden_columns)])
 
 
 def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> Sheet:
@@ -150,14 +150,14 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
             scenario.faults[recovery.fault].kind,
             recovery.flow,
             recovery.end_ns / 1e9,
-            recovery.lost,
+            recovery.lost_packets,
             recovery.recovered_s,
         )
         for result in results
         for recovery in result.recoveries
     ]
-    hidden = {"seed"} if len(results) == 1 else set()
-    return Sheet(columns, rows, [SheetPart("recovery", {column.name for column in columns} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("recovery", {column.name for column in columns} - hidden_columns)])
 
 
 def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
@@ -175,15 +175,15 @@ def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
         if result.lateness is not None
         for limit_ns, count in sorted(result.lateness.windows.items())
     ]
-    hidden = {"seed"} if len(results) == 1 else set()
-    return Sheet(columns, rows, [SheetPart("lateness", {column.name for column in columns} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("lateness", {column.name for column in columns} - hidden_columns)])
 
 
 def _formation_sheet(results: Sequence[SeedResult]) -> Sheet:
     columns = (SheetColumn("seed", "seed", ""), *FORMATION)
     rows = [(result.seed, *formation_values(result.formation)) for result in results]
-    hidden = {"seed"} if len(results) == 1 else set()
-    return Sheet(columns, rows, [SheetPart("followers", {column.name for column in columns} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("followers", {column.name for column in columns} - hidden_columns)])
 
 
 def _cost_text(results: Sequence[SeedResult]) -> str:

@@ -81,11 +81,11 @@ class _CountedRuns:
         self._scenario = scenario
         self._seed = seed
         self._report = report
-        self._done = 0
+        self._finished_runs = 0
 
     def __call__(self, policy: SyncPolicy) -> Run:
-        self._report(self._done)
-        self._done += 1
+        self._report(self._finished_runs)
+        self._finished_runs += 1
         with build(self._scenario, policy=policy, seed=self._seed, measures_all=True) as simulation:
             return simulation.run()
 
@@ -111,10 +111,10 @@ def _summary(satisfaction: Satisfaction, threshold: float) -> str:
     reference = f"the exact reference loses {number_text(100 * satisfaction.reference_loss)} %"
     lines = [f"{reference} in {satisfaction.reference_exchanges:,} exchanges, independently of the window"]
     if satisfaction.rounds:
-        last = satisfaction.rounds[-1]
+        last_round = satisfaction.rounds[-1]
         outcome = "accepted" if satisfaction.is_satisfied else "not accepted"
         lines.append(
-            f"{outcome} at {number_text(100 * threshold)} %: {number_text(100 * last.loss)} % after "
+            f"{outcome} at {number_text(100 * threshold)} %: {number_text(100 * last_round.loss)} % after "
             f"{format_count(len(satisfaction.rounds), 'round')} and {satisfaction.exchanges:,} exchanges"
         )
     return "\n".join(lines)

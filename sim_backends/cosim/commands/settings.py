@@ -35,13 +35,13 @@ def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, f
         sink: Receives the events.
         unit: Unit of total and part.
     """
-    started_s: dict[str, float] = {}
+    start_s: dict[str, float] = {}
 
     def report(activity: str, total: float, done: float) -> None:
         now_s = time.monotonic()
-        spent_s = now_s - started_s.setdefault(activity, now_s)
-        left_s = spent_s * (total / done - 1) if done and spent_s else None
-        sink(Progress(activity, done, total, unit, left_s))
+        elapsed_s = now_s - start_s.setdefault(activity, now_s)
+        remaining_s = elapsed_s * (total / done - 1) if done and elapsed_s else None
+        sink(Progress(activity, done, total, unit, remaining_s))
 
     return report
 
@@ -79,11 +79,11 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ...]:
+def seeds(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> tuple[int, ...]:
     """Return the seeds from the options; without such options, the seeds of the scenario."""
     if arguments.seeds is not None:
         return tuple(range(1, arguments.seeds + 1))
-    return chosen.seeds if arguments.seed is None else (arguments.seed,)
+    return cosim_scenario.seeds if arguments.seed is None else (arguments.seed,)
 
 
 def workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers:
@@ -107,14 +107,14 @@ def policies(arguments: argparse.Namespace) -> list[str]:
     return [name for name in registry.policies() if not arguments.policy or name in arguments.policy]
 
 
-def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[float]:
+def windows_s(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> list[float]:
     """Return the windows of a comparison in seconds, in ascending order.
 
     Raises:
         ConfigurationError: One of them is not a duration above 0.
     """
     if not arguments.windows:
-        return [chosen.policy.window]
+        return [cosim_scenario.policy.window]
     windows = sorted({parse_duration_s(text, "--window") for text in arguments.windows.split(",")})
     if windows[0] <= 0:
         raise ConfigurationError(
@@ -124,9 +124,9 @@ def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[floa
     return windows
 
 
-def with_window(chosen: CosimScenario, window_s: float) -> CosimScenario:
+def with_window(cosim_scenario: CosimScenario, window_s: float) -> CosimScenario:
     """Return a scenario with another window."""
-    return chosen.model_copy(update={"policy": chosen.policy.model_copy(update={"window": window_s})})
+    return cosim_scenario.model_copy(update={"policy": cosim_scenario.policy.model_copy(update={"window": window_s})})
 
 
 def has_window(name: str) -> bool:
@@ -204,24 +204,24 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
     return Pace(factor, bound_s)
 
 
-def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
+def policy(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> str:
     """Return the name of the sync policy.
 
     Raises:
         ConfigurationError: There is no policy with this name, or a parameter is invalid.
     """
-    name = chosen.policy.name if arguments.policy is None else arguments.policy
-    make_policy(name, **chosen.policy.parameters)
+    name = cosim_scenario.policy.name if arguments.policy is None else arguments.policy
+    make_policy(name, **cosim_scenario.policy.parameters)
     return str(name)
 
 
 def note_commensurate_events(
-    chosen: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
+    cosim_scenario: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
 ) -> None:
     """Print a note on each window that is commensurate with a period of the scenario; suggest a better window.
 
     Args:
-        chosen: The scenario.
+        cosim_scenario: The scenario.
         policies: Names of the sync policies that run it.
         windows_s: Windows of the policies that have one.
         seeds: Number of seeds; each seed draws different phases.
@@ -230,14 +230,14 @@ def note_commensurate_events(
         return
     used_s = [window_s for window_s in windows_s if any(map(has_window, policies))]
     for window_s in used_s:
-        commensurate = commensurate_events(chosen, [window_s])
+        commensurate = commensurate_events(cosim_scenario, [window_s])
         if not commensurate:
             continue
         periods = ", ".join(
             f"{item.event.name} (every {item.event.period_s * 1e3:.6g} ms: {format_count(item.phases, 'phase')})"
             for item in commensurate
         )
-        other_s = incommensurate_window_s(chosen, window_s)
+        other_s = incommensurate_window_s(cosim_scenario, window_s)
         instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
         show_note(
             f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}; errors and added "
@@ -246,14 +246,14 @@ def note_commensurate_events(
         )
 
 
-def policy_text(name: str, chosen: CosimScenario) -> str:
+def policy_text(name: str, cosim_scenario: CosimScenario) -> str:
     """Return the name of a sync policy and the parameter that determines its windows: `sliding_window 10 ms`."""
     if has_window(name):
-        return f"{name} {chosen.policy.window * 1e3:g} ms"
+        return f"{name} {cosim_scenario.policy.window * 1e3:g} ms"
     if "bound_m" not in inspect.signature(registry.policies()[name]).parameters:
         return name
-    bound_db = chosen.policy.bound_db
-    return f"{name} {chosen.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
+    bound_db = cosim_scenario.policy.bound_db
+    return f"{name} {cosim_scenario.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
 
 
 def _change(text: str) -> tuple[str, Any]:

@@ -41,7 +41,7 @@ class SheetColumn:
     factor: float = 1.0
     digits: int = 3
 
-    def shown(self, value: Value) -> str:
+    def shown_text(self, value: Value) -> str:
         """Return the text of a value in a printed table."""
         if value is None or isinstance(value, str):
             return value or _MISSING
@@ -82,7 +82,7 @@ class Sheet:
         """Return the headings and the cells of a part."""
         indices = [index for index, column in enumerate(self.columns) if column.name in part.columns]
         heads = [self.columns[index].head for index in indices]
-        return heads, [[self.columns[index].shown(row[index]) for index in indices] for row in self.rows]
+        return heads, [[self.columns[index].shown_text(row[index]) for index in indices] for row in self.rows]
 
     def legend(self, part: SheetPart, explained_heads: Collection[str] = ()) -> dict[str, str]:
         """Return the meanings of the headings of a part, except headings that are already explained."""

@@ -162,10 +162,14 @@ def _sheet(scenario: CosimScenario, all_rows: Sequence[tuple[float, Row]], seeds
 
 
 def _values(window_s: float, row: Row) -> Sequence[Value]:
-    first: tuple[Value, ...] = (row.policy, window_s if settings.has_window(row.policy) else None, len(row.by_seed))
+    first_values: tuple[Value, ...] = (
+        row.policy,
+        window_s if settings.has_window(row.policy) else None,
+        len(row.by_seed),
+    )
     if row.errors is None or row.formation is None:
-        return first + (None,) * (len(COLUMNS) - len(first))
-    return (*first, *_error_values(row.errors), *formation_values(row.formation))
+        return first_values + (None,) * (len(COLUMNS) - len(first_values))
+    return (*first_values, *_error_values(row.errors), *formation_values(row.formation))
 
 
 def _error_values(errors: Errors) -> tuple[Value, ...]:

@@ -67,8 +67,8 @@ def policies() -> Mapping[str, PolicyKind]:
 def _load(point: EntryPoint) -> PolicyKind:
     kind: PolicyKind = plugins.load(point)
     problem = ""
-    if missing := missing_members(kind):
-        problem = f"the sync policy lacks {', '.join(missing)}"
+    if missing_names := missing_members(kind):
+        problem = f"the sync policy lacks {', '.join(missing_names)}"
     elif getattr(kind, "name", None) != point.name:
         problem = f"the sync policy's name is {getattr(kind, 'name', None)!r}, but must be {point.name!r}"
     if problem:

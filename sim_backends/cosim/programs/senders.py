@@ -47,7 +47,7 @@ class Periodic:
         """Return the time of the next packet, or None after `stop_ns`."""
         return None if self._stop_ns is not None and self._next_ns >= self._stop_ns else self._next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send a packet if it is due."""
         wake_ns = self.next_wake_ns()
         if wake_ns is None or now_ns < wake_ns:
@@ -117,7 +117,7 @@ class EchoRequester:
         """Return the time of the next request, or None after the last."""
         return self._next_ns if self._sent_count < self._count else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send a request if it is due."""
         wake_ns = self.next_wake_ns()
         if wake_ns is None or now_ns < wake_ns:
@@ -136,10 +136,12 @@ class EchoResponder:
     def next_wake_ns(self) -> None:
         """Return None: it wakes only when a request arrives."""
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send a reply to each received request."""
         requests = [
-            (datagram.source, datagram.payload) for datagram in received if isinstance(datagram.payload, PingRequest)
+            (datagram.source, datagram.payload)
+            for datagram in received_datagrams
+            if isinstance(datagram.payload, PingRequest)
         ]
         return Action(
             [
@@ -209,7 +211,7 @@ class Playback:
         """Return the time of the next message, or None at the end of the bag."""
         return self._begin_ns + self._bag[self._sent_count].at_ns if self._sent_count < len(self._bag) else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send all messages that are due."""
         datagrams = []
         while (wake_ns := self.next_wake_ns()) is not None and wake_ns <= now_ns:

@@ -101,7 +101,7 @@ class DriveThrough(NeverSends):
         """Return the time of the next command, or None after the last point."""
         return None if self._has_arrived else self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Steer towards the next point if a command is due."""
         if self._has_arrived or not self._timer.fire_if_due(now_ns):
             return Action()
@@ -155,17 +155,17 @@ class FlyThrough(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Steer towards the next point if a command is due."""
         if not self._timer.fire_if_due(now_ns):
             return Action()
-        last = len(self._points_m) - 1
+        last_index = len(self._points_m) - 1
         while (
-            self._next_index < last
+            self._next_index < last_index
             and math.dist(own_state.position_m, self._points_m[self._next_index]) <= self._reached_m
         ):
             self._next_index += 1
-        stops = self._next_index == last
+        stops = self._next_index == last_index
         return Action(command=fly_towards(own_state, self._points_m[self._next_index], self._speed_m_s, stops=stops))
 
 
@@ -199,7 +199,7 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
         speed_m_s: Top speed.
         stops: True to slow down and stop at the point.
     """
-    offset_m = [goal - own for own, goal in zip(own_state.position_m, point_m, strict=True)]
+    offset_m = [target - position for position, target in zip(own_state.position_m, point_m, strict=True)]
     remaining_m = math.hypot(*offset_m)
     if not remaining_m:
         return Velocity()
@@ -254,7 +254,7 @@ class VelocityProfile(NeverSends):
         """Return the beginning of the next leg, or None after the last."""
         return self._times_ns[self._next_index] if self._next_index < len(self._times_ns) else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send the command of the leg that has begun, if any."""
         due = bisect_right(self._times_ns, now_ns)
         if due == self._next_index:
@@ -288,7 +288,7 @@ class SpeedOscillation(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send the present speed if a command is due."""
         if not self._timer.fire_if_due(now_ns):
             return Action()

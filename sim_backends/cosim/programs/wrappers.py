@@ -30,12 +30,12 @@ class CombinedProgram:
         times_ns = (next_send_ns(program) for program in self._programs)
         return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Wake the programs that are due, or all if a datagram has arrived."""
         actions = [
-            program.wake(now_ns, own_state, received)
+            program.wake(now_ns, own_state, received_datagrams)
             for program in self._programs
-            if received or _is_due(program, now_ns)
+            if received_datagrams or _is_due(program, now_ns)
         ]
         commands = [action.command for action in actions if action.command is not None]
         datagrams = tuple(datagram for action in actions for datagram in action.datagrams)
@@ -75,11 +75,11 @@ class Outage:
         """Return the program's next send time."""
         return next_send_ns(self._program)
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Wake the program; during the outage, discard its action, and stop the body once."""
         is_off = self._begin_ns <= now_ns and (self._end_ns is None or now_ns < self._end_ns)
         if not is_off:
-            return self._program.wake(now_ns, own_state, received)
+            return self._program.wake(now_ns, own_state, received_datagrams)
         wake_ns = self._program.next_wake_ns()
         if wake_ns is not None and wake_ns <= now_ns:
             self._program.wake(now_ns, own_state, ())
@@ -165,16 +165,20 @@ class ProgramWithClock:
         reading_ns = next_send_ns(self._program)
         return None if reading_ns is None else self._clock.first_ns(reading_ns)
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Wake the program at the clock's reading, and stamp its datagrams with it."""
         reading_ns = self._clock.reading_ns(now_ns)
-        action = self._program.wake(reading_ns, own_state, [self._unstamped(datagram) for datagram in received])
+        action = self._program.wake(
+            reading_ns, own_state, [self._unstamped(datagram) for datagram in received_datagrams]
+        )
         stamped_payload = [
             replace(datagram, payload=_StampedPayload(datagram.payload, reading_ns)) for datagram in action.datagrams
         ]
         return Action(stamped_payload, action.command)
 
-    def _unstamped(self, received: ReceivedDatagram) -> ReceivedDatagram:
-        stamped_payload: _StampedPayload = received.payload
-        arrived_ns = self._clock.reading_ns(received.arrived_ns)
-        return ReceivedDatagram(received.source, stamped_payload.payload, stamped_payload.sent_ns, arrived_ns)
+    def _unstamped(self, received_datagram: ReceivedDatagram) -> ReceivedDatagram:
+        stamped_payload: _StampedPayload = received_datagram.payload
+        arrived_ns = self._clock.reading_ns(received_datagram.arrived_ns)
+        return ReceivedDatagram(
+            received_datagram.source, stamped_payload.payload, stamped_payload.sent_ns, arrived_ns
+        )

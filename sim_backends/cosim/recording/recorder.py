@@ -109,8 +109,8 @@ class RunRecorder:
         about: The scenario and its settings.
         states_every_ns: Interval at which true states are recorded, at ends of windows, in simulated nanoseconds.
         part_every_s: Interval at which parts are written, in seconds of wall time.
-        snap_bytes: Number of bytes kept of each IP packet in `captures/`. That folder has a file for each robot if
-            the network passes its packets to `log_ip`.
+        snap_bytes: Number of bytes of each IP packet that are stored in `captures/`. That folder has a file for each
+            robot if the network passes its packets to `log_ip`.
         agents: The agents that are absent at time 0; `captures/` must also include their packets.
         flows: Flows with special headers in the captures, by name.
     """
@@ -205,15 +205,15 @@ class RunRecorder:
         ending = RunEnding.COMPLETE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED
-        why = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
+        error_text = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
         if not self._has_failed:
-            self._write_part(last=True)
+            self._write_part(is_last=True)
         self._close()
         self._free_reserve()
         self._manifest = replace(
             self._manifest,
             ending=ending,
-            why=why,
+            error_text=error_text,
             digest="" if self._has_failed else self._state.digest.hexdigest(),
             parts=self._state.checksums,
         )
@@ -232,7 +232,7 @@ class RunRecorder:
             if not self._has_failed:
                 raise self._error(error) from error
 
-    def _write_part(self, *, last: bool = False) -> None:
+    def _write_part(self, *, is_last: bool = False) -> None:
         """Write the collected windows; an interrupt does not cause a window to be counted twice.
 
         If the disk is full, the reserved space is used for tables, not for captures. As many windows are written as
@@ -249,9 +249,9 @@ class RunRecorder:
             failure = error
             self._free_reserve()
         count = len(self._windows)
-        while count or last:
+        while count or is_last:
             try:
-                self._write_windows(count, last=last and failure is None)
+                self._write_windows(count, is_last=is_last and failure is None)
                 break
             except OSError as error:
                 failure = failure or error
@@ -262,13 +262,13 @@ class RunRecorder:
         if failure is not None:
             raise self._error(failure) from failure
 
-    def _write_windows(self, count: int, *, last: bool) -> None:
+    def _write_windows(self, count: int, *, is_last: bool) -> None:
         """Write the first `count` collected windows as a part of each table."""
         state, windows = self._state.copy(), self._windows[:count]
         rows = state.add_windows(windows)
         if not state.parts:
             rows["states"] = state_rows(0, self._first_states) + rows["states"]
-        if last:
+        if is_last:
             rows["packets"] += state.undecided_rows()
         written_paths: list[Path] = []
         try:

@@ -188,7 +188,7 @@ class _Traffic(Strict, ABC):
                 f"only the protocol topic has a qos, but the protocol is {self.protocol}", "qos"
             )
         if self.source in self.to:
-            raise schema.validation_error(f"{self.source} sends to itself", "to")
+            raise schema.validation_error(f"{self.source} is both the sender and a receiver", "to")
         if len(set(self.to)) < len(self.to):
             raise schema.validation_error("an agent is listed twice", "to")
         return self
@@ -344,8 +344,8 @@ class PingTraffic(_Traffic):
 
     @override
     def packets(self, duration_s: float) -> float:
-        sent = min(self.count, (duration_s - self.start) / self.interval)
-        return 2 * len(self.to) * max(sent, 0.0)
+        request_count = min(self.count, (duration_s - self.start) / self.interval)
+        return 2 * len(self.to) * max(request_count, 0.0)
 
 
 Traffic = Annotated[StreamTraffic | BagTraffic | FileTraffic | PingTraffic, Field(discriminator="kind")]

@@ -114,8 +114,8 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         losses_db = self._losses([states[name].position_m for name in names])
         losses_by_nem: dict[int, list[NemPathloss]] = {}
         for (first, second), loss_db in losses_db.items():
-            for receiver, other in ((first, second), (second, first)):
-                loss = NemPathloss(self._nems[names[other]], loss_db, loss_db)
+            for receiver, peer in ((first, second), (second, first)):
+                loss = NemPathloss(self._nems[names[peer]], loss_db, loss_db)
                 losses_by_nem.setdefault(self._nems[names[receiver]], []).append(loss)
         return [SerializedEvent(nem, PATHLOSS, encode_pathlosses(losses)) for nem, losses in losses_by_nem.items()]
 

@@ -92,12 +92,12 @@ def _change(document: Document, keys: list[str], value: Any) -> None:  # noqa: A
         ConfigurationError: A parent key has a value without keys, or an index is beyond the end of a list.
     """
     location = tuple(int(key) if key.isdecimal() else key for key in keys)
-    *parents, last = location
+    *parents, last_key = location
     data = document.data
     try:
         for key in parents:
             data = data.setdefault(key, {}) if isinstance(data, dict) else data[key]
-        data[last] = value
+        data[last_key] = value
     except (IndexError, TypeError):
         raise ConfigurationError(
             f"the key {'.'.join(keys)} cannot be changed, because it does not exist",

@@ -164,21 +164,21 @@ def _differences(start_ns: int, end_ns: int, exact: _Outcome, actual: _Outcome) 
     """Return each error of a window for all packets and agents that it affected."""
     differences: dict[str, list[float]] = {measure: [] for measure in MEASURES}
     for identity, fate in exact.fates.items():
-        other = actual.fates.get(identity)
+        actual_fate = actual.fates.get(identity)
         was_sent_in_window = start_ns < fate.packet.sent_ns <= end_ns
         arrived_in_window = fate.arrived_ns is not None and start_ns < fate.arrived_ns <= end_ns
         if (
             not (was_sent_in_window or arrived_in_window)
-            or other is None
-            or not (fate.is_decided and other.is_decided)
+            or actual_fate is None
+            or not (fate.is_decided and actual_fate.is_decided)
         ):
             continue
         if was_sent_in_window:
-            differences["position_m"].append(position_error_m(other))
-        differences["fates"].append(float(bool(fate.reason) != bool(other.reason)))
-        if fate.counted_ns is not None and other.counted_ns is not None:
-            differences["delivery_s"].append(abs(fate.counted_ns - other.counted_ns) / 1e9)
-            differences["late_s"].append(other.late_ns / 1e9)
+            differences["position_m"].append(position_error_m(actual_fate))
+        differences["fates"].append(float(bool(fate.reason) != bool(actual_fate.reason)))
+        if fate.counted_ns is not None and actual_fate.counted_ns is not None:
+            differences["delivery_s"].append(abs(fate.counted_ns - actual_fate.counted_ns) / 1e9)
+            differences["late_s"].append(actual_fate.late_ns / 1e9)
     differences["path_m"] = [
         math.dist(state.position_m, actual.states[name].position_m)
         for name, state in exact.states.items()

@@ -41,27 +41,27 @@ class FlowSample:
     """The packets of a flow in one run; for a ping, its requests.
 
     Attributes:
-        sent: Number of packets.
-        arrived: Number of packets that arrived or, for a ping, got a reply before the run ended.
+        sent_packets: Number of packets.
+        arrived_packets: Number of packets that arrived or, for a ping, got a reply before the run ended.
         delay_sum_s: Sum of their delays, from sending to the arrival that counts for the receiver, or of round trips;
             nan if none arrived, because 0 would mean an immediate transmission.
         reasons: Number of the other packets by the reason why they did not arrive.
     """
 
-    sent: int
-    arrived: int
+    sent_packets: int
+    arrived_packets: int
     delay_sum_s: float
     reasons: Mapping[str, int]
 
     @property
     def loss(self) -> float:
         """Share of the packets that did not arrive; nan without packets."""
-        return 1 - self.arrived / self.sent if self.sent else np.nan
+        return 1 - self.arrived_packets / self.sent_packets if self.sent_packets else np.nan
 
     @property
     def delay_mean_s(self) -> float:
         """Mean delay of packets that arrived; nan if no packet arrived."""
-        return self.delay_sum_s / self.arrived if self.arrived else np.nan
+        return self.delay_sum_s / self.arrived_packets if self.arrived_packets else np.nan
 
 
 def flow_samples(
@@ -116,9 +116,9 @@ def _fates(run: Run, flow: str) -> list[Fate]:
     return [fate for (name, _), fate in run.fates.items() if name == flow]
 
 
-def _flow_sample(sent: int, delays_s: Sequence[float], fates: Sequence[Fate]) -> FlowSample:
+def _flow_sample(sent_packets: int, delays_s: Sequence[float], fates: Sequence[Fate]) -> FlowSample:
     reasons = Counter(fate.reason or UNDER_WAY for fate in fates if fate.arrived_ns is None)
-    return FlowSample(sent, len(delays_s), sum(delays_s) if delays_s else np.nan, dict(reasons))
+    return FlowSample(sent_packets, len(delays_s), sum(delays_s) if delays_s else np.nan, dict(reasons))
 
 
 Changes = Mapping[str, Any]

@@ -48,9 +48,9 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
     rows = {setting.digest: _rows_of(setting, plan, folder) for setting in plan.settings}
     partitions = [factor.column for factor in plan.factors]
     schema = _schema((row for setting_rows in rows.values() for row in setting_rows), plan.factors)
-    new, old = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
+    new_folder, previous_folder = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
     with folder.error_conversion():
-        for old_folder in (new, old):
+        for old_folder in (new_folder, previous_folder):
             shutil.rmtree(old_folder, ignore_errors=True)
         for setting in plan.settings:
             if rows[setting.digest]:
@@ -58,20 +58,20 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
                     f"{column}={quote(value, safe='')}"
                     for column, value in zip(partitions, setting.values.values(), strict=True)
                 ]
-                path = new.joinpath(*parts, "part-0.parquet")
+                path = new_folder.joinpath(*parts, "part-0.parquet")
                 path.parent.mkdir(parents=True)
                 table = pa.Table.from_pylist(rows[setting.digest], schema=schema)
                 pa.parquet.write_table(table, path, compression="zstd")
-        new.mkdir(exist_ok=True)
-        paths = sorted(new.rglob("*"))
+        new_folder.mkdir(exist_ok=True)
+        paths = sorted(new_folder.rglob("*"))
         files.sync([path for path in paths if path.is_file()])
-        for path in (new, *(path for path in paths if path.is_dir())):
+        for path in (new_folder, *(path for path in paths if path.is_dir())):
             files.sync_folder(path)
         if folder.results.exists():
-            folder.results.rename(old)
-        new.rename(folder.results)
+            folder.results.rename(previous_folder)
+        new_folder.rename(folder.results)
         files.sync_folder(folder.path)
-        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(previous_folder, ignore_errors=True)
     return sum(map(len, rows.values()))
 
 

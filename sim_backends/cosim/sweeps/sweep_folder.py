@@ -99,12 +99,14 @@ class SweepFolder:
             if next(self.path.iterdir(), None) is not None:
                 raise ConfigurationError("this folder is not empty", where=str(self.path), remedy="choose another -o")
             return
-        before, now = self._read(path), _description(plan)
+        stored_plan, current_plan = self._read(path), _description(plan)
         for key in ("scenario", "factors"):
-            old, new = ([*item] if isinstance(item, dict) else item for item in (before.get(key), now[key]))
-            if old != new:
+            old_value, new_value = (
+                [*item] if isinstance(item, dict) else item for item in (stored_plan.get(key), current_plan[key])
+            )
+            if old_value != new_value:
                 raise ConfigurationError(
-                    f"this is a sweep with other {key}: {old}", where=str(self.path), remedy="choose another -o"
+                    f"this is a sweep with other {key}: {old_value}", where=str(self.path), remedy="choose another -o"
                 )
 
     def finished(self) -> set[str]:

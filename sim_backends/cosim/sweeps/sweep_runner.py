@@ -105,7 +105,7 @@ def _sweep_columns(run: SweepRun, flow: FlowResult, result: SeedResult) -> dict[
     columns: dict[str, Value] = {"flow": flow.name}
     if DISTANCE in run.setting.values:
         columns["distance"] = run.setting.values[DISTANCE]
-    if flow.arrived:
+    if flow.arrived_packets:
         columns["added_delay_mean_s"] = flow.added_s
     if result.simulated_s:
         columns["exchanges_per_s"] = result.windows / result.simulated_s
@@ -183,17 +183,24 @@ def _failure(end: TaskEnd[RunResult], attempts: int) -> RunFailure | None:
 class _Reporter:
     """Reports the end of each run and the remaining time."""
 
-    def __init__(self, sink: Sink, done: int, total: int) -> None:
-        self._sink, self._done, self._total, self._done_before = sink, done, total, done
-        self._started_s = time.monotonic()
-        sink(Progress("sweep", done, total, "runs"))
+    def __init__(self, sink: Sink, finished_count: int, total: int) -> None:
+        self._sink, self._finished_count, self._total, self._initial_count = (
+            sink,
+            finished_count,
+            total,
+            finished_count,
+        )
+        self._start_s = time.monotonic()
+        sink(Progress("sweep", finished_count, total, "runs"))
 
     def report_end(self, run: SweepRun, failure: RunFailure | None) -> None:
-        self._done += failure is None
-        spent_s, new = time.monotonic() - self._started_s, self._done - self._done_before
-        left_s = spent_s / new * (self._total - self._done) if new else None
+        self._finished_count += failure is None
+        spent_s, new_count = time.monotonic() - self._start_s, self._finished_count - self._initial_count
+        remaining_s = spent_s / new_count * (self._total - self._finished_count) if new_count else None
         if failure is None:
-            self._sink(SweepRunEnded(str(run.setting), run.seed, run.name, "", "", 1, self._done, self._total))
+            self._sink(
+                SweepRunEnded(str(run.setting), run.seed, run.name, "", "", 1, self._finished_count, self._total)
+            )
         else:
             event = SweepRunEnded(
                 str(run.setting),
@@ -202,8 +209,8 @@ class _Reporter:
                 failure.reason,
                 failure.remedy,
                 failure.attempts,
-                self._done,
+                self._finished_count,
                 self._total,
             )
             self._sink(event)
-        self._sink(Progress("sweep", self._done, self._total, "runs", left_s))
+        self._sink(Progress("sweep", self._finished_count, self._total, "runs", remaining_s))

@@ -95,8 +95,8 @@ class RealAgents(Agents):
         return self._reached_ns
 
     @override
-    def deliver(self, receiver: str, received: ReceivedDatagram) -> None:
-        self.delivered.append(received.payload)
+    def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
+        self.delivered.append(received_datagram.payload)
 
     @property
     @override

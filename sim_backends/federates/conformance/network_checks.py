@@ -60,7 +60,7 @@ class _FateAccount:
     def __init__(self, probe: FederateProbe) -> None:
         self._probe = probe
         self._packets: dict[int, Packet] = {}
-        self._decided: set[int] = set()
+        self._decided_ids: set[int] = set()
         self._next_event_ns = probe.welcome.next_event_ns
         self.arrivals: list[Arrival] = []
         self.reasons: dict[int, str] = {}
@@ -91,14 +91,14 @@ class _FateAccount:
 
     def undecided(self) -> list[int]:
         """Return the numbers of packets that neither arrived nor were dropped."""
-        return sorted(self._packets.keys() - self._decided)
+        return sorted(self._packets.keys() - self._decided_ids)
 
     def _decide(self, packet_id: int) -> None:
         if packet_id not in self._packets:
             raise CheckError(f"the fate of packet {packet_id} was reported, but it was not sent to the network")
-        if packet_id in self._decided:
+        if packet_id in self._decided_ids:
             raise CheckError(f"the fate of packet {packet_id} was reported twice")
-        self._decided.add(packet_id)
+        self._decided_ids.add(packet_id)
 
     def _check_arrival(self, arrival: Arrival, from_ns: int, to_ns: int) -> None:
         self._decide(arrival.packet_id)

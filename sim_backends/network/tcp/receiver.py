@@ -96,8 +96,8 @@ class Receiver:
         self._out_of_order.add(segment.first, segment.end)
         block = self._out_of_order.containing(segment.first)
         assert block is not None
-        others = [number for number in self._sack_order if not block[0] <= number < block[1]]
-        self._sack_order = [segment.first, *others]
+        other_ranges = [number for number in self._sack_order if not block[0] <= number < block[1]]
+        self._sack_order = [segment.first, *other_ranges]
 
     def _send_ack(self) -> None:
         assert self._last_segment is not None

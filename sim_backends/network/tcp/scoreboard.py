@@ -48,7 +48,7 @@ class Scoreboard:
     messages of robots.
 
     Attributes:
-        next: The next sequence number to send (SND.NXT).
+        next_number: The next sequence number to send (SND.NXT).
         first_unacknowledged: The first unacknowledged sequence number (SND.UNA).
         pipe_bytes: Estimate of the bytes in flight (RFC 6675, 4, SetPipe).
         delivered_bytes: Bytes that have arrived so far according to ACKs and SACKs.
@@ -56,7 +56,7 @@ class Scoreboard:
     """
 
     def __init__(self) -> None:
-        self.next = 1
+        self.next_number = 1
         self.first_unacknowledged = 1
         self.pipe_bytes = 0
         self.delivered_bytes = 0
@@ -65,7 +65,7 @@ class Scoreboard:
         self._sent_segments: list[SentSegment] = []
         self._acked_count = 0
         self._removed_count = 0
-        self._arrived = Ranges()
+        self._arrived_ranges = Ranges()
         # Indices, counted over the whole stream, of the last three segments that arrived by SACK.
         self._latest_sacked: list[int] = []
         self._examined = 0
@@ -76,9 +76,9 @@ class Scoreboard:
 
     def send(self, now_ns: int, length: int, number: int) -> SentSegment:
         """Record a new segment that is sent, and return it."""
-        segment = SentSegment(self.next, self.next + length, number, now_ns)
+        segment = SentSegment(self.next_number, self.next_number + length, number, now_ns)
         self._sent_segments.append(segment)
-        self.next = segment.end
+        self.next_number = segment.end
         self.pipe_bytes += length
         return segment
 
@@ -100,7 +100,7 @@ class Scoreboard:
                 self._count_delivered(now_ns, segment)
             self._remove_from_pipe(segment)
             self._acked_count += 1
-        self._arrived.remove_before(ack_number)
+        self._arrived_ranges.remove_before(ack_number)
         if self._acked_count >= _COMPACT:
             del self._sent_segments[: self._acked_count]
             self._removed_count += self._acked_count
@@ -111,7 +111,7 @@ class Scoreboard:
         for block in sacks:
             first = max(block[0], self.first_unacknowledged)
             if first < block[1]:
-                for new_range in self._arrived.add(first, block[1]):
+                for new_range in self._arrived_ranges.add(first, block[1]):
                     self._mark_arrived(now_ns, new_range)
 
     def detect_losses(self, now_ns: int, *, is_recovering: bool) -> int | None:  # noqa: ARG002 (see RackScoreboard)

@@ -198,17 +198,19 @@ class Sender:
     def _start_recovery(self, lost_segment: SentSegment) -> None:
         """Start a recovery: reduce the window and send the first lost segment (RFC 6675, 5, step 4)."""
         scoreboard = self.scoreboard
-        self._recovery_end = scoreboard.next
+        self._recovery_end = scoreboard.next_number
         self.control.on_loss(self._flight_bytes())
         self._reduction = ProportionalReduction(
-            self.control.window_bytes, scoreboard.next - scoreboard.first_unacknowledged, self._options.segment_bytes
+            self.control.window_bytes,
+            scoreboard.next_number - scoreboard.first_unacknowledged,
+            self._options.segment_bytes,
         )
         self._log("loss")
         self._send_again(lost_segment)
 
     def _flight_bytes(self) -> int:
         """Return FlightSize without the data that limited transmit sent beyond the window (RFC 5681, 3.2, step 2)."""
-        return min(self.scoreboard.next - self.scoreboard.first_unacknowledged, self.control.window_bytes)
+        return min(self.scoreboard.next_number - self.scoreboard.first_unacknowledged, self.control.window_bytes)
 
     def _on_timeout(self) -> None:
         self._timeouts += 1
@@ -222,7 +224,7 @@ class Sender:
         is_repeated = self._timeouts > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
         self.control.on_timeout(self._flight_bytes(), is_repeated=is_repeated)
         scoreboard.lose_all()
-        self._recovery_end = scoreboard.next
+        self._recovery_end = scoreboard.next_number
         self._reduction = None
         self.round_trips.back_off()
         self._log("timeout")
@@ -260,15 +262,15 @@ class Sender:
     def _next_length(self) -> int:
         """Return the length of the next new segment; 0 if there is none."""
         scoreboard, options = self.scoreboard, self._options
-        length = min(options.segment_bytes, self._stream.end - scoreboard.next)
-        if scoreboard.next + length > scoreboard.first_unacknowledged + self._receive_window_bytes:
+        length = min(options.segment_bytes, self._stream.end - scoreboard.next_number)
+        if scoreboard.next_number + length > scoreboard.first_unacknowledged + self._receive_window_bytes:
             return 0
         if options.nagle and length < options.segment_bytes and scoreboard:
             return 0
         return length
 
     def _send_new(self, length: int) -> None:
-        segment = self.scoreboard.send(self._wire.now_ns, length, self._stream.number(self.scoreboard.next))
+        segment = self.scoreboard.send(self._wire.now_ns, length, self._stream.number(self.scoreboard.next_number))
         self._emit(segment.first, length, number=segment.number, earlier_transmissions=0)
         self._record_sent(length)
         if self._timer.due_ns is None:

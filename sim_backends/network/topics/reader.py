@@ -192,7 +192,7 @@ class TopicReader:
             self._next_number += 1
             self._deliver(sample)
 
-    def _missing(self) -> tuple[tuple[int, ...], _MissingFragments | None]:
+    def _find_missing(self) -> tuple[tuple[int, ...], _MissingFragments | None]:
         """Return the missing samples before the first incomplete one, and the missing fragments of that sample."""
         numbers: list[int] = []
         for number in range(self._next_number, min(self._last_number + 1, self._next_number + _MAX_BITS)):
@@ -209,7 +209,7 @@ class TopicReader:
 
     def _choose_response(self) -> _Response:
         """Return the response that is due now."""
-        numbers, missing_fragments = self._missing()
+        numbers, missing_fragments = self._find_missing()
         now_ns = self._wire.now_ns
         kind: _Kind = "silent_ack"
         if numbers or missing_fragments:

@@ -19,7 +19,7 @@ class Topics:
 
     A subscriber receives data by unicast, as in CycloneDDS if multicast is restricted to discovery (`AllowMulticast:
     spdp`); this is recommended for Wi-Fi, where multicast has no link-layer acknowledgement. A program continues
-    while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so that its own
+    while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so that its
     history is never full.
 
     Not modelled: durability other than volatile, HEARTBEAT_FRAG, which is optional, and the topics that ROS 2 adds to

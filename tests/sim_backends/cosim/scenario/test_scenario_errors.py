@@ -87,7 +87,7 @@ WRONG = [
     ("distance: 2m", "distance: 0m", 15, "greater than 0"),
     ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name of at most 31 lower-case letters"),
     ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
-    ("from: one, to: two", "from: one, to: one", 18, "one sends to itself"),
+    ("from: one, to: two", "from: one, to: one", 18, "one is both the sender and a receiver"),
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
     ("from: one, to: two", "from: one, to: [two, two]", 18, "listed twice"),
     ("to: [one]", "to: [three]", 16, "three sends, receives or relays packets, but has no radio"),
