@@ -213,7 +213,7 @@ class RunRecorder:
         self._manifest = replace(
             self._manifest,
             ending=ending,
-            error_text=error_text,
+            why=error_text,
             digest="" if self._has_failed else self._state.digest.hexdigest(),
             parts=self._state.checksums,
         )
