@@ -229,10 +229,10 @@ class Agents:
         if not (self._new_agents or self._last_states):
             return begin
         new_agents, self._new_agents = self._new_agents, frozenset()
-        lost_names, self._last_states = self._last_states, {}
+        last_states, self._last_states = self._last_states, {}
         added_states = {
-            name: end.get(name) or lost_names[name]
-            for name in sorted(new_agents | lost_names.keys())
+            name: end.get(name) or last_states[name]
+            for name in sorted(new_agents | last_states.keys())
             if name not in begin
         }
         return {**added_states, **begin} if added_states else begin

@@ -77,7 +77,7 @@ class PacketLedger:
     """Tracks each packet from its entry to its arrival or drop; an impossible report raises a `FederateError`.
 
     Args:
-        fates: The ledger adds the fate of every packet that enters the network to it, by flow and number.
+        fates: Mapping to which the ledger adds the fate of every packet that enters the network, by flow and number.
         step_ns: The physics step.
         measured_agents: Agents that the position error of every packet includes, in addition to its sender and
             receiver.
@@ -184,7 +184,7 @@ class PacketLedger:
         return fates
 
     def is_withdrawn(self, packet_id: int) -> bool:
-        """Return True if a packet was withdrawn, and forget it: a second call for the same packet returns False."""
+        """Return True if a packet was withdrawn, but only once: a second call for the same packet returns False."""
         if packet_id not in self._withdrawn_ids:
             return False
         self._withdrawn_ids.remove(packet_id)

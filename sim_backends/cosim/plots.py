@@ -77,13 +77,13 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
     rows = -(-len(panels) // columns)
     with _drawing():
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES * rows), layout="constrained")
-        drawn_lines = []
+        drawn_panels = []
         for number, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(rows, columns, number)
-            drawn_lines.append((axes, panel, _draw_log(axes, panel)))
+            drawn_panels.append((axes, panel, _draw_log(axes, panel)))
         figure.draw_without_rendering()  # the axes have their final positions only after this call
         figure.set_layout_engine("none")
-        for axes, panel, curves in drawn_lines:
+        for axes, panel, curves in drawn_panels:
             _label(
                 axes,
                 [curve.label or curve.name for curve in panel.curves],

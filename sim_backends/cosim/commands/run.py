@@ -106,7 +106,7 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         elif result.stop_reason:
             # The command reports the full error when it ends.
             reason = result.stop_reason if result.error is None else f"stopped at {result.simulated_s:g} s"
-            show_note(f"seed {result.seed}: {reason}; the numbers are from the time before")
+            show_note(f"seed {result.seed}: {reason}; the numbers cover only the time until then")
 
 
 def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
@@ -165,7 +165,7 @@ def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
         SheetColumn("seed", "seed", ""),
         SheetColumn("late_up_to_s", "late up to (ms)", "lateness of a window against real time; 0: in time", 1e3),
         SheetColumn(
-            "windows", "windows", "number of windows with at most this lateness, and more than that of the row above"
+            "windows", "windows", "number of windows whose lateness is at most this, and above that of the row before"
         ),
         SheetColumn("share", "share (%)", "share of all windows", 100),
     )

@@ -112,14 +112,14 @@ def _all_rows(
     all_rows: list[tuple[float, Row]] = []
     report = progress_reporter(sink)
     for number, window_s in enumerate(windows_s):
-        window_policies = [name for name in policies if number == 0 or settings.has_window(name)]
+        policies_to_run = [name for name in policies if number == 0 or settings.has_window(name)]
         make = partial(_build, settings.with_window(scenario, window_s))
-        runs = len({*window_policies, EventDriven.name}) * len(seeds)
+        runs = len({*policies_to_run, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        window_outcomes = outcomes(make, window_policies, seeds, workers=workers, progress=progress)
+        window_outcomes = outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
         window_rows = rows(window_outcomes, partial(formation, scenario))
-        all_rows += [(window_s, row) for row in window_rows if row.policy in window_policies]
+        all_rows += [(window_s, row) for row in window_rows if row.policy in policies_to_run]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))
 
 

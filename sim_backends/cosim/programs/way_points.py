@@ -63,8 +63,7 @@ _APPROACH_PER_S: Final = 1.0
 class DriveThrough(NeverSends):
     """Drives a wheeled body from point to point, and stops at the last point.
 
-    It turns towards a point at a rate proportional to the heading error, and drives more slowly the larger this error
-    is.
+    It turns towards a point at a rate proportional to the heading error. A larger error reduces its speed.
 
     Args:
         points_m: The waypoints, metres east and north.

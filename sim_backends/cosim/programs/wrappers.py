@@ -171,10 +171,10 @@ class ProgramWithClock:
         action = self._program.wake(
             reading_ns, own_state, [self._unstamped(datagram) for datagram in received_datagrams]
         )
-        stamped_payload = [
+        stamped_datagrams = [
             replace(datagram, payload=_StampedPayload(datagram.payload, reading_ns)) for datagram in action.datagrams
         ]
-        return Action(stamped_payload, action.command)
+        return Action(stamped_datagrams, action.command)
 
     def _unstamped(self, received_datagram: ReceivedDatagram) -> ReceivedDatagram:
         stamped_payload: _StampedPayload = received_datagram.payload
