@@ -3,16 +3,16 @@
 The network extrapolates the agents at the velocities that they had at the beginning of the window, as simulators of
 many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Physics and programs advance ahead of the
 network: arrivals count from the end of the window, so nothing that physics and programs do in the window depends on
-the network. When they have reached a time, a pair of agents has an error x, the distance between its true relative
-position and the relative position in the network. It grows at a speed v, which changes by at most the acceleration
-limit a: after a time t it is at most x + v t + a t^2 / 2. Before the error can reach the bound, the policy evaluates
-the errors again; if less than one step of the physics remains, the window ends. The bound therefore holds for any
-motion, and the windows are not shortened for motions that were possible but did not occur ("send on delta":
-Miskowicz, Sensors 6, 49, 2006).
+the network. At the time that physics and programs have reached, a pair of agents has an error x: the distance between
+its true relative position and its relative position in the network. This error grows at a speed v, which changes by
+at most the acceleration limit a: after a time t, the error is at most x + v t + a t^2 / 2. Before the error can reach
+the bound, the policy evaluates the errors again; if less than one step of the physics remains, the window ends. The
+bound is therefore kept for any motion, and the windows are not shortened for motions that were possible but did not
+occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
 
 The policy examines the pairs of all agents that send, receive, forward or interfere. A bound in metres adds the pairs
-of each agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound
-in dB adds the pairs of each agent and a fixed source of interference.
+of each agent and a fixed point on the ground, so that the bound also applies to the absolute position of the agent. A
+bound in dB adds the pairs of each agent and a fixed source of interference.
 
 The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
 the error grows by u q between two steps. The step is the step of the physics if u q is at most an eighth of the
@@ -117,7 +117,7 @@ class ErrorBounded:
         with np.errstate(divide="ignore"):
             longest_s = float(np.min(_STEP_SHARE * pairs.bounds_m / pairs.assumed_m_s, initial=math.inf))
         step_ns = situation.physics_step_ns
-        # Times are whole nanoseconds, so no event is between two of them.
+        # The step need not be shorter than 1 ns, because all times are whole nanoseconds.
         self._reckoning_step_ns = step_ns if longest_s * 1e9 >= step_ns else max(math.floor(longest_s * 1e9), 1)
         return self._reckoning_step_ns
 

@@ -147,7 +147,7 @@ class EmptyWindows:
         """Count a window.
 
         Raises:
-            PolicyError: There are too many, or time would run backwards.
+            PolicyError: There are too many such windows, or time would run backwards.
         """
         if begin_ns != self._at_ns:
             self._at_ns, self._count = begin_ns, 0

@@ -11,7 +11,7 @@ _AS_PER_NS: Final = 10**9
 
 
 class Windows:
-    """Ends of windows whose lengths are not whole nanoseconds.
+    """Computes the ends of windows whose lengths are not whole nanoseconds.
 
     A window ends at the last whole nanosecond that the sum of all lengths so far has reached.
     """
@@ -38,7 +38,7 @@ class Windows:
 
 
 class FixedWindow:
-    """Windows of one length.
+    """Base class of the policies whose windows all have the same length.
 
     Args:
         window_s: Their length in seconds; fractions of a nanosecond are added to later windows.
@@ -71,7 +71,7 @@ class FixedWindow:
 
 
 class TimeStepped(FixedWindow):
-    """Data is exchanged at the ends of windows only."""
+    """Data is exchanged only at the ends of windows."""
 
     name = "time_stepped"
     defers_sends = True

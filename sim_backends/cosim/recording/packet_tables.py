@@ -129,7 +129,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
         BLAKE2b of the file, in hexadecimal.
 
     Raises:
-        OSError: It cannot be written; no file is left.
+        OSError: The part cannot be written; no incomplete file remains.
     """
     schema = SCHEMAS[table]
     columns = zip(*rows, strict=True) if rows else [()] * len(schema)

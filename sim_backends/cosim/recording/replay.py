@@ -46,7 +46,7 @@ def read_recording(folder: Path) -> Recording:
     run = Run(windows_ns=windows["end_ns"])
     run.fates = {fate.packet.identity: fate for fate in sorted(fates, key=lambda fate: fate.packet.packet_id)}
     for part in run.wall_s:
-        # Added in the same order as in the run, so that the sum is equal to the last bit.
+        # The times are added in the same order as in the run, so that all bits of the sum are equal.
         for spent_s in windows[f"{part}_s"]:
             run.wall_s[part] += spent_s
     if manifest.digest:

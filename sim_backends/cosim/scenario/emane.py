@@ -129,7 +129,7 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
         observer: Another observer of the run, or None.
 
     Raises:
-        ConfigurationError: The section does not suit the agents, or the channel cannot be used.
+        ConfigurationError: The section does not match the agents, or the channel cannot be used.
     """
     options = scenario.emane
     assert options is not None

@@ -109,7 +109,7 @@ class SweepFolder:
                     f"this is a sweep with other {key}: {old_value}", where=str(self.path), remedy="choose another -o"
                 )
 
-    def finished(self) -> set[str]:
+    def finished_runs(self) -> set[str]:
         """Return the names of the finished runs."""
         return {path.stem for path in (self.path / _RUNS).glob("*.json")}
 

@@ -125,11 +125,11 @@ def run_sweep(
         again: True to also repeat failed runs that have no attempt left.
 
     Raises:
-        ConfigurationError: A result cannot be written; the message has the command that continues. Or a worker has
-            another version or other files.
+        ConfigurationError: A result cannot be written (the message contains the command that continues), or a worker
+            has another version or other files.
         LinkError: The scheduler of the cluster does not answer.
     """
-    finished = folder.finished()
+    finished = folder.finished_runs()
     missing_runs = [run for run in plan.runs if run.name not in finished]
     previous_failures = {} if again else {run.name: folder.failure(run) for run in missing_runs}
     attempts = {
