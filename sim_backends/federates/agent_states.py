@@ -176,7 +176,7 @@ class ReceivedStates(Mapping[str, State]):
         return self._rows is agents.indices or self._rows == agents.indices
 
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
-        """Return True if other states have the same agents with the same limits; False does not exclude this."""
+        """Return True if other states have the same agents and limits; it may also return False for equal limits."""
         return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 
     @property

@@ -139,7 +139,7 @@ class _Heartbeat:
         self._request = request, copy_number, at_ns
 
     def answer(self, frame: bytes) -> None:
-        """Send the answer to the request, and stop to send `busy` for it."""
+        """Send the answer to the request, and no further `busy` for it."""
         with self._lock:
             self._request = None
             self._channel.send(frame, None)

@@ -3,7 +3,7 @@
 Agents have indices from 0 in the order of their announcement, first the agents in `hello`. A later agent gets the
 next index in the first message that mentions it, for this copy and its copies.
 
-- **Handshake.** The coordinator sends hello, the federate answers with welcome or error. `welcome` repeats the
+- **Handshake.** The coordinator sends hello; the federate answers with welcome or error. `welcome` repeats the
   configuration hash, the SHA-256 of the JSON. `name` names the scenario or the federate. The side that accepts a
   connection checks the token of join or hello.
 - **Transports.** Welcome lists the values of a packet's `protocol` that the network carries: `udp`, `tcp`, `topic`,

@@ -164,7 +164,7 @@ def check_velocity(target: Target) -> None:
 
 
 def check_flight_axes(target: Target) -> None:
-    """A commanded velocity is east, north and up, also at a heading of pi/2."""
+    """The components of a commanded velocity are east, north and up, also at a heading of pi/2."""
     heading_rad = math.pi / 2
     probe = target.open(_hello_with_heading(target.hello, heading_rad))
     commands = dict.fromkeys(_suitable_agents(probe, VELOCITY), Velocity(_FLIGHT_M_S))

@@ -160,7 +160,7 @@ def check_exactly_once(target: Target) -> None:
 
 
 def check_next_event(target: Target) -> None:
-    """Nothing arrives or is dropped before the announced next event, which may be too early."""
+    """Nothing arrives or is dropped before the announced next event; the announced time may be too early."""
     probe = target.open()
     probe.require(FederateCapability.NEXT_EVENT)
     account, states = _FateAccount(probe), _states(probe)
@@ -203,7 +203,7 @@ def check_window_length(target: Target) -> None:
 
 
 def check_far_away(target: Target) -> None:
-    """A packet to an agent that is 1,000 km away is decided; if it is dropped, with a reason."""
+    """The fate of a packet to an agent that is 1,000 km away is decided, with a reason if it is dropped."""
     probe = target.open()
     account, states = _FateAccount(probe), _states(probe)
     distant_agent = probe.hello.agents[-1].name if len(probe.hello.agents) < 2 else probe.hello.agents[1].name
@@ -287,7 +287,7 @@ def check_seed(target: Target) -> None:
 
 
 def check_removed_packets(target: Target) -> None:
-    """The fate of a packet is the same without other packets; as this is a recommendation, the check never fails."""
+    """The fate of a packet is the same without other packets. This is a recommendation, so the check never fails."""
     results = []
     for every in (1, 2):
         probe = target.open()
@@ -303,7 +303,7 @@ def check_removed_packets(target: Target) -> None:
 
 
 def check_new_agent(target: Target) -> None:
-    """A packet to an agent that has appeared is decided, if the federate declares that agents may appear."""
+    """The fate of a packet to an agent that has appeared is decided, if agents may appear."""
     probe = target.open()
     probe.require(FederateCapability.AGENTS_APPEAR)
     account, states = _FateAccount(probe), _states(probe)
@@ -352,7 +352,7 @@ def check_dead_reckoning(target: Target) -> None:
 
 
 def check_fork(target: Target) -> None:
-    """A copy continues as the original, and neither changes the other."""
+    """A copy continues like the original, and neither changes the other."""
     probe = target.open()
     probe.require(FederateCapability.FORK)
     states = _states(probe)

@@ -237,7 +237,7 @@ def check_lifetimes(target: Target) -> None:
 
 
 def check_fork(target: Target) -> None:
-    """A copy continues as the original, and neither changes the other."""
+    """A copy continues like the original, and neither changes the other."""
     probe = target.open()
     probe.require(FederateCapability.FORK)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)

@@ -423,7 +423,7 @@ PHYSICS_CASES = [
         "lifetimes", physics(LosesAnotherAgent, agents_disappear=True), "bob, which is always present, has no"
     ),
     BrokenFederate(
-        "lifetimes", physics(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from the start"
+        "lifetimes", physics(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from its requested start"
     ),
     BrokenFederate("fork", physics(IsShared), "the original"),
     BrokenFederate("drive_axes", physics(SwapsAxes), "0 rad, and moved by (0, 0.6, 0) m instead of 0.6 m east"),
@@ -460,7 +460,7 @@ NETWORK_CASES = [
     BrokenFederate("bye", replace(physics(DelayNetwork), stays=True), "it has not closed the connection"),
     BrokenFederate("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
     BrokenFederate(
-        "exactly_once", replace(physics(DelayNetwork), alter=later(MessageKind.OUTCOMES, 1)), "it advanced to"
+        "exactly_once", replace(physics(DelayNetwork), alter=later(MessageKind.OUTCOMES, 1)), "but advanced to"
     ),
     BrokenFederate("exactly_once", physics(net(lambda _, arrived, drops, to_ns: ([], drops))), "neither arrived nor"),
     BrokenFederate(
