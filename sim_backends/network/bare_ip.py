@@ -60,7 +60,7 @@ class _Group:
 
 
 class BareBroadcast:
-    """Carries broadcasts. Only the first packet of a group sends a frame, which is also that of the other packets.
+    """Carries broadcasts. The first packet of a group sends one frame, which carries all packets of the group.
 
     Args:
         wire: The network below.

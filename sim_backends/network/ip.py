@@ -12,13 +12,13 @@ from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketIdentity
 
 HEADER_BYTES: Final = 20
-"""RFC 791, 3.1, without options."""
+"""Size of the header without options (RFC 791, 3.1)."""
 
 MAX_PACKET_BYTES: Final = 65535
-"""Maximum of the 16-bit total length, RFC 791, 3.1."""
+"""Maximum of the total length, a field of 16 bits (RFC 791, 3.1)."""
 
 MTU_BYTES: Final = 1500
-"""Linux's default for Wi-Fi and Ethernet."""
+"""Largest IP packet of a frame: Linux's default for Wi-Fi and Ethernet."""
 
 REASSEMBLY_NS: Final = 30 * 10**9
 """Time for which Linux waits for the other fragments after the first one (net.ipv4.ipfrag_time)."""

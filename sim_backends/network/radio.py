@@ -241,7 +241,7 @@ class RadioNetwork:
         return True
 
     def _collect(self) -> None:
-        """Pass the packets that the radio delivers now to their hosts, including packets that this causes."""
+        """Pass the packets that the radio delivers now to their hosts, until it delivers no further packet now."""
         while deliveries := self._radio.deliveries(self.now_ns):
             for _, host, fragment, _, delay in deliveries:
                 if self._log_delay is not None:

@@ -16,7 +16,7 @@ NOT_CONNECTED: Final = "no subscriber is connected"
 GIVEN_UP: Final = "the subscriber has given up this connection"
 OUT_OF_ORDER: Final = "blocks of UDPROS out of order"
 _PROBE_BYTES: Final = 20 + 32
-"""A TCP segment without data, with timestamps."""
+"""Size of a TCP segment without data, with timestamps and the IP header."""
 _UDP_BYTES: Final = 20 + 8
 _UDPROS_HEADER_BYTES: Final = 8
 
@@ -74,7 +74,7 @@ class TcprosLink:
         self._options = options
         self._downstream = flow.publisher, flow.subscriber
         self._retry_ns = options.reconnect.first_ns
-        # The connection that each end regards as open; 0 for none.
+        # Number of the connection that is open at each end; 0 if no connection is open there.
         self._publisher_connection = 0
         self._subscriber_connection = 0
         self._connection_count = 0

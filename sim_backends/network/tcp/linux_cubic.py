@@ -13,11 +13,11 @@ from sim_backends.network.tcp.tcp_options import TcpOptions
 _NS_PER_S_CUBED: Final = 10**27
 # bic_scale 41: C is 410 / 1024 segments per s^3.
 _C: Final = 410, 1024
-# beta 717 of 1024.
+# beta is 717 / 1024.
 _BETA: Final = 717, 1024
 # beta_scale: Reno's window grows by one segment per 15/8 acknowledged windows.
 _RENO: Final = 15, 8
-# The growth rate is updated after HZ / 32, unless the window changed.
+# Time after which the growth rate is updated even if the window has not changed: HZ / 32.
 _UPDATE_NS: Final = 1_000_000_000 // 32
 # Minimum number of acknowledged segments per segment of growth, and maximum before the first loss.
 _MIN_ACKED_PER_SEGMENT: Final = 2

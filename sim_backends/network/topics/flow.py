@@ -1,7 +1,7 @@
 """A flow of publish-subscribe: a writer, its reader, and the record of the result of each sample.
 
 The two ends exchange information only by messages. The record uses the state of both ends: a sample will never arrive
-if its writer has given it up, no message with a part of it is in flight, and its reader has not received all of it.
+if its writer has given it up, no message with a part of it is in flight, and its reader has not stored all of it.
 """
 
 from collections.abc import Callable
@@ -114,7 +114,7 @@ class TopicSession:
         self._settle(sample)
 
     def _settle(self, sample: Sample) -> None:
-        if sample.give_up_reason and not sample.in_flight and not sample.is_received and not sample.is_settled:
+        if sample.give_up_reason and not sample.in_flight and not sample.is_stored and not sample.is_settled:
             sample.is_settled = True
             self._drop(sample, sample.give_up_reason)
 

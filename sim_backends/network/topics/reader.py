@@ -128,7 +128,7 @@ class TopicReader:
         undelivered = list(self._complete_samples.values())
         self._complete_samples.clear()
         for sample in undelivered:
-            sample.is_received = False
+            sample.is_stored = False
         return undelivered
 
     def on_message(self, message: Data | Heartbeat | Gap) -> None:
@@ -155,7 +155,7 @@ class TopicReader:
         del self._fragments[number]
         self._last_number = max(self._last_number, number)
         self._complete_samples[number] = data.sample
-        data.sample.is_received = True
+        data.sample.is_stored = True
         if not self._is_reliable:
             # Samples that were overtaken are no longer expected, and are discarded if they arrive.
             self._skip(self._next_number, number)

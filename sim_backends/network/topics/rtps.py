@@ -31,7 +31,7 @@ class Sample:
         number: Its sequence number at its writer; 0 until it is sent.
         times_sent: Number of transmissions of each fragment.
         in_flight: Number of messages with a part of it that have neither arrived nor been lost.
-        is_received: True if its reader has received all of it, even if an earlier sample must be delivered first.
+        is_stored: True if its reader has stored all of it, possibly until an earlier sample has been delivered.
         give_up_reason: Reason why its writer will not send it again; empty while the writer may send it.
         is_settled: True if it was delivered or dropped.
         endpoint_flow: For a sample of the discovery, the flow whose endpoint it describes.
@@ -43,7 +43,7 @@ class Sample:
     number: int = 0
     times_sent: dict[int, int] = field(default_factory=dict)
     in_flight: int = 0
-    is_received: bool = False
+    is_stored: bool = False
     give_up_reason: str = ""
     is_settled: bool = False
     endpoint_flow: str = ""

@@ -69,7 +69,7 @@ struct Answer
     std::string body;
 };
 
-// Return the stream of the protocol, and redirect standard output to standard error, because libraries may print to it.
+// Return the stream of the protocol. Redirect standard output to standard error, because libraries may print to it.
 inline std::FILE*
 RedirectStandardOutput()
 {
