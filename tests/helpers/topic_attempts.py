@@ -57,7 +57,7 @@ def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PL
     """A valid attempt; the samples in `lost` are missing in the subscriber's capture and log."""
     start_ns, matched_ns = START - 2 * SECOND, START - 600 * MS
     size = plan.size_bytes + plan.envelope_bytes
-    start_rows = [(records.BEGUN, 0, 0, 0, start_ns), (records.MATCHED, 0, 0, 0, matched_ns)]
+    start_rows = [(records.DISCOVERY_STARTED, 0, 0, 0, start_ns), (records.MATCHED, 0, 0, 0, matched_ns)]
     sent, received = (
         [*start_rows],
         [

@@ -104,7 +104,7 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
         yield f"the {name}'s log was written by the {_NAMES.get(log.end, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
-    has_valid_count = (log.kinds.get(topic_samples.BEGUN) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
+    has_valid_count = (log.kinds.get(topic_samples.DISCOVERY_STARTED) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
     unexpected_kinds = (
         (topic_samples.FOREIGN,) if end == topic_samples.PUBLISHER else (topic_samples.REFUSED, topic_samples.SKIPPED)
     )

@@ -35,7 +35,7 @@ _RECORD: Final = np.dtype(
 RECORD_BYTES: Final = _RECORD.itemsize
 
 _KINDS: Final = range(1, 9)
-_SAMPLE, BEGUN, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
+_SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
@@ -116,7 +116,7 @@ def read_log(path: Path) -> TopicLog:
         raise EvidenceError(
             "does not have the number of samples in its end record", where=str(path), remedy="repeat the measurement"
         )
-    started, matched, origin = by_kind[BEGUN], by_kind[MATCHED], by_kind[_ORIGIN]
+    started, matched, origin = by_kind[DISCOVERY_STARTED], by_kind[MATCHED], by_kind[_ORIGIN]
     if len(ends) and not _is_intact(content, ends[0], required=len(origin) > 0):
         raise EvidenceError("was changed: its checksum is wrong", where=str(path), remedy="repeat the measurement")
     offered = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]

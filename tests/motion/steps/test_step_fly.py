@@ -25,7 +25,7 @@ DRONE = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) i
 PERMITTED = {role: robot.model_copy(update={"abilities": frozenset({"mavlink"})}) for role, robot in CAST.items()}
 SCENE = Scene(Protocol.TCP, PERMITTED, "f")
 LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
-MODE = '{"what": "PX4 refuses to be armed", "remedy": "remove the cause", "grave": false}'
+MODE = '{"what": "PX4 refuses to arm", "remedy": "remove the cause", "grave": false}'
 LIMITS = CAST[DRONE].profile.limits
 
 

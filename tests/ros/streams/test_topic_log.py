@@ -14,7 +14,7 @@ from fieldkit.ros.streams import topic_samples
 
 def write_log(path: Path) -> bytes:
     log = Log(str(path))
-    log.note(records.BEGUN, 10)
+    log.note(records.DISCOVERY_STARTED, 10)
     log.note(records.MATCHED, 30)
     for sequence in range(3):
         log.note(records.SAMPLE, 105 + 10 * sequence, size=50, sequence=sequence, sent_ns=100 + 10 * sequence)
