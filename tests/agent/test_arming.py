@@ -86,7 +86,7 @@ def test_no_faults_for_a_ready_autopilot() -> None:
         ({"status": None}, "it does not report its status"),
         ({"status": status(charge=19)}, "its battery charge is 19%, but the minimum is 20%"),
         ({"status": status(healthy=0)}, "ArduCopter refuses to arm: GPS"),
-        ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "be armed: Gyros inconsistent"),
+        ({"text": d.MAVLink_statustext_message(2, b"PreArm: Gyros inconsistent")}, "arm: Gyros inconsistent"),
         ({"home": None}, "it has no home position"),
         (
             {"top": parameter("FENCE_ALT_MAX", 2.5)},

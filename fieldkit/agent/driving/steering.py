@@ -307,7 +307,7 @@ class Driver:
         self.phase, self._phase_s, self._turning = BACK, now_s, True
 
     def _desired_velocity(self, relative_pose: OdometryPose) -> DriveVelocity:
-        """Return the desired velocity before limits are applied; select the next leg if the current one is complete."""
+        """Return the desired velocity before limits are applied; at the end of a leg, select the next one."""
         if self.phase in (_WAITS, "there", "home"):
             return ZERO_VELOCITY
         while self._legs:

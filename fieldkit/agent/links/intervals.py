@@ -116,7 +116,7 @@ class MessageInterval:
 
 
 class MessageIntervals:
-    """The intervals of all messages. They are requested in sequence, because an answer does not contain the message id.
+    """The intervals of all messages. They are requested in sequence, because an answer contains no message id.
 
     Args:
         send: Sends a request to a target, with message id and interval in microseconds.
@@ -202,7 +202,7 @@ class MessageIntervals:
         self._send(key[0], key[1], message.interval_us)
 
     def report(self, client: Hashable, now_s: float) -> Mapping[str, Any]:
-        """Return the interval in us, MAV_RESULT and rate in Hz of each message requested by a client, by message id."""
+        """Return interval in us, MAV_RESULT and rate in Hz of each message that a client requested, by message id."""
         return {
             str(kind): {"interval_us": message.interval_us, "result": message.result, "hz": message.hz(now_s)}
             for (_, kind), message in self._messages.items()

@@ -83,7 +83,7 @@ class Ros1Middleware:
         return lambda: int(endpoint.get_num_connections())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the topic's type at the master if it differs; the master stores the type of the last publisher only."""
+        """Return the topic's type at the master if it differs. The master stores only the last publisher's type."""
         own_name = rospy.get_name()
         try:
             master = Master(own_name)

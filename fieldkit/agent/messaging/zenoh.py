@@ -107,7 +107,7 @@ class ZenohMiddleware:
             endpoint: Any = zenoh.ext.declare_advanced_publisher(
                 self._session, topic.key, cache=cache, publisher_detection=True, **options
             )
-            # An advanced publisher does not report whether a subscription matches; a plain one with the same key does.
+            # Only a plain publisher reports whether a subscription matches; an advanced publisher does not.
             matching: Any = self._session.declare_publisher(topic.key, **options)
         else:
             endpoint = matching = self._session.declare_publisher(topic.key, **options)

@@ -168,7 +168,7 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     robot = scene.robot(move.role)
     drive = _drive(robot)
     middleware, ros = middleware_of(robot), robot.profile.ros
-    message_types = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
+    message_types = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.standard_types()
     network = _network(robot, middleware) | {"gid_bytes": message_types.distribution.gid_bytes}
 
     def topic(topic_name: str, kind: str, profile: str, number: int) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Ports and multicast groups of middlewares, by which captures identify their packets.
+"""Ports and multicast groups of middlewares. Captures identify the packets of middlewares by them.
 
 DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). Zenoh and ROS 1 do not use their
 default ports, so that fieldkit's routers, masters and nodes can run beside those of a robot. Each domain has separate
@@ -52,7 +52,7 @@ def zenoh_listener(domain: int) -> int:
 
 
 def zenoh(domain: int, *, multicast: bool) -> MiddlewarePorts:
-    """Return Zenoh's ports in a domain; declarations of a session use the port of its data."""
+    """Return Zenoh's ports in a domain; a session sends declarations and data over the same port."""
     data = frozenset({zenoh_listener(domain)})
     if not multicast:
         return MiddlewarePorts(data=data, discovery=frozenset())

@@ -49,8 +49,8 @@ DEFAULT_BAG: Final = "scan"
 # Measured: rosbag took 0.6 to 0.8 s longer than its duration, and 3.2 s longer on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
 
-# A recorder needs up to a second to subscribe, more on a small computer under load. If a bag then spans less than
-# half of its duration, the recording has failed.
+# A recorder needs up to a second to subscribe, and more on a small computer under load. A recording has failed if its
+# bag, plus this time, spans less than half of the duration.
 SUBSCRIBE_S: Final = 1.0
 MIN_RECORDED_SHARE: Final = 0.5
 
@@ -80,13 +80,13 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):
     """Records a ROS bag, by the record command of the robot's profile.
 
-    A robot may record several bags of different names, one after the other; a `transfer` then names its `file`.
+    A robot may record several bags with different names, one after the other; the `file` of a `transfer` selects one.
 
     Attributes:
         robot: Role that records.
-        topics: List of topics.
+        topics: The recorded topics.
         duration: Duration of the recording.
-        name: Name of the bag without its extension; names of its job and log begin with it, unless it is `scan`.
+        name: Name of the bag without its extension; the names of its job and log start with it, unless it is `scan`.
         reception: Whether columns report how soon its topics were received, and how regularly: [what a recorder
             received](method-delay.md#what-a-recorder-received).
     """
@@ -304,7 +304,7 @@ def _bytes_per_s(robot: Robot, name: str) -> float:
 
 
 def _judge(robot: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:
-    """Return verdict, detail and remedy on the ROS environment after the setup files."""
+    """Return verdict, detail and remedy for the ROS environment that the setup files create."""
     ros, profile = _ros(robot), robot.profile.name
     command = ros.command
     distribution, _, master = answer.text.partition(" ")

@@ -1,7 +1,7 @@
 """Contradictions between the logs of a topic and the captures of its ends.
 
-A capture shows the head of most samples: number and time of sending (`topic_samples`). Each sample in a log is
-therefore compared with its packet. Their times are comparable, because both are from one robot's clock. If TCP or a
+A capture contains the head of most samples: number and time of sending (`topic_samples`). Therefore, each sample in a
+log is compared with its packet. Their times are comparable, because both are from one robot's clock. If TCP or a
 middleware put several samples into one packet, so that the capture shows no heads, counts and bytes are compared.
 """
 
@@ -56,7 +56,7 @@ _GRACE_NS: Final = 300_000_000
 
 
 _READ_BURST_NS: Final = 1_000_000
-"""Within this time a subscriber's program reads all samples in its queue."""
+"""Time in which a subscriber's program reads all samples in its queue."""
 
 _OVERHEAD_BYTES: Final = 200
 _OVERHEAD_ONCE_BYTES: Final = 20_000
@@ -121,7 +121,7 @@ def _arrival_contradictions(
         yield f"{missing_text}, but are not in the subscriber's log"
 
 
-def withheld(
+def withheld_columns(
     values: Mapping[str, Value],
     arrived: TopicSamples,
     captured: CapturedTopic,
@@ -175,13 +175,13 @@ def _content_contradictions(
     heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str
 ) -> Iterator[str]:
     """Yield differences in the time of sending between capture and log, and captured samples without a record."""
-    if numbers is not None and (unlogged := int((~np.isin(heads.sequence, numbers)).sum())):
-        yield f"{format_count(unlogged, 'sample')} in the {name}'s capture are not in its log"
+    if numbers is not None and (unlogged_count := int((~np.isin(heads.sequence, numbers)).sum())):
+        yield f"{format_count(unlogged_count, 'sample')} in the {name}'s capture are not in its log"
     first = heads.first()
-    _, logged, captured = np.intersect1d(samples.sequence, first.sequence, return_indices=True)
-    if different := int((samples.sent_ns[logged] != first.sent_ns[captured]).sum()):
-        what = f"{format_count(different, 'sample')} in the {name}'s log"
-        yield f"{what} have another time of sending than in its capture"
+    _, log_index, capture_index = np.intersect1d(samples.sequence, first.sequence, return_indices=True)
+    if different_count := int((samples.sent_ns[log_index] != first.sent_ns[capture_index]).sum()):
+        samples_text = format_count(different_count, "sample")
+        yield f"{samples_text} have different times of sending in the {name}'s log and in its capture"
 
 
 def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
@@ -213,7 +213,7 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
 
 def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if the capture has too few packets for the samples in a log without duplicates."""
-    if not plan.on_ports and not len(subscriber.heads):
+    if not plan.uses_expected_ports and not len(subscriber.heads):
         return
     packets = subscriber.packets
     size_bytes = plan.size_bytes + plan.envelope_bytes
@@ -235,7 +235,7 @@ _DATAGRAM_BYTES: Final = 1_200
 
 
 def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, size_bytes: int) -> Iterator[str]:
-    """Yield a contradiction if samples are logged before enough bytes had arrived; for captures without heads."""
+    """Yield a contradiction if samples were logged before enough bytes had arrived; for captures without heads."""
     order, arrival = np.argsort(times_ns, kind="stable"), np.sort(samples.at_ns)
     bytes_until = np.concatenate(([0], np.cumsum(payload_bytes[order])))
     captured_bytes = bytes_until[np.searchsorted(times_ns[order], arrival + STAMP_NS, side="right")]
@@ -255,12 +255,12 @@ def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, co
         return _missing_bytes(plan, log, subscriber)
     heads = subscriber.heads.first()
     begins_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
-    settled = (heads.at_ns > begins_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
+    is_settled = (heads.at_ns > begins_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
     received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
-    is_missing = settled & received & ~np.isin(heads.sequence, log.samples.sequence)
+    is_missing = is_settled & received & ~np.isin(heads.sequence, log.samples.sequence)
     if not is_missing.any():
         return 0
-    return int((~_overflowed(plan, log.samples, heads, is_missing, int(log.times_ns[-1]))).sum())
+    return int((~_may_have_overflowed(plan, log.samples, heads, is_missing, int(log.times_ns[-1]))).sum())
 
 
 def _is_received(
@@ -292,8 +292,10 @@ def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
     return acknowledged
 
 
-def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_missing: Mask, end_ns: int) -> Mask:
-    """Return, for each sample that a log lacks, True if a queue of the subscriber may have dropped it."""
+def _may_have_overflowed(
+    plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_missing: Mask, end_ns: int
+) -> Mask:
+    """Return a mask of the samples missing in a log that a queue of the subscriber may have dropped."""
     if plan.depth is None:
         return np.zeros(int(is_missing.sum()), dtype=np.bool_)
     arrived_ns, read_ns = np.sort(heads.at_ns), np.append(np.sort(samples.at_ns), end_ns)
@@ -311,7 +313,7 @@ def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_m
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
-    """Return how many samples a log lacks, from the TCP bytes that arrived, if the capture has no heads."""
+    """Return the number of samples that a log lacks, from the TCP bytes that arrived; for captures without heads."""
     if not subscriber.is_tcp:
         return 0
     max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES
