@@ -16,8 +16,8 @@ from fieldkit.trial.procedure_section import TrialOutline
 
 
 @contextmanager
-def guarded(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, shells: Shells) -> Iterator[None]:
-    """Guard drones that no step flies while the body runs.
+def guard_drones(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, shells: Shells) -> Iterator[None]:
+    """While the body runs, guard drones that no step flies.
 
     Args:
         actions: Action of each drone if the attempt is aborted, a value of `OnAbort`.

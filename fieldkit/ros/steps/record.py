@@ -208,7 +208,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         return self.prefixed_name(f"{self.robot}-record.log")
 
     @override
-    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+    def recordings(self, cast: Cast) -> Iterator[RecordedFile]:
         robot = cast[self.robot]
         size_bytes = _BAG_BYTES + self.duration * sum(_bytes_per_s(robot, topic) for topic in self.topics)
         yield RecordedFile(self.robot, self.bag(robot), size_bytes, alias=self.name)
@@ -223,7 +223,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
-        return sum(file.size_bytes for file in self.recorded(scene.cast) if file.role is role)
+        return sum(file.size_bytes for file in self.recordings(scene.cast) if file.role is role)
 
     @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:

@@ -72,7 +72,7 @@ def captured_topic(step: StreamOptions, view: View) -> CapturedTopic:
 
 def dropped_reason(step: StreamOptions, view: View) -> str:
     """Return the reason why columns that need captures are withheld; empty if the kernel dropped no packet."""
-    counts = {role: view.dropped(role) for role in (step.sender, step.receiver)}
+    counts = {role: view.dropped_packets(role) for role in (step.sender, step.receiver)}
     return " and ".join(
         f"the capture of {role} lacks {format_count(count, 'packet')} that its kernel dropped"
         for role, count in counts.items()
