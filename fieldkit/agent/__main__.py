@@ -31,9 +31,10 @@ Arguments = Mapping[str, Any]
 
 
 class StopRequest(threading.Event):
-    """An event that stops the program. After a signal, `is_set` returns True from the next statement of `main` on.
+    """An event that stops the program.
 
-    Therefore, a program that was suspended (SIGSTOP) when the signal arrived sends nothing after it is resumed.
+    After a signal, `is_set` returns True from the next statement of the main thread on. Therefore, a program that was
+    suspended (SIGSTOP) when the signal arrived sends nothing after it is resumed.
     """
 
     _signalled = False

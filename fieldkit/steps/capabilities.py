@@ -1,8 +1,9 @@
 """Optional capabilities of a step, in addition to the contract of `Step`.
 
 Each capability is a class with one method, or with several that belong together. The harness queries it by
-`isinstance`; a step without the capability contributes nothing. A kind that ships with fieldkit derives from its capabilities, so
-that mypy checks the signatures of its methods. For a kind of another package it is enough to define the methods.
+`isinstance`; a step without the capability contributes nothing. A kind that ships with fieldkit derives from its
+capabilities, so that mypy checks the signatures of its methods. For a kind of another package it is enough to define
+the methods.
 """
 
 from abc import ABC, abstractmethod

@@ -28,7 +28,7 @@ class LoadOptions(OverLink):
     Attributes:
         sender: Role that runs the client, and sends.
         receiver: Role that runs the server, and receives.
-        protocol: `tcp` or `is_udp`; without it, the protocol of the repeat.
+        protocol: `tcp` or `udp`; without it, the protocol of the repeat.
         rate: Maximum rate of each stream, `5Mbit/s`; without it, UDP sends 1 Mbit/s and TCP as much as the link
             carries.
         streams: Number of parallel streams.

@@ -13,7 +13,7 @@ from fieldkit.core.model import Role, Verdict
 from fieldkit.steps.scene import CommandResult, Need, Scene
 
 LOOPBACK: Final = "lo"
-"""Interface of a link whose address may be reached over any other link of the robot, which its routes select."""
+"""Interface of a link whose address is reached over any link of the robot that its routes select."""
 
 _DEVICE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})", re.ASCII)
 

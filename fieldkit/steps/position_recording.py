@@ -108,7 +108,7 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 
 
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]:
-    """Return the fixed positions of the robots that stay where they were placed while the steps inside run."""
+    """Return the fixed positions of the robots that do not move while the steps inside run."""
     movers = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.has_path)
     moving = frozenset[Role]().union(*(step.moves() for step in movers if isinstance(step, Moves)))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}

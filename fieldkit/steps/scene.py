@@ -67,7 +67,7 @@ class Scene:
         protocol: The transport protocol under test.
         cast: The robot in each role.
         folder: The attempt's folder on every robot.
-        recorded: The files that the procedure records on each robot, in the order of recording.
+        recordings: The files that the procedure records on each robot, in the order of recording.
         variants: The detected tools of the robots; empty before the detection.
         laptop_folder: The attempt's folder on the laptop, for data that no robot has; None if no attempt is made.
         placement: The placement of the robots; None if the robots were not placed.
@@ -83,7 +83,7 @@ class Scene:
     protocol: Protocol
     cast: Cast
     folder: str
-    recorded: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    recordings: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
     laptop_folder: Path | None = None
     placement: Placement | None = None
@@ -99,7 +99,7 @@ class Scene:
         return self.cast[role]
 
     def link(self, role: Role, name: str = "") -> RobotLink:
-        """Return the robot's end of a link, of the radio under test if the name is empty.
+        """Return the robot's end of a link; an empty name means the radio under test.
 
         Raises:
             ConfigurationError: The robot has no such link.

@@ -13,7 +13,7 @@ from fieldkit.steps.surroundings import EnclosingStep
 
 @dataclass(frozen=True)
 class View:
-    """One attempt with its evidence, as one step of the attempt uses it.
+    """One attempt with its evidence, for one step of the attempt.
 
     Attributes:
         scene: The attempt.

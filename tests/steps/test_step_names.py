@@ -109,7 +109,7 @@ def test_plan_lists_transfers_pings_and_captures() -> None:
         "receiver.pcap": Role.RECEIVER,
     }
     assert planned_evidence.bags(plan) == {Role.SENDER: "scan.bag"}
-    assert [file.name for file in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
+    assert [file.name for file in plan.scenes()[0].recordings[Role.SENDER]] == ["scan.bag", "imu.bag"]
 
 
 def test_step_uses_innermost_capture_around_it(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""State of a drone's autopilot, and commands to it, over MAVLink, for programs on the drone's computer.
+"""State of a drone's autopilot and commands to it over MAVLink, for programs on the drone's computer.
 
 Messages, commands and their numbers are defined in https://mavlink.io/en/messages/common.html.
 """

@@ -46,7 +46,7 @@ class FlightPlan:
         lease_s: Timeout for the first order.
         guards: Whether the program guards the drone instead of flying it.
         rescues: Whether the program only lands the drone, because neither its pilot nor its guard runs.
-        end: End of the flight: `land` at the current position, or `return` at the current height and land there.
+        end: End of the flight: `land` at the current position, or `return` to the origin and land.
         height_m: Height of the take-off.
         legs: The path after the take-off: metres ahead, to the left and up per leg, relative to the origin's heading.
         speed_m_s: Speed along the path.

@@ -99,7 +99,7 @@ def is_same_frame(identifier: str, other_identifier: str) -> bool:
 def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> FlightOrigin:
     """Return the origin of a flight in the frame of its start.
 
-    The heading of a recorded origin is kept. If latitude and longitude of both positions are known, they give its
+    The heading is that of the recorded origin. If latitude and longitude of both positions are known, they give its
     position in the frame of the start; otherwise the frame must be the same as at the first start.
 
     Args:

@@ -69,7 +69,7 @@ def message_type(name: str) -> Any:  # noqa: ANN401 (generated)
 
 
 class Ros2Middleware:
-    """A node with the qos topics only: no parameter services, no log on `/rosout`."""
+    """A node with only the requested topics: it has no parameter services and no log on `/rosout`."""
 
     def __init__(self, network: Network) -> None:
         # Iron introduced static peers and type hashes; `rclpy.type_hash` shows that this is Iron or later.

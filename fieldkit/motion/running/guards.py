@@ -31,7 +31,7 @@ def guard_drones(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, 
     """
     with ExitStack() as stack:
         for role in sort_roles(actions):
-            job = piloting.guard(scene, role, f"{role}-guard", abort=actions[role])
+            job = piloting.guard_job(scene, role, f"{role}-guard", abort=actions[role])
             body_s = plan.procedure.expected_s(scene.protocol)
             stack.enter_context(piloting.guarding(scene, shells[role], job, body_s=body_s))
         yield

@@ -64,7 +64,7 @@ def limit_s(move: Move) -> float:
 
 
 def path_duration_s(robot: Robot, move: Move) -> float:
-    """Return the duration of the path of a move in one direction with its turns, in seconds, to the millisecond."""
+    """Return the duration of the path of a move in one direction with its turns, in s, rounded to milliseconds."""
     return round(drive_plan.path_duration_s(DriveTask.from_json(_task(robot, move))), 3)
 
 
@@ -267,7 +267,7 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
 def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
     scene: Scene, testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, motion: RobotMotion
 ) -> Iterator[DriveLease]:
-    """Drive a robot out while the body runs, and back; see `drive_robot`."""
+    """Drive a robot along its path while the body runs, then back; see `drive_robot`."""
 
     def bring_back() -> str:
         end_state = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)

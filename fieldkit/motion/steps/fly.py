@@ -286,7 +286,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         """Return the rescue, which is inactive if the control connection crosses the radio under test."""
 
         def raise_alarm(text: str) -> None:
-            flight.lost = "neither its pilot nor its guard runs"
+            flight.lost_reason = "neither its pilot nor its guard runs"
             announce(text, None)
 
         guard_name = self.prefixed_name("guard")

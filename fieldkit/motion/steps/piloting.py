@@ -152,12 +152,12 @@ class FlightLease(LeaseKeeper):
             does not cross the radio under test.
 
     Attributes:
-        lost: The reason why the program cannot report its end; empty if it can.
+        lost_reason: The reason why the program cannot report its end; empty if it can.
     """
 
     def __init__(self, shell: Shell, program: Planned, lease_s: float, silent_lease_s: float | None) -> None:
         job = program.job
-        self.lost = ""
+        self.lost_reason = ""
         super().__init__(
             shell,
             job,
@@ -171,7 +171,7 @@ class FlightLease(LeaseKeeper):
     @property
     @override
     def end_reason(self) -> str:
-        reason = self._reported_reason or self.lost
+        reason = self._reported_reason or self.lost_reason
         return f"its flight ended early: {reason}" if reason else super().end_reason
 
     @property
@@ -254,7 +254,7 @@ class FlightLease(LeaseKeeper):
             self.renew()
             if any(line.endswith(f" {mark}") for line in self._lines):
                 return
-            if reason := self._reported_reason or self.lost or self.end_reason:
+            if reason := self._reported_reason or self.lost_reason or self.end_reason:
                 raise self.failure(reason)
             if deadline.expired:
                 last_line = shorten(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"

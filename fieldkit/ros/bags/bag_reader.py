@@ -1,4 +1,4 @@
-"""Reader of bags with the rosbags library, which `bag` runs in a sandboxed process. No other module reads bags."""
+"""Reader of bags with the rosbags library, which `bag` runs in a sandboxed process."""
 
 import math
 from contextlib import closing

@@ -67,7 +67,7 @@ def inspect(bag: BagFiles, *, read_all: bool) -> Json:
     if problems:
         recoverable = _count_recoverable(bag)
         result |= {"saved": recoverable}
-        if not bag.closed and recoverable["why"]:  # only this function has read the files of an unclosed bag
+        if not bag.closed and recoverable["why"]:  # no other function has read the files of an unclosed bag
             problems.append(recoverable["why"])
     return result | {"problems": problems[:_MAX_PROBLEMS]}
 

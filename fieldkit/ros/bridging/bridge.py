@@ -1,8 +1,8 @@
 """Bridge topics between two middlewares as serialized messages: ROS 1, DDS and Zenoh.
 
-Between ROS 1 and ROS 2 rosbags converts the bytes without deserializing them. Headers of
-ROS 2 have no `seq`: it is omitted in messages to ROS 2, and is 0 in messages to ROS 1. Samples do not loop: each side
-ignores the samples that it has published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
+Between ROS 1 and ROS 2, rosbags converts the bytes without deserializing them. Headers of ROS 2 have no `seq`: it is
+omitted in messages to ROS 2, and is 0 in messages to ROS 1. Samples do not loop: each side ignores the samples that
+it has published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
 """
 
 import os
@@ -56,7 +56,7 @@ class Forwarder:
         crossing: The topic and its direction.
         source: The side whose nodes publish it.
         target: The side that it is forwarded to.
-        topic_pair: The topic in the terms of the source, and of the target.
+        topic_pair: The topic as the source and as the target describe it.
         convert: Converts a message of the source to one of the target; raises `SerdeError` for an invalid message.
     """
 
@@ -122,10 +122,10 @@ class _RunningSide:
 
 
 @contextmanager
-def bridged(
+def bridge_topics(
     near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes
 ) -> Iterator[Sequence[Forwarder]]:
-    """Bridge two sides while the body runs.
+    """Bridge topics between two sides while the body runs.
 
     Args:
         near: The source of topics, but the target of topics with `Crossing.back`.

@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
     crossings = _crossings(arguments)
     types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
     near, far = (Side(middleware, _network(middleware, arguments)) for middleware in (arguments.near, arguments.far))
-    with _until_signal() as stop_event, bridge.bridged(near, far, crossings, types) as forwarders:
+    with _until_signal() as stop_event, bridge.bridge_topics(near, far, crossings, types) as forwarders:
         show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C stops it")
         _watch(forwarders, stop_event)
         counts = [forwarder.counts() for forwarder in forwarders]

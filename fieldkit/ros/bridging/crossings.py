@@ -96,7 +96,7 @@ class CrossingCounts:
         per_s: Messages per second between the first and the last; None for fewer than two.
         bytes_per_s: Bytes per second in the same time, without the first message.
         delay_median_s: Median time from the arrival of a message until the target accepted it; its precision is 1 %.
-        delay_p99_s: 99th percentile of this time, its precision is 1 %.
+        delay_p99_s: 99th percentile of this time; its precision is 1 %.
     """
 
     topic: str

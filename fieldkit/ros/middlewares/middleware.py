@@ -20,7 +20,7 @@ class MiddlewareName(StrEnum):
 
 
 class Discovery(StrEnum):
-    """A discovery method: how publisher and subscriber find each other."""
+    """Method by which publishers and subscribers discover each other."""
 
     MULTICAST = "multicast"
     PEERS = "peers"

@@ -94,7 +94,7 @@ class _Exchange:
         self._counts: dict[Role, Mapping[str, Mapping[str, int]]] = {}
 
     def listen(self, role: Role) -> None:
-        """Start to count datagrams on a robot."""
+        """Start counting datagrams on a robot."""
         shell, job = self._shells[role], self._counting_job(role)
         with self._store_error(role):
             evidence.begin(shell, job.folder, role, self._cast[role].profile.radio.interface)
@@ -111,7 +111,7 @@ class _Exchange:
             self._shells[role].run(argv, deadline=Deadline.after(_SEND_S))
 
     def end(self, role: Role) -> None:
-        """Stop to count on a robot, read the counts, and delete the files of the exchange."""
+        """Stop counting on a robot, read the counts, and delete the files of the exchange."""
         shell, job = self._shells[role], self._counting_job(role)
         with self._store_error(role):
             try:
@@ -166,7 +166,7 @@ def parse_counts(output: bytes) -> dict[str, dict[str, int]]:
     """Return the counts by address of the sender and kind from the output of a robot.
 
     Raises:
-        RobotError: The output is not of this form.
+        RobotError: The output has another form.
     """
     try:
         counts = json.loads(output)

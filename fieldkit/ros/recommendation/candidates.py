@@ -171,7 +171,7 @@ def assess_candidate(
 
 
 def _reason(judgement: Judgement) -> str:
-    """Return the reason why a judgement does not hold, with the measured values."""
+    """Return the reason why an expectation is not met, with the measured values."""
     unknown, expectation_text = judgement.why or "undecided", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
         return f"{expectation_text}: {unknown}"

@@ -23,7 +23,13 @@ not exceed it."""
 _INTENDED: Final = "topic_intended"
 _CELL: Final = "cell"
 _LOSS: Final = Quantity(
-    "loss", "loss, samples never sent included", Kind.COUNTED, "share", "topic_received", _INTENDED, (0.0, 1.0)
+    "loss",
+    "loss, including samples that were never sent",
+    Kind.COUNTED,
+    "share",
+    "topic_received",
+    _INTENDED,
+    (0.0, 1.0),
 )
 _DELAY: Final = Quantity(
     "topic_delay_p95_s", "delay, 95 %", Kind.MEDIAN, "s", possible=(0.0, math.inf), of_sent="topic_delay_p95_sent_s"

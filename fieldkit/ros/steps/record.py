@@ -87,8 +87,8 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         topics: The recorded topics.
         duration: Duration of the recording.
         name: Name of the bag without its extension; the names of its job and log start with it, unless it is `scan`.
-        reception: Whether columns report how soon its topics were received, and how regularly: [what a recorder
-            received](method-delay.md#what-a-recorder-received).
+        reception: Whether columns report how soon and how regularly the messages of its topics were received: [what a
+            recorder received](method-delay.md#what-a-recorder-received).
     """
 
     cross_checks = (

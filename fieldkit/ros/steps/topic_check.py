@@ -178,6 +178,6 @@ def _judge_rate(check: str, count: int, span_s: float, rate_hz: float, report: R
     low, high = ((count + sign) / max(span_s, 1e-9) for sign in (-1, 1))
     detail = f"{count} messages in {span_s:.1f} s, expected {rate_hz:g} Hz"
     if high < (1 - TOLERANCE) * rate_hz or (count > 1 and low > (1 + TOLERANCE) * rate_hz):
-        report.warn(check, detail, "correct the rate in the profile, or find out what slows the topic: top")
+        report.warn(check, detail, "correct the rate in the profile, or find the program that slows it down: top")
     else:
         report.ok(check, detail)

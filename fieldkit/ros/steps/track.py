@@ -123,11 +123,10 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     """Records the position of each robot on that robot, with its profile's record command, while inner steps run.
 
     The distance and speed columns of the transfers and pings inside use these positions
-    ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to be where they were
-    placed, unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
-    columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
-    `positions.json`, which records the source of each position and how far the robots' clocks were ahead of the
-    laptop's.
+    ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to stay at their placement,
+    unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the columns
+    `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and `positions.json`,
+    which records the source of each position and how far the robots' clocks were ahead of the laptop's.
 
     Attributes:
         robots: Source of each robot's position, by role.

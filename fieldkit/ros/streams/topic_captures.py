@@ -86,13 +86,15 @@ def is_complete(publisher: SampleFlow, subscriber: SampleFlow) -> bool:
     return len(sent_packets) > 0 and bool(match(sent_packets, received_packets).arrived.all())
 
 
-def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured: CapturedTopic) -> Iterator[str]:
+def check_captures(
+    plan: TopicPlan, publisher_log: TopicLog, subscriber_log: TopicLog, captured: CapturedTopic
+) -> Iterator[str]:
     """Yield each contradiction between the logs and the captures as a sentence.
 
     Args:
         plan: Settings of the procedure.
-        sent: Complete log of the publisher.
-        received: Complete log of the subscriber.
+        publisher_log: Complete log of the publisher.
+        subscriber_log: Complete log of the subscriber.
         captured: The topic in both captures.
     """
     if any(
@@ -101,29 +103,31 @@ def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured
     ):
         return
     if captured.publisher is not None:
-        yield from _content_contradictions(captured.publisher.heads, sent.samples, sent.samples.sequence, "publisher")
+        yield from _content_contradictions(
+            captured.publisher.heads, publisher_log.samples, publisher_log.samples.sequence, "publisher"
+        )
         yield from _sending_contradictions(captured.publisher.heads)
     if captured.subscriber is not None:
-        yield from _content_contradictions(captured.subscriber.heads, received.samples, None, "subscriber")
-        yield from _arrival_contradictions(plan, received, captured.subscriber, complete=captured.complete)
+        yield from _content_contradictions(captured.subscriber.heads, subscriber_log.samples, None, "subscriber")
+        yield from _arrival_contradictions(plan, subscriber_log, captured.subscriber, complete=captured.complete)
 
 
 def _arrival_contradictions(
-    plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *, complete: bool
+    plan: TopicPlan, subscriber_log: TopicLog, subscriber: SampleFlow, *, complete: bool
 ) -> Iterator[str]:
     """Yield the contradictions between the subscriber's log and its capture."""
-    arrived = first_arrivals(received)
-    yield from SampleArrivals.of(arrived, subscriber, complete=complete, reliable=plan.reliable).contradictions()
-    yield from _surplus_copies(received.samples, subscriber)
-    yield from _uncaptured_samples(plan, arrived, subscriber)
-    if missing := _missing_count(plan, received, subscriber, complete=complete):
-        missing_text = f"{format_count(missing, 'sample')} arrived according to the subscriber's capture"
+    arrivals = first_arrivals(subscriber_log)
+    yield from SampleArrivals.of(arrivals, subscriber, complete=complete, reliable=plan.reliable).contradictions()
+    yield from _surplus_copies(subscriber_log.samples, subscriber)
+    yield from _uncaptured_samples(plan, arrivals, subscriber)
+    if missing_count := _missing_count(plan, subscriber_log, subscriber, complete=complete):
+        missing_text = f"{format_count(missing_count, 'sample')} arrived according to the subscriber's capture"
         yield f"{missing_text}, but are not in the subscriber's log"
 
 
 def withheld_columns(
     values: Mapping[str, Value],
-    arrived: TopicSamples,
+    arrivals: TopicSamples,
     captured: CapturedTopic,
     *,
     reliable: bool,
@@ -133,20 +137,20 @@ def withheld_columns(
 
     Args:
         values: Columns of the topic from the logs.
-        arrived: Samples that arrived, each once.
+        arrivals: Samples that arrived, each once.
         captured: The topic in both captures.
         reliable: As in `TopicPlan`.
         deadline_s: Deadline of the topic; None if it has no deadline.
     """
-    if captured.subscriber is None or not len(arrived):
+    if captured.subscriber is None or not len(arrivals):
         return {}
     latency_s = SampleArrivals.of(
-        arrived, captured.subscriber, complete=captured.complete, reliable=reliable
+        arrivals, captured.subscriber, complete=captured.complete, reliable=reliable
     ).latency_s
     if latency_s is None or not len(latency_s):
         return {}
     # A sample of unknown latency affects the columns, too. It is assumed to have the largest known latency.
-    latency_s = np.append(latency_s, np.full(len(arrived) - len(latency_s), latency_s.max()))
+    latency_s = np.append(latency_s, np.full(len(arrivals) - len(latency_s), latency_s.max()))
     figures_s = {
         "median": float(np.median(latency_s)),
         "mean": float(latency_s.mean()),
@@ -166,8 +170,11 @@ def withheld_columns(
 
 def _quantile_of_sent(latency_s: Floats, values: Mapping[str, Value], share: float) -> float:
     """Return the quantile of the received samples that corresponds to this quantile of the sent samples."""
-    sent, received = values.get("topic_sent"), values.get("topic_received")
-    sent_per_received = sent / received if isinstance(sent, int) and isinstance(received, int) and received else 1.0
+    sent_count, received_count = values.get("topic_sent"), values.get("topic_received")
+    if isinstance(sent_count, int) and isinstance(received_count, int) and received_count:
+        sent_per_received = sent_count / received_count
+    else:
+        sent_per_received = 1.0
     return float(np.quantile(latency_s, min(share * sent_per_received, 1.0)))
 
 
@@ -211,13 +218,13 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
 
 
-def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
+def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if the capture has too few packets for the samples in a log without duplicates."""
     if not plan.uses_expected_ports and not len(subscriber.heads):
         return
     packets = subscriber.packets
     size_bytes = plan.size_bytes + plan.envelope_bytes
-    without_head = int((~np.isin(arrived.sequence, subscriber.heads.sequence)).sum())
+    without_head = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
     if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
@@ -227,7 +234,7 @@ def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: Samp
         missing_text = f"{format_count(without_head - max(capacity, 0), 'sample')} in the subscriber's log"
         yield f"{missing_text} are not in its capture"
     if not len(subscriber.heads):
-        yield from _early_samples(arrived, packets.time_ns, payload_bytes, size_bytes)
+        yield from _early_samples(arrivals, packets.time_ns, payload_bytes, size_bytes)
 
 
 _DATAGRAM_BYTES: Final = 1_200
@@ -254,10 +261,10 @@ def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, co
     if not len(subscriber.heads):
         return _missing_bytes(plan, log, subscriber)
     heads = subscriber.heads.first()
-    begins_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
-    is_settled = (heads.at_ns > begins_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
-    received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
-    is_missing = is_settled & received & ~np.isin(heads.sequence, log.samples.sequence)
+    start_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
+    is_settled = (heads.at_ns > start_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
+    is_received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
+    is_missing = is_settled & is_received & ~np.isin(heads.sequence, log.samples.sequence)
     if not is_missing.any():
         return 0
     return int((~_may_have_overflowed(plan, log.samples, heads, is_missing, int(log.times_ns[-1]))).sum())
@@ -278,8 +285,8 @@ def _is_received(
         next_index = np.searchsorted(numbers, heads.sequence, side="right")
         next_ns = np.append(samples.at_ns[first], -1)[next_index]
         return has_all_bytes & (gapless | (next_ns >= heads.at_ns))
-    received: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
-    return received
+    is_delivered: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
+    return is_delivered
 
 
 def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:

@@ -35,7 +35,7 @@ _COUNTS: Final = columns(
     ),
     ("topic_repeated", "count", "Samples that the subscriber received more than once."),
     ("topic_refused", "count", "Samples that the publisher's middleware did not accept in time."),
-    ("topic_skipped", "count", "Samples that were never sent: their time passed while an earlier one was written."),
+    ("topic_skipped", "count", "Samples that were never sent, because writing an earlier one took too long."),
     (
         "topic_discovered",
         "bool",

@@ -1,4 +1,4 @@
-"""Cause a fault of a robot, and measure from outside the time for which the robot does not answer."""
+"""Cause a fault of a robot, and measure the time for which the robot does not answer."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -53,7 +53,8 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     asked to cause it; with `--yes` no operator is asked, and the attempts are void.
 
     - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
-    - `out-of-range`: no other robot receives the robot for `for`. If it is the relay, no robot receives any other.
+    - `out-of-range`: no other robot receives packets of the robot for `for`. If it is the relay, no robot receives
+      packets of any other.
     - `reboot`: every process ends at the same moment, data in memory is lost, and the robot boots.
     - `kill`: every process named `process` ends at the same moment.
 

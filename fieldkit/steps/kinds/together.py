@@ -29,10 +29,10 @@ MAX_PARALLEL: Final = 8
 class TogetherStep(Nest, Prepares, DescribesActions):
     """Runs its steps at the same time: all listeners are up before the first step begins.
 
-    It ends when the last of them ends. If one fails, all others are stopped, including a `wait`. For a sequence inside
-    it, use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`, `move`,
-    `ask`, `wait` with `until`) must contain or precede it. If SSH uses the radio under test, the commands of one step
-    affect the measurement of another.
+    It ends when the last of them ends. If one fails, all others are stopped, including a `wait`. For a sequence
+    inside it, use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`,
+    `move`, `ask`, `wait` with `until`) must contain or precede it. If SSH uses the radio under test, the commands of
+    one step affect the measurement of another.
 
     Attributes:
         during: Two steps or more; at most 8 run at the same time.

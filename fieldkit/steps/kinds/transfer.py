@@ -143,7 +143,7 @@ class TransferStep(
 
         If no recording has the name, the first one is returned, because `refusals` reports this error.
         """
-        recordings = scene.recorded[self.sender]
+        recordings = scene.recordings[self.sender]
         return next((file for file in recordings if self.file in {file.name, file.alias}), recordings[0])
 
     @override
@@ -208,7 +208,7 @@ class TransferStep(
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
         """Yield a reason if no recording has the name of the file to send."""
-        recordings = [file.name for file in scene.recorded[self.sender]]
+        recordings = [file.name for file in scene.recordings[self.sender]]
         if self.file is not None and self.file not in {
             self._file_to_send(scene).name,
             self._file_to_send(scene).alias,
@@ -264,7 +264,7 @@ class TransferStep(
     def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
         """Return the error if a sender started so late that the radio is not the cause of its loss."""
         return RobotError(
-            f"sending started up to {waited_s:.1f} s after listening, but {listener}",
+            f"the sender started up to {waited_s:.1f} s after the listener, but {listener}",
             where=scene.robot(self.sender).name,
             remedy="check the control link, or increase `idle` or `limit` in the procedure",
         )
@@ -348,7 +348,7 @@ class TransferStep(
         return (self.receiver, self.prefixed_name(_LISTEN)), (self.sender, self.prefixed_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
-        """Return the recorded termination of a netcat, or None if the robot recorded none."""
+        """Return the recorded termination of a netcat, or None if there is no record."""
         after = view.evidence.read_or_none(host.state, host.after_file(role))
         return (after.endings or {}).get(job) if after else None
 

@@ -16,7 +16,7 @@ from fieldkit.steps.scene import Announce, Planned, Scene
 
 
 class WaitStep(AlongStep, DescribesActions, AsksOperator):
-    """Waits for a time, or until the operator has done something and pressed Enter.
+    """Waits for a time, or until the operator has carried out an action and pressed Enter.
 
     With `--yes` no operator is asked.
 

@@ -308,7 +308,9 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
     sample = bytes.fromhex(scan(7))
     of_ros1 = bytes(standard_types().ros2.cdr_to_ros1(sample, TYPE))
     crossing = Crossing.parse(SCAN)
-    with bridge.bridged(Side("ros1", network), Side("dds", network), [crossing], standard_types()) as (carrier,):
+    with bridge.bridge_topics(Side("ros1", network), Side("dds", network), [crossing], standard_types()) as (
+        carrier,
+    ):
         assert source.deliver is not None
         for data in (b"", of_ros1[:-1], of_ros1 + b"x", b"\xff" * 200, of_ros1):
             source.deliver(data, time.time_ns())

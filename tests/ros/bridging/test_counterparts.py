@@ -61,7 +61,7 @@ def carried(
     network = Network("127.0.0.1")
     crossing = Crossing.parse(f"/t:{type_name}", back=back)
     source, target = (of_dds, of_ros1) if back else (of_ros1, of_dds)
-    with bridge.bridged(Side("ros1", network), Side("dds", network), [crossing], types):
+    with bridge.bridge_topics(Side("ros1", network), Side("dds", network), [crossing], types):
         assert source.deliver is not None
         source.deliver(sample, time.time_ns())
     (ros1_topic,), (dds_topic,) = of_ros1.topics, of_dds.topics
@@ -128,11 +128,11 @@ def test_range_with_a_wrong_length_is_invalid(cut: int) -> None:
 
 
 def test_additional_members_depend_on_the_distribution() -> None:
-    added = {
+    pairs = {
         distribution: counterparts.of_type(standard_types(distribution), "sensor_msgs/Range")
         for distribution in (Distribution.HUMBLE, Distribution.IRON)
     }
-    assert [pair.added if pair else None for pair in added.values()] == [b"", bytes(4)]
+    assert [pair.added_bytes if pair else None for pair in pairs.values()] == [b"", bytes(4)]
     assert counterparts.of_type(standard_types(), "visualization_msgs/Marker") is None
     with pytest.raises(ConfigurationError, match="there is no message type"):
         counterparts.of_type(standard_types(), "sensor_msgs/Rnge")
