@@ -140,7 +140,7 @@ class AccessCategories(Generic[Payload]):
     Args:
         mapping: Mapping of DSCPs.
         band: Band of the station.
-        draw: As for `CategoryQueue`.
+        draw: See `CategoryQueue`.
 
     Attributes:
         active: The category of the current or last exchange.

@@ -88,8 +88,8 @@ class PacketDraws:
     """Draws for packets, for one purpose at one station or on one link.
 
     Args:
-        seed: As for `RandomStream`.
-        name: As for `RandomStream`.
+        seed: See `RandomStream`.
+        name: See `RandomStream`.
     """
 
     def __init__(self, seed: int, *name: str) -> None:

@@ -46,7 +46,7 @@ class ManagementHandler(Protocol):
 
 
 class ManagedDelivery(PacketDelivery[Payload]):
-    """Packets of robots that may be stations of access points. Arguments as the base class.
+    """Packets of robots that may be stations of access points. Arguments are those of the base class.
 
     Attributes:
         robots: Indices of the robots; other stations are access points and neighbours.
