@@ -196,7 +196,7 @@ def overview(
         LabLink(
             (names[first_index], names[second_index]),
             min(channel.snr_db(first_index, second_index), channel.snr_db(second_index, first_index)),
-            channel.linked(first_index, second_index),
+            channel.are_linked(first_index, second_index),
             tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
         )
         for (first_index, second_index), crossed in zip(pairs, world.crossings(first, second), strict=True)

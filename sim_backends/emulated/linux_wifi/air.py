@@ -125,7 +125,7 @@ class _ChannelGains(WorldChannel):
     channel: "_Channel"
 
     @override
-    def linked(self, transmitter: int, receiver: int) -> bool:
+    def are_linked(self, transmitter: int, receiver: int) -> bool:
         return True
 
     @override
