@@ -115,8 +115,8 @@ class ArmingCheck:
         """Return the names of the requested parameters that the autopilot has not reported."""
         dialect = self._drone.dialect
         alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
-        reported = self._drone.parameters.keys()
-        return [name for names in alternatives if reported.isdisjoint(names) for name in names]
+        reported_names = self._drone.parameters.keys()
+        return [name for names in alternatives if reported_names.isdisjoint(names) for name in names]
 
     @property
     def is_starting(self) -> bool:

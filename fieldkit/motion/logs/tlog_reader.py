@@ -104,11 +104,11 @@ class TlogDecoder:
     def message(self, frame: LoggedFrame) -> Any | None:  # noqa: ANN401 (of a class that the dialect generates)
         """Return the message in a frame; None if the frame is damaged, or of another dialect."""
         try:
-            decoded = self._link.decode(bytearray(frame.data))
+            message = self._link.decode(bytearray(frame.data))
         except dialect.MAVError:
             self.damaged_frames += 1
             return None
-        return None if decoded.get_type().startswith("UNKNOWN") else decoded
+        return None if message.get_type().startswith("UNKNOWN") else message
 
 
 def answer(request: Json) -> Json:

@@ -70,7 +70,7 @@ class FlyLeg(PathLeg):
     down: _Distance = None
 
     @schema.model_validator(mode="after")
-    def _one_direction(self) -> "FlyLeg":
+    def _has_one_direction(self) -> "FlyLeg":
         for key, opposite in (("away", "towards"), ("left", "right"), ("up", "down")):
             if getattr(self, key) is not None and getattr(self, opposite) is not None:
                 raise schema.validation_error(

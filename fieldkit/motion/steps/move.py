@@ -106,10 +106,13 @@ class MoveStep(
     @override
     def adjustments(self, cast: Cast) -> Iterator[str]:
         if self.within_limits:
-            requested = self.model_copy(update={"within_limits": False}).resolved(cast).motion
-            permitted = self.resolved(cast).motion
-            if permitted != requested:
-                permitted_text, requested_text = geometry.describe_move(permitted), geometry.describe_move(requested)
+            requested_move = self.model_copy(update={"within_limits": False}).resolved(cast).motion
+            permitted_move = self.resolved(cast).motion
+            if permitted_move != requested_move:
+                permitted_text, requested_text = (
+                    geometry.describe_move(permitted_move),
+                    geometry.describe_move(requested_move),
+                )
                 yield f"{cast[self.robot].name} moves {permitted_text}; {requested_text} is beyond its limits"
 
     @property

@@ -175,9 +175,9 @@ def _reason(judgement: Judgement) -> str:
     unknown, expectation_text = judgement.why or "undecided", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
         return f"{expectation_text}: {unknown}"
-    why = f"; {judgement.why}" if judgement.why else ""
+    note = f"; {judgement.why}" if judgement.why else ""
     figures = f"in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}"
-    return f"{expectation_text} {figures}{why}"
+    return f"{expectation_text} {figures}{note}"
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:

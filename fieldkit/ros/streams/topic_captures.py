@@ -295,8 +295,8 @@ def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
     if connection is None or not len(connection[1]):
         return np.zeros(len(heads), dtype=np.bool_)
     base = int(heads.end[0])
-    acknowledged: Mask = seq_difference(heads.end, base) <= seq_difference(connection[1].tcp_ack, base).max()
-    return acknowledged
+    is_acknowledged: Mask = seq_difference(heads.end, base) <= seq_difference(connection[1].tcp_ack, base).max()
+    return is_acknowledged
 
 
 def _may_have_overflowed(
@@ -308,15 +308,17 @@ def _may_have_overflowed(
     arrived_ns, read_ns = np.sort(heads.at_ns), np.append(np.sort(samples.at_ns), end_ns)
     lost_ns = heads.at_ns[is_missing]
     next_ns = read_ns[np.minimum(np.searchsorted(read_ns, lost_ns), len(read_ns) - 1)]
-    queued = np.searchsorted(arrived_ns, next_ns, side="right") - np.searchsorted(arrived_ns, lost_ns, side="right")
+    queue_length = np.searchsorted(arrived_ns, next_ns, side="right") - np.searchsorted(
+        arrived_ns, lost_ns, side="right"
+    )
     # A missing sample that arrives releases all waiting samples together; the capture may lack heads of some of them.
     read_together = np.searchsorted(read_ns[:-1], next_ns + _READ_BURST_NS, side="right") - np.searchsorted(
         read_ns[:-1], next_ns
     )
-    queued = np.maximum(queued, read_together)
+    queue_length = np.maximum(queue_length, read_together)
     newest_ns = arrived_ns[max(len(arrived_ns) - plan.depth, 0)]
-    overflowed: Mask = (queued >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
-    return overflowed
+    may_have_overflowed: Mask = (queue_length >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
+    return may_have_overflowed
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:

@@ -127,9 +127,9 @@ def _publisher_problems(plan: TopicPlan, publisher_log: TopicLog) -> Iterator[st
     samples, numbers = publisher_log.samples, publisher_log.numbers
     if (numbers != np.arange(len(numbers))).any():
         yield "the sample numbers in the publisher's log do not start at 0, or have a gap"
-    offered = len(numbers) + publisher_log.skipped
-    if publisher_log.matched_ns is not None and offered != plan.samples:
-        yield f"the publisher's log accounts for {offered} instead of {format_count(plan.samples, 'sample')}"
+    offered_count = len(numbers) + publisher_log.skipped
+    if publisher_log.matched_ns is not None and offered_count != plan.samples:
+        yield f"the publisher's log accounts for {offered_count} instead of {format_count(plan.samples, 'sample')}"
     yield from _wrong_sizes(plan, publisher_log, 0, "publisher")
     if len(samples) and (samples.at_ns < samples.sent_ns - MAX_SLEW_NS).any():
         yield "the publisher's log has a sample that the middleware accepted before it was created"
