@@ -83,12 +83,12 @@ def _robots(arguments: argparse.Namespace) -> Iterator[Robots]:
     if path is None and Path(SITE_FILE).is_file():
         path = Path(SITE_FILE)
     document = None if path is None else documents.read(path)
-    backend = arguments.backend or (None if document is None else robot_access.backend_of(document))
+    backend = arguments.backend or (None if document is None else robot_access.configured_backend(document))
     with ExitStack() as stack:
         if backend == _FIELD and document is not None:
             yield stack.enter_context(_field_robots(robot_access.read_access(document)))
             return
-        robots: Robots = stack.enter_context(lab_shells.opened(folder.of_directory(Path.cwd())))
+        robots: Robots = stack.enter_context(lab_shells.open_shells(folder.of_directory(Path.cwd())))
         yield robots or stack.enter_context(_other_robots(backend, path))
 
 

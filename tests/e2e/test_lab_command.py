@@ -115,7 +115,7 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
     argv = ("sh", "-c", DRIVE_SCRIPT, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
     driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
-    with lab_shells.opened(folder.of_directory(lab)) as shells:
+    with lab_shells.open_shells(folder.of_directory(lab)) as shells:
         jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
         evidence.begin(shells["ground-1"], attempt, "sender", "lo")
         jobs.start(shells["ground-1"], driver)

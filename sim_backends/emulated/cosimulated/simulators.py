@@ -36,7 +36,7 @@ DEADLINE_S: Final = 10.0
 """Longest wait for an answer of a simulator. The lab waits for 15 s for an answer of the medium."""
 
 _END_NS: Final = 10**9 * 10**8
-"""Announced end of a run, which no run reaches: three years."""
+"""End of a run that is announced to the simulators; at three years, no run reaches it."""
 
 
 class Simulators(NamedTuple):
@@ -173,7 +173,8 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
 
 
 def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
-    """Start a network that is a program; arguments and errors as `start_physics`, with all stations."""
+    """Start the program of a network. Arguments and errors are those of `start_physics`, but with all stations."""
+
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported = network.welcome.transports
     if supported and not {UNICAST, BROADCAST} <= {*supported}:

@@ -354,8 +354,8 @@ def test_a_router_outside_the_cast_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("ros2", "message"),
     [
-        ("{discovery: router}", "require each other"),
-        ("{router: duckiedrone-1}", "require each other"),
+        ("{discovery: router}", "must be given together"),
+        ("{router: duckiedrone-1}", "must be given together"),
         ("{discovery: router, router: drone}", "emulated.ros2.router names 'drone', which the lab does not have"),
         ("{discovery: magic}", "emulated.ros2.discovery"),
     ],
