@@ -152,7 +152,7 @@ class ArmingCheck:
             )
             return
         if drone.armed:
-            yield ArmingFault("its motors turn", "land it first")
+            yield ArmingFault("its motors are running", "land it first")
         yield from self._position()
         yield from self._battery()
         yield from self._prearm_checks()

@@ -164,7 +164,7 @@ class MoveStep(
         if (drive := drive_of(robot.profile)) is not None and can_drive(robot):
             driving_note = (
                 f", and back, automatically: velocities on {drive.topic}, odometry of {drive.odometry}; it stops if "
-                f"no order arrives for {drive.lease:g} s, or {robot.profile.limits.fence_m:g} m from its origin"
+                f"no order arrives for {drive.lease:g} s, and at {robot.profile.limits.fence_m:g} m from its origin"
             )
         duration = f"for up to {round(self.path_s(robot), 1):g} s"
         yield f"{robot.name} moves {geometry.describe_move(self.motion)}, {duration}{driving_note}"

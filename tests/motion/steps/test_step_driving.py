@@ -84,7 +84,7 @@ def test_without_permission_there_is_no_driver() -> None:
     (line, *_) = STEP.dry_run_notes(scene)
     assert "automatically" not in line
     (line, *_) = STEP.dry_run_notes(SCENE)
-    assert "it stops if no order arrives for 2 s, or 30 m from its origin" in line
+    assert "it stops if no order arrives for 2 s, and at 30 m from its origin" in line
 
 
 def test_path_beyond_fence_or_speed_is_refused() -> None:
