@@ -69,7 +69,7 @@ def bring_down(
 
     Raises:
         FlightError: Another party flies the drone (`TAKEN_OVER`), no heartbeat was received for `NO_HEARTBEAT_S`, or
-            its motors still turn after `_LANDING_TIMEOUT_S`.
+            its motors are still running after `_LANDING_TIMEOUT_S`.
     """
     drone, retry_s, start_s, has_warned = session.drone, 0.0, time.monotonic(), False
     command = (drone.dialect or Px4()).bring_down_command(action)  # other families accept the commands of PX4
@@ -79,7 +79,7 @@ def bring_down(
     while drone.armed:
         now_s = time.monotonic()
         if now_s > start_s + _LANDING_TIMEOUT_S:
-            raise FlightError(REFUSED, f"its motors still turn, although it was commanded to {action}")
+            raise FlightError(REFUSED, f"its motors are still running, although it was commanded to {action}")
         if min(drone.heartbeat_age_s, now_s - start_s) > NO_HEARTBEAT_S:
             raise FlightError(REFUSED, f"no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s")
         if not drone.alive and not has_warned:
