@@ -99,8 +99,8 @@ class MotionPermission:
             yield
         except KeyboardInterrupt:
             for hold in self._journal.holds if self._journaled_origins is not None else ():
-                place = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
-                sink(Note(f"{hold.reason}: {place}"))
+                instruction = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
+                sink(Note(f"{hold.reason}: {instruction}"))
             raise
 
     def _require_placed(self, origins: JournaledOrigins) -> None:
