@@ -352,5 +352,5 @@ def test_an_error_inside_is_reported_even_if_the_robot_does_not_return(
     field = DrivingTestbed(RecordingShell(status=['{"ended": "", "ready": true}']))
     with pytest.raises(LinkError) as caught:
         driven(field, fail)
-    assert caught.value.what.startswith("it does not answer; before, the steps failed: RobotError: ")
+    assert caught.value.what.startswith("it does not answer; before that, the steps failed: RobotError: ")
     assert "ping exited with 2" in caught.value.what
