@@ -107,7 +107,7 @@ def test_text_in_pieces_is_joined() -> None:
     long = b"PreArm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT"
     pieces = {f"text{n}": d.MAVLink_statustext_message(2, long[50 * n :][:50], 5, n) for n in range(2)}
     (fault,) = faults(**pieces)
-    assert fault.endswith("armed: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT")
+    assert fault.endswith("to arm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT")
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])
