@@ -28,7 +28,7 @@ class View:
     def capture(self, role: Role) -> Capture | None:
         """Return the capture of a robot around the step; None if there is none or it is incomplete."""
         name = capture_around(self.within, role)
-        return None if name is None or self.dropped(role) else self.evidence.whole_capture(name)
+        return None if name is None or self.dropped(role) else self.evidence.undamaged_capture(name)
 
     def dropped(self, role: Role) -> int:
         """Return the number of packets that a robot's kernel and interface dropped before tcpdump.

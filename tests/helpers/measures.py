@@ -59,7 +59,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
 def _captures(evidence: AttemptEvidence) -> Measured:
     measured = Measured()
     for role in (Role.SENDER, Role.RECEIVER):
-        capture = evidence.whole_capture(tcpdump_log.capture_file(role))
+        capture = evidence.undamaged_capture(tcpdump_log.capture_file(role))
         log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_file(role))
         frame_count = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None

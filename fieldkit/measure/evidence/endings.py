@@ -47,13 +47,13 @@ class Ending:
     Attributes:
         cause: Cause of the termination; `EXITED` includes a signal that was not sent by fieldkit.
         code: Exit code; None if the job was killed together with its supervisor, or is still running.
-        lasted_s: Duration in seconds; None if the end is unknown.
+        duration_s: Duration in seconds; None if the end is unknown.
         ended_s: End, in seconds since boot; None if unknown.
     """
 
     cause: Cause
     code: int | None
-    lasted_s: float | None
+    duration_s: float | None
     ended_s: float | None = None
 
 
@@ -72,8 +72,8 @@ def times_s(lines: Iterable[str]) -> Mapping[str, tuple[float, float | None]]:
 
 def _ending(match: re.Match[str]) -> Ending:
     ended_s = None if match["ended"] == "-" else float(match["ended"])
-    lasted_s = None if ended_s is None else ended_s - int(match["started"]) / _TICKS_PER_S
-    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), lasted_s, ended_s)
+    duration_s = None if ended_s is None else ended_s - int(match["started"]) / _TICKS_PER_S
+    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), duration_s, ended_s)
 
 
 def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
@@ -90,8 +90,8 @@ def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float
         return _NOT_ALLOWED[ending.cause].format(ending.code)
     if ending.cause is Cause.EXITED and ending.code > _KILLED:
         return f"was killed by {_signal(ending.code - _KILLED)}, not by fieldkit"
-    if ending.cause is Cause.EXITED and ending.lasted_s is not None and ending.lasted_s + _TOLERANCE_S < least_s:
-        return f"exited after {ending.lasted_s:.1f} s of {least_s:g} s"
+    if ending.cause is Cause.EXITED and ending.duration_s is not None and ending.duration_s + _TOLERANCE_S < least_s:
+        return f"exited after {ending.duration_s:.1f} s of {least_s:g} s"
     return None
 
 

@@ -87,13 +87,13 @@ class HandoverGap:
     """The time without answers around a handover.
 
     Attributes:
-        lasted_s: Time between the answers before and after it; the observed time if it is open.
+        duration_s: Time between the answers before and after it; the observed time if it is open.
         first_lost: First sequence number without an answer in it.
         lost: Number of requests without an answer in it.
         is_open: True if ping started or ended in it.
     """
 
-    lasted_s: float
+    duration_s: float
     first_lost: int
     lost: int
     is_open: bool
@@ -143,7 +143,7 @@ def gap_around(handover: Handover, output: Ping, interval_s: float) -> HandoverG
     unanswered = last_seq - last
     if unanswered > 0 and handover.joined_ns >= last_ns:
         gaps.append(HandoverGap(unanswered * interval_s, last + 1, unanswered, is_open=True))
-    return max(gaps, key=lambda gap: gap.lasted_s, default=None)
+    return max(gaps, key=lambda gap: gap.duration_s, default=None)
 
 
 def measure(samples: Sequence[LinkSample], output: Ping | None, interval_s: float, ping_pong_s: float) -> Measured:
@@ -187,9 +187,9 @@ def _measure_gaps(handovers: Sequence[Handover], output: Ping | None, interval_s
     if not gaps:
         reason = _NO_STAMPS if handovers else _NO_HANDOVER
         return Measured({}, dict.fromkeys(("roam_gap_s", "roam_gap_at_least_s", "roam_lost"), reason))
-    longest = max(gaps, key=lambda gap: gap.lasted_s)
+    longest = max(gaps, key=lambda gap: gap.duration_s)
     filled, empty = ("roam_gap_s", "roam_gap_at_least_s")[:: -1 if longest.is_open else 1]
     reason = f"ping {'started or ended' if longest.is_open else 'neither started nor ended'} in the gap"
     # Two handovers may share a gap, whose requests are counted once.
     lost = sum({gap.first_lost: gap.lost for gap in gaps}.values())
-    return Measured({filled: longest.lasted_s, "roam_lost": lost}, {empty: reason})
+    return Measured({filled: longest.duration_s, "roam_lost": lost}, {empty: reason})

@@ -95,7 +95,7 @@ class IperfInterval:
     """One interval of a test at one end, with sums over all streams. A value is None if that end does not count it.
 
     Attributes:
-        lasted_s: Length in seconds.
+        duration_s: Length in seconds.
         payload_bytes: Payload sent or received.
         datagrams: UDP datagrams; at the receiver, the datagrams that it expected.
         lost: Expected datagrams that the receiver did not receive.
@@ -106,7 +106,7 @@ class IperfInterval:
         rate_bit_s: Payload bits per second as written by iperf3.
     """
 
-    lasted_s: float
+    duration_s: float
     payload_bytes: int
     datagrams: int | None
     lost: int | None
@@ -119,7 +119,7 @@ class IperfInterval:
     @property
     def bit_s(self) -> float:
         """Payload bits per second."""
-        return 8 * self.payload_bytes / self.lasted_s
+        return 8 * self.payload_bytes / self.duration_s
 
 
 @dataclass(frozen=True)
@@ -144,11 +144,11 @@ class IperfTest:
 
     @property
     def _full_intervals(self) -> tuple[IperfInterval, ...]:
-        longest_s = max((interval.lasted_s for interval in self.intervals), default=0.0)
-        return tuple(interval for interval in self.intervals if interval.lasted_s >= _MIN_LENGTH_SHARE * longest_s)
+        longest_s = max((interval.duration_s for interval in self.intervals), default=0.0)
+        return tuple(interval for interval in self.intervals if interval.duration_s >= _MIN_LENGTH_SHARE * longest_s)
 
     @property
-    def steady(self) -> tuple[IperfInterval, ...]:
+    def steady_intervals(self) -> tuple[IperfInterval, ...]:
         """The full intervals, without the first one if there are at least three.
 
         In the first one, TCP increases its rate from slow start, and the receiver waits for the first packet.
@@ -160,9 +160,9 @@ class IperfTest:
     def window_s(self) -> tuple[float, float]:
         """Start and end of the steady intervals, in seconds after the first packet."""
         start_s = sum(
-            interval.lasted_s for interval in self._full_intervals[: len(self._full_intervals) - len(self.steady)]
+            interval.duration_s for interval in self._full_intervals[: len(self._full_intervals) - len(self.steady_intervals)]
         )
-        return start_s, start_s + sum(interval.lasted_s for interval in self.steady)
+        return start_s, start_s + sum(interval.duration_s for interval in self.steady_intervals)
 
 
 def read(path: Path) -> IperfTest:
@@ -207,13 +207,13 @@ def parse(text: str) -> IperfTest:
 def _intervals(document: Mapping[str, Any]) -> Iterator[IperfInterval]:
     for interval in items(document, "intervals"):
         total = mapping(interval, "sum")
-        lasted_s, payload_bytes = number(total, "seconds"), count(total, "bytes")
-        if total.get("omitted") is True or not lasted_s or payload_bytes is None:
+        duration_s, payload_bytes = number(total, "seconds"), count(total, "bytes")
+        if total.get("omitted") is True or not duration_s or payload_bytes is None:
             continue
         datagrams, lost, retransmits = (count(total, name) for name in ("packets", "lost_packets", "retransmits"))
         streams = [count(stream, "bytes") for stream in items(interval, "streams")]
         yield IperfInterval(
-            lasted_s,
+            duration_s,
             payload_bytes,
             datagrams,
             lost,
@@ -236,14 +236,14 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
     """Return the columns of a test from the results of both ends; None for an end whose result is not available."""
     sent, received = (test.intervals if test else () for test in (sender, receiver))
     received_bytes = sum(interval.payload_bytes for interval in received) if received else None
-    steady = receiver.steady if receiver else ()
-    rates = [interval.bit_s for interval in steady]
-    lasted_s = sum(interval.lasted_s for interval in steady)
+    steady_intervals = receiver.steady_intervals if receiver else ()
+    rates = [interval.bit_s for interval in steady_intervals]
+    duration_s = sum(interval.duration_s for interval in steady_intervals)
     datagrams, lost = (_sum([getattr(interval, name) for interval in received]) for name in ("datagrams", "lost"))
     arrived = None if datagrams is None or lost is None else max(datagrams - lost, 0)
     values = {
-        "iperf3_throughput_bit_s": 8 * sum(interval.payload_bytes for interval in steady) / lasted_s
-        if steady
+        "iperf3_throughput_bit_s": 8 * sum(interval.payload_bytes for interval in steady_intervals) / duration_s
+        if steady_intervals
         else None,
         "iperf3_interval_min_bit_s": min(rates, default=None),
         "iperf3_interval_median_bit_s": median(rates) if rates else None,

@@ -39,7 +39,7 @@ class IperfStart:
 
     Attributes:
         cookie: Random text that is the same at both ends of a test.
-        began_utc_s: Start, in seconds since 1970 UTC.
+        start_utc_s: Start, in seconds since 1970 UTC.
         protocol: `tcp` or `udp`.
         streams: Number of parallel streams.
         block_bytes: Bytes per write; for UDP, the payload of a datagram.
@@ -47,7 +47,7 @@ class IperfStart:
     """
 
     cookie: str = ""
-    began_utc_s: int | None = None
+    start_utc_s: int | None = None
     protocol: str = ""
     streams: int | None = None
     block_bytes: int | None = None
@@ -66,7 +66,7 @@ class IperfTotals:
         jitter_s: Jitter at the receiver, in seconds.
         retransmits: Retransmitted segments.
         out_of_order: Datagrams of all streams that arrived out of order, including duplicates.
-        ends_s: End times of all summaries, in seconds from the start.
+        summary_ends_s: End times of all summaries, in seconds from the start.
     """
 
     sent_bytes: int | None = None
@@ -76,7 +76,7 @@ class IperfTotals:
     jitter_s: float | None = None
     retransmits: int | None = None
     out_of_order: int = 0
-    ends_s: tuple[float, ...] = ()
+    summary_ends_s: tuple[float, ...] = ()
 
 
 def parse_start(document: Mapping[str, Any]) -> IperfStart:
@@ -86,7 +86,7 @@ def parse_start(document: Mapping[str, Any]) -> IperfStart:
     cookie, protocol, reverse = start.get("cookie"), test.get("protocol"), number(test, "reverse")
     return IperfStart(
         cookie=cookie if isinstance(cookie, str) else "",
-        began_utc_s=count(mapping(start, "timestamp"), "timesecs"),
+        start_utc_s=count(mapping(start, "timestamp"), "timesecs"),
         protocol=protocol.lower() if isinstance(protocol, str) else "",
         streams=count(test, "num_streams"),
         block_bytes=count(test, "blksize"),
@@ -107,7 +107,7 @@ def parse_totals(document: Mapping[str, Any]) -> IperfTotals:
         jitter_s=next((ms / 1e3 for part in (received, both) if (ms := number(part, "jitter_ms"))), None),
         retransmits=count(sent, "retransmits"),
         out_of_order=sum(count(mapping(stream, "udp"), "out_of_order") or 0 for stream in items(end, "streams")),
-        ends_s=tuple(_ends_s(end)),
+        summary_ends_s=tuple(_ends_s(end)),
     )
 
 

@@ -114,7 +114,7 @@ def lateness_quantile_ns(histogram: Mapping[int, int], share: float) -> int | No
     return next((late_ns for (late_ns, _), total in zip(counts, cumulative, strict=True) if total >= min_total), None)
 
 
-def too_late(lateness: Lateness) -> int:
+def late_packet_count(lateness: Lateness) -> int:
     """Return the number of packets that were later than the bound."""
     return sum(count for late_ns, count in lateness.packets.items() if late_ns > lateness.bound_ns)
 
@@ -127,7 +127,7 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
     values = {
         "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
         "emulator_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
-        "emulator_too_late": too_late(lateness),
+        "emulator_too_late": late_packet_count(lateness),
     }
     return Measured.from_optional(values, "no packet was delivered")
 
@@ -150,7 +150,7 @@ def lateness_problem(lateness: Lateness) -> str | None:
     packet_ns = lateness_quantile_ns(lateness.packets, 1.0)
     window_ns = lateness_quantile_ns(lateness.windows or {}, 1.0)
     if packet_ns is not None and packet_ns > bound_ns:
-        late = f"{too_late(lateness)} packets were delivered too late, by up to {packet_ns / 1e6:.3g} ms"
+        late = f"{late_packet_count(lateness)} packets were delivered too late, by up to {packet_ns / 1e6:.3g} ms"
     elif window_ns is not None and window_ns > bound_ns:
         windows = sum(count for late_ns, count in (lateness.windows or {}).items() if late_ns > bound_ns)
         late = f"{windows} windows of the co-simulation ended too late, by up to {window_ns / 1e6:.3g} ms"

@@ -15,7 +15,7 @@ from fieldkit.core.columns import Measured, fault_column_name, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
-from fieldkit.measure.evidence.outage_columns import declared
+from fieldkit.measure.evidence.outage_columns import fault_columns
 
 SILENT_S: Final = 1.0
 """A robot has not recovered if its last answer is older than this at the end of the observation."""
@@ -109,7 +109,7 @@ def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
     return Recovery(outage_s=outage_s, recovery_s=recovery_s, recovered=True)
 
 
-def cause_lasted_s(path: Path) -> float | None:
+def cause_duration_s(path: Path) -> float | None:
     """Return the duration of the cause of a fault from its note, in seconds; None if unknown.
 
     Raises:
@@ -157,7 +157,7 @@ def _process_answers(path: Path) -> _Answers:
 def measure(kind: FaultKind, effect: Recovery | None) -> Measured:
     """Return the columns of a kind of fault; `effect` is None if the evidence is not available."""
     if effect is None:
-        return Measured.all_missing(declared(kind), "the observation is not available")
+        return Measured.all_missing(fault_columns(kind), "the observation is not available")
     outage = {
         fault_column_name(kind, "outage_s"): effect.outage_s,
         fault_column_name(kind, "recovered"): effect.recovered,

@@ -18,7 +18,7 @@ def _observer(kind: FaultKind) -> str:
     return "process" if kind is FaultKind.KILL else "ping"
 
 
-def declared(kind: FaultKind) -> tuple[Column, ...]:
+def fault_columns(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
     outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
     recovery_meaning = f"Part of this outage after the end of the cause of {kind}; empty if that end is unknown."
@@ -36,4 +36,4 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     return (*times, *columns(110, (bound, "s", bound_meaning)))
 
 
-COLUMNS: Final = tuple(column for kind in _KINDS_IN_ORDER for column in declared(kind))
+COLUMNS: Final = tuple(column for kind in _KINDS_IN_ORDER for column in fault_columns(kind))

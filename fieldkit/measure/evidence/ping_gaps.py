@@ -52,12 +52,12 @@ class AnswerGap:
     """The longest time without an answer in a run of ping.
 
     Attributes:
-        lasted_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
+        duration_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
         lost: Number of unanswered requests in the gap.
         is_open: Whether ping started or ended in the gap, so that both numbers are lower bounds.
     """
 
-    lasted_s: float
+    duration_s: float
     lost: int
     is_open: bool
 
@@ -118,5 +118,5 @@ def measure_gap(output: Ping | None, interval_s: float) -> Measured:
     closed, bounds = (tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS))
     filled, empty = (bounds, closed) if gap.is_open else (closed, bounds)
     reason = "ping started or ended in the gap" if gap.is_open else "ping neither started nor ended in the gap"
-    values = dict(zip(filled, (gap.lasted_s, gap.lost), strict=True))
+    values = dict(zip(filled, (gap.duration_s, gap.lost), strict=True))
     return Measured(values, dict.fromkeys(empty, reason))

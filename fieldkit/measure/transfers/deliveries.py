@@ -47,14 +47,14 @@ class FlowSchedule:
 
     Attributes:
         interval_s: Sending interval of a flow with a fixed rate; 0 if the sender always has more to send.
-        lasts_s: Sending duration from the first payload on; None if the flow ends when everything is sent.
+        duration_s: Sending duration from the first payload on; None if the flow ends when everything is sent.
         size_bytes: Payload of a TCP flow; None if it is not known in advance.
         until_ns: Time at which the receiving program ended, by the receiver's clock; None if unknown.
         head_bytes: Bytes at the start of a TCP flow that belong to its setup.
     """
 
     interval_s: float = 0.0
-    lasts_s: float | None = None
+    duration_s: float | None = None
     size_bytes: int | None = None
     until_ns: int | None = None
     head_bytes: int = 0
@@ -141,7 +141,7 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
     sent_index, received_index = delay.tcp_copies(frames)
     pairs = StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
     delivery = stream_delivery(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
-    if expected.lasts_s is not None or not len(at_ns):
+    if expected.duration_s is not None or not len(at_ns):
         return delivery
     if is_complete:
         return replace(delivery, end_ns=None)
@@ -192,13 +192,13 @@ def stream_delivery(
     """
     min_stall_s = max(MIN_STALL_S, _MIN_RTTS * rtt_s, _MIN_INTERVALS * expected.interval_s)
     first_ns, data_ns, last_ns = sent_ns
-    if expected.lasts_s is not None:
-        last_ns = data_ns + round(1e9 * expected.lasts_s)
+    if expected.duration_s is not None:
+        last_ns = data_ns + round(1e9 * expected.duration_s)
     if not len(at_ns):
         return Delivery(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
     start_offset_ns, end_offset_ns = _sender_to_receiver_ns(pairs)
     end_ns = last_ns + end_offset_ns
-    if expected.lasts_s is not None and expected.until_ns is not None:
+    if expected.duration_s is not None and expected.until_ns is not None:
         end_ns = min(end_ns, expected.until_ns)
     return Delivery(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
 

@@ -47,7 +47,7 @@ def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets
     Raises:
         EvidenceError: A capture is missing, damaged or without times, or the captures contradict each other.
     """
-    captures = [evidence.whole_capture(name) for name in transfer.captures]
+    captures = [evidence.undamaged_capture(name) for name in transfer.captures]
     if any(capture is None for capture in captures):
         raise EvidenceError("there are no complete captures of both ends", where=str(evidence.folder))
     sender, receiver = (capture.packets for capture in captures if capture is not None)

@@ -170,7 +170,7 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
     Raises:
         EvidenceError: They cannot be determined from the captures.
     """
-    sender, receiver = (evidence.whole_capture(file) for file in transfer.captures)
+    sender, receiver = (evidence.undamaged_capture(file) for file in transfer.captures)
     if sender is None or receiver is None:
         raise EvidenceError("there are no complete captures of both ends")
     schedule = flow_schedule(evidence, transfer, listener)

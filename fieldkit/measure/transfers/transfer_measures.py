@@ -63,7 +63,7 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
         transfer: The transfer.
         listener: Job that received the file; empty if unknown.
     """
-    captures = [evidence.whole_capture(file) for file in transfer.captures]
+    captures = [evidence.undamaged_capture(file) for file in transfer.captures]
     sender, receiver = captures if transfer.captured else (None, None)
     contradiction = incomparability_reason(evidence, transfer)
     pings = evidence.read_or_none(ping.read, step_prefixed(transfer.name, ping.FILE))
@@ -109,7 +109,7 @@ def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str
 
 
 def _incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
-    sender, receiver = map(evidence.whole_capture, transfer.captures)
+    sender, receiver = map(evidence.undamaged_capture, transfer.captures)
     if (
         sender
         and receiver

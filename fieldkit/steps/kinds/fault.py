@@ -269,7 +269,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
-        return (*outage_columns.declared(self.kind), *across.declared(self))
+        return (*outage_columns.fault_columns(self.kind), *across.declared(self))
 
     @override
     def measure(self, view: View) -> Measured:

@@ -234,7 +234,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
                 sender_counters=view.evidence.counters(self.source),
                 receiver_counters=view.evidence.counters(self.destination),
             )
-            yield from load_checks.find(self._flow(view, sent, received), sent, received, load_evidence)
+            flow = self._flow(view, sent, received)
+            yield from load_checks.find_contradictions(flow, sent, received, load_evidence)
         interface = view.scene.link(self.destination, self.over).interface
         interface_bytes = view.evidence.interface_bytes(self.destination, interface)
         payload_bytes = sum(interval.payload_bytes for interval in received.intervals)
@@ -284,7 +285,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             view.scene,
             reverse=self.reverse,
             ports=ports,
-            lasts_s=self._duration_s if self.size is None else None,
+            duration_s=self._duration_s if self.size is None else None,
             until_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
         )
 

@@ -333,7 +333,9 @@ class TransferStep(
         else:
             finished = listened is not None and listened.code == 0
             was_stopped = endings[0] is not None and listened is None
-            yield from transfer_checks.find(view.evidence, transfer, finished=finished, cut=was_stopped)
+            yield from transfer_checks.find_contradictions(
+                view.evidence, transfer, finished=finished, was_stopped=was_stopped
+            )
         texts = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
         if listened is not None and netcat.listener_failed(listened.code, texts[0]):
             yield f"{self._logs[0]}: netcat was terminated by a signal, or could not write {self._into}"

@@ -19,7 +19,7 @@ send limit 130 1286154 12981.58
 def test_recorded_terminations_are_parsed() -> None:
     by_name = endings.parse(NOTED.splitlines())
     assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.STOPPED, 0)
-    assert by_name["capture"].lasted_s == pytest.approx(2.25)
+    assert by_name["capture"].duration_s == pytest.approx(2.25)
     assert by_name["killed"] == Ending(Cause.EXITED, None, None)
     assert [by_name[name].cause for name in ("ping", "busy", "send")] == [Cause.EXITED, Cause.RUNNING, Cause.LIMIT]
 

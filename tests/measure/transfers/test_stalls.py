@@ -188,7 +188,7 @@ def test_a_flow_shorter_than_its_schedule_has_stalled_until_the_end_of_it() -> N
     stream = Stream()
     for number in range(100):  # the sender's kernel takes no more of them after 1 s: its interface is down
         stream.datagram(number, number * STEP_NS)
-    scheduled = FlowSchedule(interval_s=0.01, lasts_s=5.0)
+    scheduled = FlowSchedule(interval_s=0.01, duration_s=5.0)
     assert measured(of_udp(*captured([stream]), scheduled)) == {"stall_at_least_s": pytest.approx(4.0), "stalls": 1}
     shortened = replace(scheduled, until_ns=START + 3 * SECOND)
     assert measured(of_udp(*captured([stream]), shortened))["stall_at_least_s"] == pytest.approx(2.0, abs=0.01)
