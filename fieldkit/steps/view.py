@@ -36,7 +36,9 @@ class View:
         It is 0 without a capture around the step, and without counters of tcpdump, which other checks report.
         """
         name = capture_around(self.within, role)
-        log = None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_of(name))
+        log = (
+            None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.capture_log_file(name))
+        )
         return 0 if log is None else (log.dropped_by_kernel or 0) + (log.dropped_by_interface or 0)
 
     def captured(self, *roles: Role) -> bool:

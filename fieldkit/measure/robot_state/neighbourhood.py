@@ -172,7 +172,7 @@ def measure(role: Role, states: Sequence[RadioState]) -> Measured:
         "others_airtime_share": max(shares, default=None),
     }
     prefixed = {f"{role}_{name}": value for name, value in values.items()}
-    return Measured.from_optional(prefixed, "its radio does not report it, or received no other network")
+    return Measured.from_optional(prefixed, "the robot's radio does not report it, or received no other network")
 
 
 def channel_problem(states: Sequence[RadioState]) -> str | None:
