@@ -357,7 +357,12 @@ def test_a_robot_that_rebooted(attempt: Attempt) -> None:
         ("receiver", "listen itself 0", "listen itself 143", "its job listen was killed by SIGTERM, not by fieldkit"),
         ("sender", "send itself 0", "send itself 137", "its job send was killed by SIGKILL, not by fieldkit"),
         ("sender", "send itself 0 100000 1060.00", "send itself - 100000 -", "its job send was killed"),
-        ("sender", "record itself 0 100000 1001.50", "record itself 0 100000 1000.40", "exited after 0.4 s, but must run for 1 s"),
+        (
+            "sender",
+            "record itself 0 100000 1001.50",
+            "record itself 0 100000 1000.40",
+            "exited after 0.4 s instead of 1 s",
+        ),
         ("sender", "ping itself 0", "ping asked 0", "its job ping was stopped by fieldkit before it had finished"),
     ],
 )

@@ -126,7 +126,10 @@ def fewer_frames(folder: Path) -> None:
             "lateness.txt: 3 packets were delivered too late, by up to 41.9 ms; the bound is 5 ms",
         ),
         (text("track.csv", "utc_ns"), "track.csv: is not a track of robots"),
-        (text("track.csv", track.text([]).replace("lines 0", "lines 1")), "track.csv: is truncated: it has 0 of 1 lines"),
+        (
+            text("track.csv", track.text([]).replace("lines 0", "lines 1")),
+            "track.csv: is truncated: it has 0 of 1 lines",
+        ),
         (text("link.csv", "utc_ns"), "link.csv: is not a file of link samples"),
         (text("lateness.txt", "bound"), "lateness.txt: is not a file of packet lateness"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),

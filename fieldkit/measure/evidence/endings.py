@@ -96,7 +96,7 @@ def termination_error(ending: Ending, allowed: Collection[Cause], min_duration_s
         and ending.duration_s is not None
         and ending.duration_s + _TOLERANCE_S < min_duration_s
     ):
-        return f"exited after {ending.duration_s:.1f} s, but must run for {min_duration_s:g} s"
+        return f"exited after {ending.duration_s:.1f} s instead of {min_duration_s:g} s"
     return None
 
 

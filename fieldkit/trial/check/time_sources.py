@@ -95,6 +95,6 @@ def contradictions(times: Mapping[str, RobotTime]) -> Iterator[str]:
             second_time.offset.offset_s - first_time.offset.offset_s,
             second_time.offset.error_s + first_time.offset.error_s,
         )
-        reports = clock_states.chosen(first_time.reports), clock_states.chosen(second_time.reports)
+        reports = clock_states.choose_report(first_time.reports), clock_states.choose_report(second_time.reports)
         if sentence := clock_states.contradiction((first, second), reports, measured):
             yield sentence

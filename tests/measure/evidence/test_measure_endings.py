@@ -44,7 +44,7 @@ def test_other_lines_are_ignored(line: str) -> None:
         ("job limit 137 100 9.00", {Cause.LIMIT}, 15.0, None),
         ("job asked 0 100 9.00", {Cause.EXITED}, 0.0, "was stopped by fieldkit before it had finished"),
         ("job itself 0 100 15.95", {Cause.EXITED}, 15.0, None),
-        ("job itself 0 100 9.00", {Cause.EXITED}, 15.0, "exited after 8.0 s, but must run for 15 s"),
+        ("job itself 0 100 9.00", {Cause.EXITED}, 15.0, "exited after 8.0 s instead of 15 s"),
         ("job itself - 100 -", {Cause.EXITED}, 15.0, "was killed"),
         ("job running - 100 -", {Cause.EXITED}, 0.0, "was still running when the evidence was collected"),
     ],
