@@ -90,7 +90,7 @@ def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tupl
             continue
         for transfer in planned_evidence.transfers(plan, Protocol(evidence.repeats.texts["protocol"][row])):
             if (packets := fates.read(attempt, transfer)) is not None:
-                masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
+                masks.setdefault((transfer.name, transfer.protocol), []).append(packets.lost_or_repeated)
         if max(map(len, masks.values()), default=0) == max_lines:
             break
     return masks
@@ -110,7 +110,7 @@ def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
     )
 
 
-def _runs(marked: Mask) -> list[tuple[int, int]]:
+def _runs(lost_or_repeated: Mask) -> list[tuple[int, int]]:
     """Return the first column and the length of each run of marked columns."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
     return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]

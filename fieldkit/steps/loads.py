@@ -85,7 +85,7 @@ class LoadOptions(OverLink):
         reverse: bool = False,
         ports: tuple[tuple[int, int], ...] = (),
         duration_s: float | None = None,
-        until_ns: int | None = None,
+        receiver_end_ns: int | None = None,
     ) -> LoadStreams:
         """Return the packet filter of the load's data streams in captures.
 
@@ -94,7 +94,7 @@ class LoadOptions(OverLink):
             reverse: Whether the server sends.
             ports: As `LoadStreams.ports`.
             duration_s: As `FlowSchedule.duration_s`.
-            until_ns: As `FlowSchedule.until_ns`.
+            receiver_end_ns: As `FlowSchedule.receiver_end_ns`.
         """
         ends = [scene.link(role, self.over).address for role in (self.sender, self.receiver)]
         source, destination = reversed(ends) if reverse else ends
@@ -112,7 +112,7 @@ class LoadOptions(OverLink):
                 interval_s=self.interval_s(scene.protocol),
                 head_bytes=0 if reverse or carrier is Protocol.UDP else COOKIE_BYTES,
                 duration_s=duration_s,
-                until_ns=until_ns,
+                receiver_end_ns=receiver_end_ns,
             ),
         )
 

@@ -102,7 +102,7 @@ def udp_packets(packets: udp.UdpPackets) -> StampPairs:
 
 def udp_copies(packets: udp.UdpPackets) -> tuple[Ints, Ints]:
     """Return the indices of the packets of `udp_packets` among the sent and among the received packets."""
-    return _copies(packets.match, packets.chosen)
+    return _copies(packets.match, packets.is_transfer_packet)
 
 
 def tcp_frames(frames: tcp.TcpFrames) -> StampPairs:

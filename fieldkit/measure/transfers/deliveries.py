@@ -49,14 +49,14 @@ class FlowSchedule:
         interval_s: Sending interval of a flow with a fixed rate; 0 if the sender always has more to send.
         duration_s: Sending duration from the first payload on; None if the flow ends when everything is sent.
         size_bytes: Payload of a TCP flow; None if it is not known in advance.
-        until_ns: Time at which the receiving program ended, by the receiver's clock; None if unknown.
+        receiver_end_ns: Time at which the receiving program ended, by the receiver's clock; None if unknown.
         head_bytes: Bytes at the start of a TCP flow that belong to its setup.
     """
 
     interval_s: float = 0.0
     duration_s: float | None = None
     size_bytes: int | None = None
-    until_ns: int | None = None
+    receiver_end_ns: int | None = None
     head_bytes: int = 0
 
 
@@ -79,7 +79,7 @@ class Delivery:
     min_stall_s: float
 
 
-def of_udp(packets: UdpPackets, chosen: Mask, expected: FlowSchedule) -> Delivery:
+def udp_delivery(packets: UdpPackets, chosen: Mask, expected: FlowSchedule) -> Delivery:
     """Return the deliveries of datagrams.
 
     Args:
@@ -112,7 +112,7 @@ def arrivals_ns(packets: UdpPackets) -> Ints:
     return np.where(udp.complete(packets)[:-1], last_ns, NO_TIME)
 
 
-def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
+def tcp_delivery(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
     """Return the deliveries of one TCP connection in one direction.
 
     Args:
@@ -148,8 +148,8 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
     # A receiver of a known number of bytes waits for the rest until it is terminated.
     return (
         delivery
-        if expected.size_bytes is None or expected.until_ns is None
-        else replace(delivery, end_ns=expected.until_ns)
+        if expected.size_bytes is None or expected.receiver_end_ns is None
+        else replace(delivery, end_ns=expected.receiver_end_ns)
     )
 
 
@@ -198,8 +198,8 @@ def stream_delivery(
         return Delivery(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
     start_offset_ns, end_offset_ns = _sender_to_receiver_ns(pairs)
     end_ns = last_ns + end_offset_ns
-    if expected.duration_s is not None and expected.until_ns is not None:
-        end_ns = min(end_ns, expected.until_ns)
+    if expected.duration_s is not None and expected.receiver_end_ns is not None:
+        end_ns = min(end_ns, expected.receiver_end_ns)
     return Delivery(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
 
 

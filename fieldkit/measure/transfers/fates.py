@@ -25,14 +25,14 @@ class Fates:
     Attributes:
         sent_ns: Time of sending by the sender's clock, in the order of the capture. Shape (n,).
         sent_bytes: Offset of each sent packet in the payload, in bytes.
-        marked: Mask of the sent packets that were lost (UDP), or that repeat bytes sent before (TCP).
+        lost_or_repeated: Mask of the sent packets that were lost (UDP), or that repeat bytes sent before (TCP).
         received_ns: Time of arrival by the receiver's clock. Shape (m,).
         received_bytes: Offset of each received packet in the payload.
     """
 
     sent_ns: Ints
     sent_bytes: NDArray[np.int64]
-    marked: Mask
+    lost_or_repeated: Mask
     received_ns: Ints
     received_bytes: NDArray[np.int64]
 
@@ -78,7 +78,7 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
 
 def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
     packets = udp.match_transfer(sender, receiver, transfer)
-    chosen, sent_index = packets.chosen, packets.match.sent_index
+    chosen, sent_index = packets.is_transfer_packet, packets.match.sent_index
     if (chosen & packets.match.ambiguous).any():
         return None
     offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * chosen) - packets.sent.ip_payload_bytes
@@ -86,7 +86,7 @@ def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates 
     return Fates(
         sent_ns=packets.sent.time_ns[chosen],
         sent_bytes=offset_bytes[chosen],
-        marked=~packets.match.arrived[chosen],
+        lost_or_repeated=~packets.match.arrived[chosen],
         received_ns=packets.received.time_ns[received],
         received_bytes=offset_bytes[sent_index[received]],
     )
@@ -104,7 +104,7 @@ def _tcp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
     return Fates(
         sent_ns=sent.time_ns,
         sent_bytes=offset_bytes,
-        marked=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), offset_bytes[1:] < sent_up_to[:-1]),
+        lost_or_repeated=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), offset_bytes[1:] < sent_up_to[:-1]),
         received_ns=received.time_ns,
         received_bytes=received_offset_bytes,
     )
@@ -171,7 +171,7 @@ class _MatchedPackets:
     Attributes:
         sent: Packets in the sender's capture.
         received: Packets in the receiver's capture.
-        chosen: Mask of the sent packets that belong to the transfer.
+        is_transfer_packet: Mask of the sent packets that belong to the transfer.
         lost: As `SentPackets.lost`.
         sent_again: As `SentPackets.sent_again`.
         copies: Indices of matched sent packets, and of their copies among the received packets.
@@ -179,7 +179,7 @@ class _MatchedPackets:
 
     sent: Packets
     received: Packets
-    chosen: Mask
+    is_transfer_packet: Mask
     lost: MaskedArray
     sent_again: MaskedArray
     copies: tuple[Ints, Ints]
@@ -205,14 +205,14 @@ def read_sent_packets(evidence: AttemptEvidence, transfer: Transfer) -> SentPack
     if (delays := delay.packet_delays(pairs, sender, receiver, transfer)) is not None:
         delay_s[sent_index], error_s[sent_index] = delays
     return SentPackets(
-        sent_ns=np.ma.array(packets.sent.time_ns[packets.chosen]),
-        received_ns=received_ns[packets.chosen],
-        lost=packets.lost[packets.chosen],
-        sent_again=packets.sent_again[packets.chosen],
-        wire_bytes=np.ma.array(packets.sent.wire_bytes[packets.chosen]),
-        payload_bytes=np.ma.array(packets.sent.ip_payload_bytes[packets.chosen]),
-        delay_s=delay_s[packets.chosen],
-        delay_error_s=error_s[packets.chosen],
+        sent_ns=np.ma.array(packets.sent.time_ns[packets.is_transfer_packet]),
+        received_ns=received_ns[packets.is_transfer_packet],
+        lost=packets.lost[packets.is_transfer_packet],
+        sent_again=packets.sent_again[packets.is_transfer_packet],
+        wire_bytes=np.ma.array(packets.sent.wire_bytes[packets.is_transfer_packet]),
+        payload_bytes=np.ma.array(packets.sent.ip_payload_bytes[packets.is_transfer_packet]),
+        delay_s=delay_s[packets.is_transfer_packet],
+        delay_error_s=error_s[packets.is_transfer_packet],
     )
 
 
@@ -223,11 +223,11 @@ def _all_masked(rows: int, kind: type[np.generic]) -> MaskedArray:
 def _match_udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
     matched = udp.match_transfer(sender, receiver, transfer)
     # Each received packet that may be a copy may hide the loss of another packet.
-    hidden = np.append(matched.chosen, False)[matched.match.sent_index] & matched.match.possible_copy
+    hidden = np.append(matched.is_transfer_packet, False)[matched.match.sent_index] & matched.match.possible_copy
     return _MatchedPackets(
         sent=matched.sent,
         received=matched.received,
-        chosen=matched.chosen,
+        is_transfer_packet=matched.is_transfer_packet,
         lost=np.ma.array(~matched.match.arrived, mask=matched.match.ambiguous | hidden.any()),
         sent_again=_all_masked(len(matched.sent), np.bool_),
         copies=delay.udp_copies(matched),
@@ -243,7 +243,7 @@ def _match_tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _Match
     return _MatchedPackets(
         sent=matched.sent,
         received=matched.received,
-        chosen=matched.sent.tcp_payload_bytes > 0,
+        is_transfer_packet=matched.sent.tcp_payload_bytes > 0,
         lost=np.ma.array(lost, mask=ambiguous | match.possible_copy.any()),
         sent_again=np.ma.array(tcp.sent_again(matched)),
         copies=delay.tcp_copies(matched),

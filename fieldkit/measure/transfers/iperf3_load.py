@@ -255,10 +255,10 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     if load.protocol is Protocol.UDP:
         packets = _udp_packets(load, sender, receiver)
         masks = load.datagram_masks(packets.sent.where(packets.first))
-        return [deliveries.of_udp(packets, mask, load.expected) for mask in masks]
+        return [deliveries.udp_delivery(packets, mask, load.expected) for mask in masks]
     sent, received, reverse = load.forward(sender), load.forward(receiver), load.backward(sender)
     return [
-        deliveries.of_tcp(
+        deliveries.tcp_delivery(
             tcp.match_frames(
                 *(
                     frames.where((frames.sport == source_port) & (frames.dport == destination_port))

@@ -81,10 +81,10 @@ class Rates:
         }
 
 
-def of_udp(packets: udp.UdpPackets) -> Rates:
+def udp_rates(packets: udp.UdpPackets) -> Rates:
     """Return the rates of a UDP transfer."""
     sent_index = packets.match.sent_index
-    is_chosen = np.append(packets.chosen, False)[sent_index]  # the last entry is for match.NONE
+    is_chosen = np.append(packets.is_transfer_packet, False)[sent_index]  # the last entry is for match.NONE
     received, datagram = packets.received.where(is_chosen), np.append(packets.datagram, NONE)[sent_index[is_chosen]]
     time_ns = received.time_ns
     if not len(received) or (time_ns == NO_TIME).any():
@@ -99,7 +99,7 @@ def of_udp(packets: udp.UdpPackets) -> Rates:
     return Rates(throughput, float(time_ns[completes].max() - time_ns[first]) / 1e9, head_bytes)
 
 
-def of_tcp(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
+def tcp_rates(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
     """Return the rates of a TCP transfer; only the throughput if it has several connections.
 
     If offload joined segments into a frame, the headers of these segments are added.

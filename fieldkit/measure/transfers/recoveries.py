@@ -149,7 +149,7 @@ def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
     )
 
 
-def find(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecovery:
+def find_recovery(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecovery:
     """Return the effect of a fault on a stream; times are by the receiver's clock.
 
     Raises:
@@ -195,7 +195,7 @@ def measure(
     declared_columns = declare_columns(flow, kind)
     try:
         began_ns, ended_ns = _fault_times_at(times, role)
-        streams = [find(delivery, began_ns, ended_ns) for delivery in deliveries()]
+        streams = [find_recovery(delivery, began_ns, ended_ns) for delivery in deliveries()]
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:

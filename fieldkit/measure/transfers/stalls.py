@@ -96,7 +96,7 @@ def cross_checks(flow: str) -> tuple[CrossCheck, ...]:
     )
 
 
-def find(delivery: Delivery) -> Stalls:
+def find_stalls(delivery: Delivery) -> Stalls:
     """Return the stalls of a stream.
 
     Raises:
@@ -137,7 +137,7 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
     """
     declared_columns = declare_columns(flow, flow, 0)
     try:
-        streams = [find(delivery) for delivery in deliveries()]
+        streams = [find_stalls(delivery) for delivery in deliveries()]
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:
@@ -160,7 +160,7 @@ def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) 
     """
     return FlowSchedule(
         size_bytes=evidence.read_or_none(reading.size, transfer.sent_file),
-        until_ns=robot_clock.job_end_ns(evidence, transfer.destination, listener),
+        receiver_end_ns=robot_clock.job_end_ns(evidence, transfer.destination, listener),
     )
 
 
@@ -181,12 +181,12 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
 
 
 def udp_deliveries(packets: UdpPackets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of a UDP transfer; errors as `deliveries.of_udp`."""
-    return [deliveries.of_udp(packets, packets.is_transfer[:-1], schedule)]
+    """Return the deliveries of a UDP transfer; errors as `deliveries.udp_delivery`."""
+    return [deliveries.udp_delivery(packets, packets.is_transfer_datagram[:-1], schedule)]
 
 
 def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of each connection of a TCP transfer; errors as `deliveries.of_tcp`.
+    """Return the deliveries of each connection of a TCP transfer; errors as `deliveries.tcp_delivery`.
 
     Args:
         frames: Frames of the connections in both captures.
@@ -195,9 +195,9 @@ def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) 
     """
     ports = np.unique(frames.sent.sport)
     if len(ports) == 1:
-        return [deliveries.of_tcp(frames, answers.where(answers.dport == ports[0]), schedule)]
+        return [deliveries.tcp_delivery(frames, answers.where(answers.dport == ports[0]), schedule)]
     return [
-        deliveries.of_tcp(
+        deliveries.tcp_delivery(
             tcp.match_frames(
                 frames.sent.where(frames.sent.sport == port), frames.received.where(frames.received.sport == port)
             ),

@@ -63,14 +63,14 @@ class UdpPackets:
     port: int
 
     @property
-    def is_transfer(self) -> Mask:
+    def is_transfer_datagram(self) -> Mask:
         """Mask of the transfer's datagrams; the last entry is for `NO_DATAGRAM`. Shape (k + 1,)."""
         return np.append(self.sent.dport[self.first] == self.port, False)
 
     @property
-    def chosen(self) -> Mask:
+    def is_transfer_packet(self) -> Mask:
         """Mask of the transfer's sent packets, including later fragments. Shape (n,)."""
-        return self.is_transfer[self.datagram]
+        return self.is_transfer_datagram[self.datagram]
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> Ud
 def count(packets: UdpPackets) -> UdpCounts:
     """Return the counts of a UDP transfer."""
     sent, received, matched = packets.sent, packets.received, packets.match
-    arrived, chosen = matched.arrived, packets.chosen
+    arrived, chosen = matched.arrived, packets.is_transfer_packet
     complete_datagrams = complete(packets)
     payload = payload_bytes(sent)
     received_chosen = np.append(chosen, False)[matched.sent_index]  # the last entry is for match.NONE
@@ -139,8 +139,8 @@ def count(packets: UdpPackets) -> UdpCounts:
         possible_copies=int((received_chosen & matched.possible_copy).sum()),
         loss_bursts=len(bursts) if bursts_known else None,
         longest_burst=int(bursts.max(initial=0)) if bursts_known else None,
-        datagrams_sent=int(packets.is_transfer.sum()),
-        datagrams_received=int((packets.is_transfer & complete_datagrams).sum()),
+        datagrams_sent=int(packets.is_transfer_datagram.sum()),
+        datagrams_received=int((packets.is_transfer_datagram & complete_datagrams).sum()),
         bytes_sent=int(payload[chosen].sum()),
         bytes_received=int(payload[chosen & arrived].sum()),
         transfer_s=span_s(time_ns, np.ones(len(time_ns), dtype=np.bool_)),

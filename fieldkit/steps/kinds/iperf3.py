@@ -286,7 +286,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             reverse=self.reverse,
             ports=ports,
             duration_s=self._duration_s if self.size is None else None,
-            until_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
+            receiver_end_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
         )
 
     def _report(self, view: View, role: Role) -> IperfTest | None:
