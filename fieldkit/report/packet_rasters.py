@@ -110,7 +110,7 @@ def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
     )
 
 
-def _runs(lost_or_repeated: Mask) -> list[tuple[int, int]]:
+def _runs(marked: Mask) -> list[tuple[int, int]]:
     """Return the first column and the length of each run of marked columns."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
     return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]

@@ -99,7 +99,10 @@ def test_marked_tcp_frames_equal_the_count_of_retransmissions(tmp_path: Path) ->
     packet_fates = fates.read(AttemptEvidence(tmp_path), transfer)
     assert packet_fates is not None
     sender, receiver = (pcap.read(tmp_path / name).packets for name in ("sender.pcap", "receiver.pcap"))
-    assert packet_fates.lost_or_repeated.sum() == tcp.count(tcp.match_transfer(sender, receiver, transfer)).retransmitted_frames
+    assert (
+        packet_fates.lost_or_repeated.sum()
+        == tcp.count(tcp.match_transfer(sender, receiver, transfer)).retransmitted_frames
+    )
     assert packet_fates.sent_bytes[0] == packet_fates.sent_bytes.min()
 
 

@@ -18,7 +18,7 @@ from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence import reading
 
 PLACED: Final = "as placed"
-"""Frame of the procedure's placement in metres: from the sender towards the receiver, and to the left of this axis."""
+"""Frame of the procedure's placement in metres: from the sender towards the receiver, and to the left."""
 WGS84: Final = "WGS 84"
 """Frame of latitude and longitude in degrees and height above the ellipsoid in metres."""
 LOCAL: Final = "metres"

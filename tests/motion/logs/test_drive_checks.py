@@ -164,7 +164,10 @@ def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: boo
     reason = recorded_positions.travel_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
     assert (reason is None) is agrees
     if reason:
-        assert reason == f"it was 2.0 m from its start according to its odometry, but {far_m:.1f} m according to track.csv"
+        assert (
+            reason
+            == f"it was 2.0 m from its start according to its odometry, but {far_m:.1f} m according to track.csv"
+        )
 
 
 def test_the_deviation_at_a_corner_is_the_straight_distance() -> None:
