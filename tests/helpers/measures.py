@@ -11,7 +11,7 @@ from fieldkit.measure.evidence import oracle_delays, outage, ping, tcpdump_log, 
 from fieldkit.measure.transfers import transfer_columns as of_transfers
 from fieldkit.measure.transfers import transfer_measures
 from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.trial.columns import measures
+from fieldkit.trial.columns import measured_columns
 
 
 class Measures(dict[str, Any]):
@@ -26,7 +26,7 @@ class Measures(dict[str, Any]):
         return self.get(name)
 
 
-COLUMNS = frozenset(column.name for column in measures())
+COLUMNS = frozenset(column.name for column in measured_columns())
 
 
 def all_columns(figures_by_column: Measures) -> dict[str, Any]:

@@ -83,7 +83,7 @@ LARGEST_ERROR: Final = 0.1
 """Maximum error of a one-way delay as a share of the delay. With a larger error, the delay is withheld."""
 
 UNSTEADY: Final = (
-    "a clock was set during the attempt, or drifts by more than 500 ppm: no offset and drift fit all packets"
+    "no offset and drift fit all times: a clock was set during the attempt, or drifts by more than 500 ppm"
 )
 """Reason why no times of a transfer are known. Times by a single clock are also unknown, because any of the two
 clocks may be wrong.

@@ -29,7 +29,9 @@ def document(version: str, test: str, end: str) -> Any:  # noqa: ANN401 (of JSON
 def order(test: str) -> IperfSettings:
     tcp = test == "tcp"
     protocol = Protocol.TCP if tcp else Protocol.UDP
-    return IperfSettings(protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), lasts_s=3.0)
+    return IperfSettings(
+        protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), duration_s=3.0
+    )
 
 
 def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (of JSON)

@@ -131,7 +131,7 @@ def test_times_that_are_not_covered_are_missing_with_a_reason(
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
     write_bag(attempt, AWAY[:2] + AWAY[3:])
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
-    reason = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
+    reason = "the positions of the receiver from /where have a gap of 2.0 s, but at most 1.5 s are allowed"
     assert mean_m(attempt) == reason
 
 
