@@ -203,13 +203,13 @@ class CosimulatedMedium(MediumServer):
         session = self._session
         assert session is not None
         end_ns = self._clock.monotonic_ns(window.end_ns)
-        if window.ended:
+        if window.decided_fates:
             delivered = session.agents.delivered
-            arrived = [fate for fate in window.ended if fate.arrived_ns is not None]
+            arrived = [fate for fate in window.decided_fates if fate.arrived_ns is not None]
             for fate, packet in zip(arrived, delivered, strict=True):
                 self._write(session, fate, packet, window.end_ns, end_ns)
             delivered.clear()
-            for fate in window.ended:
+            for fate in window.decided_fates:
                 session.remove_packet(fate.packet)
         lag_ns = time.monotonic_ns() - end_ns
         self._late_windows[round_up(max(lag_ns, 0))] += 1
