@@ -1,6 +1,6 @@
-"""Where many tasks run: processes of this machine, or the workers of a Dask cluster.
+"""Choose where tasks run: in processes of this machine, or on the workers of a Dask cluster.
 
-Both are a `concurrent.futures.Executor`. `tasks` submits to it.
+Both are a `concurrent.futures.Executor`, to which `tasks` submits the tasks.
 """
 
 import os
@@ -45,9 +45,9 @@ class Workers:
             LinkError: The scheduler of the cluster does not answer.
         """
         if self.cluster:
-            from fieldkit.core.cluster import ClusterExecutor  # noqa: PLC0415 (a second, and an optional package)
+            from fieldkit.core.cluster import ClusterExecutor  # noqa: PLC0415 (takes 1 s, and needs an optional package)
 
             return ClusterExecutor(self.cluster)
-        from fieldkit.core.processes import LocalProcesses  # noqa: PLC0415 (with multiprocessing, 20 ms)
+        from fieldkit.core.processes import LocalProcesses  # noqa: PLC0415 (imports multiprocessing, 20 ms)
 
         return LocalProcesses(self.processes(tasks))

@@ -256,7 +256,7 @@ main() {
     [ $# -gt 0 ] && shift
     case $verb in
         sample | health | poll) "$verb" "$@" ;;
-        snapshot) snapshot "$base/.sources-$$" - ;;
+        snapshot) snapshot "$base/.sources-$$" - - ;;
         start | run | serve) launch "$verb" "$@" ;;
         wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
         end) [ ! -d "$1" ] || end "$1" ;;
