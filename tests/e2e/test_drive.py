@@ -474,7 +474,11 @@ def command_line(pid: int) -> list[bytes]:
 
 
 FAR_M = 3.0
-AFTER = DRIVE.replace("repeats: 1\nattempts: 1", "repeats: 2\nattempts: 2").replace("away: 20m", f"away: {FAR_M:g}m")
+AFTER = (
+    DRIVE.replace("repeats: 1\nattempts: 1", "repeats: 2\nattempts: 2")
+    .replace("away: 20m", f"away: {FAR_M:g}m")
+    .replace("count: 150", "count: 50")  # twice the time for the path
+)
 RESUME = ("--yes", "--allow-motion")
 
 
