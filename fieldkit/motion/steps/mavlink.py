@@ -95,7 +95,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         during: Steps that run at the same time.
     """
 
-    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.OF_POSITIONS)
+    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.POSITION_CHECKS)
 
     robot: Role
     at: Role | None = None
@@ -235,7 +235,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         mavlink = mavlink_of(scene.robot(self.robot).profile)
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
-            yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)
+            yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, has_other_listener=True)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:

@@ -109,21 +109,21 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         end_options = ("-t", f"{self._duration_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
         client = self.client(scene, *end_options, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
-        yield self._planned(scene, self.receiver, "server", self.server("-i", "1", "--json"))
-        yield self._planned(scene, self.sender, "client", client)
+        yield self._planned_job(scene, self.receiver, "server", self.server("-i", "1", "--json"))
+        yield self._planned_job(scene, self.sender, "client", client)
 
-    def _planned(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:
-        serves = role == self.receiver
+    def _planned_job(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:
+        is_server = role == self.receiver
         job = Job(
             folder=scene.folder,
             name=self.prefixed_name(f"iperf3-{name}"),
             argv=argv,
-            limit_s=self.limit + _SERVER_EXIT_S * serves,
+            limit_s=self.limit + _SERVER_EXIT_S * is_server,
             log=self._log(role),
             stdout=self._json(role),
-            ready=jobs.ready_when_bound(Protocol.TCP, self.port) if serves else None,
+            ready=jobs.ready_when_bound(Protocol.TCP, self.port) if is_server else None,
         )
-        least_s = 0.0 if serves or self.size is not None else self._duration_s
+        least_s = 0.0 if is_server or self.size is not None else self._duration_s
         return Planned(role, job, program=PROGRAM, least_s=least_s)
 
     @override
@@ -237,7 +237,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
                 receiver_counters=view.evidence.counters(self.destination),
             )
             flow = self._flow(view, source_test, destination_test)
-            yield from load_checks.find(flow, source_test, destination_test, load_evidence)
+            yield from load_checks.find_contradictions(flow, source_test, destination_test, load_evidence)
         interface = view.scene.link(self.destination, self.over).interface
         interface_bytes = view.evidence.interface_bytes(self.destination, interface)
         payload_bytes = sum(interval.payload_bytes for interval in destination_test.intervals)
@@ -287,8 +287,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             view.scene,
             reverse=self.reverse,
             ports=ports,
-            lasts_s=self._duration_s if self.size is None else None,
-            until_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
+            duration_s=self._duration_s if self.size is None else None,
+            receiver_end_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
         )
 
     def _report(self, view: View, role: Role) -> IperfTest | None:
