@@ -14,7 +14,7 @@ from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.conformance.probe import Target
-from sim_backends.federates.conformance.suite import CheckResult, run_checks
+from sim_backends.federates.conformance.suite import ConformanceResult, run_checks
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import Hello
 from sim_backends.federates.named import named_federate
@@ -105,7 +105,7 @@ def _is_federate_with_role(endpoint: str, role: int) -> bool:
         return False
 
 
-def _show(result: CheckResult) -> None:
+def _show(result: ConformanceResult) -> None:
     state = "FAILED" if result.failure else "skipped" if result.skipped else "passed"
     print_text(f"{state:7}  {result.name}: {result.meaning}")
     for label, text in (
