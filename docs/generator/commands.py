@@ -127,7 +127,8 @@ def _is_listed(action: argparse.Action) -> bool:
 
 
 def _invocation(action: argparse.Action) -> str:
-    metavar = action.metavar or ("" if action.nargs == 0 else (action.dest if not action.choices else ""))
+    default_metavar = action.dest.upper() if action.option_strings else action.dest
+    metavar = action.metavar or ("" if action.nargs == 0 or action.choices else default_metavar)
     value = metavar if isinstance(metavar, str) else " ".join(metavar)
     if action.choices and not action.metavar:
         value = "{" + ",".join(map(str, action.choices)) + "}"
