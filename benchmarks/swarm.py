@@ -51,7 +51,7 @@ REFERENCE: Final = {
     "start_s": ("", "0.11", "0.30", "0.50"),
     "pss_mb": ("", "3.2", "2.5", "2.4"),
 }
-"""EMANE 1.5.3 on 2 quiet cores, nodes without SSH server or sensors; TCP by RF Pipe and Comm Effect."""
+"""EMANE 1.5.3 on 2 idle cores, with nodes without SSH server or sensors; TCP over RF Pipe and Comm Effect."""
 
 SENDER_SCRIPT: Final = f"""
 import socket, sys, time
@@ -157,7 +157,7 @@ def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: i
 
 
 def measure_startup(size: int) -> Figures:
-    """Return the start-up cost of `size` whole robots, including the lab, and the mean memory of a robot."""
+    """Return the start-up cost of `size` robots with their services and the lab, and the mean memory of a robot."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key)

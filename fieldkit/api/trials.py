@@ -245,7 +245,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", us
 
     Args:
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
-        rebuild: Whether to measure the raw evidence again instead of reading trial.csv; nothing is written.
+        rebuild: True to compute values from the raw evidence instead of reading trial.csv; nothing is written.
         where: Condition of the attempts to use, `distance_m < 20 and topology == "master"`; empty for all.
         use_index: Whether to read many tables from an index in the user's cache; the result is the same.
 

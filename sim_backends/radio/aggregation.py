@@ -20,7 +20,7 @@ QOS_HEADER_BYTES: Final = HEADER_BYTES + 2
 """Headers of a QoS data frame: 9.2.4.5."""
 
 TYPICAL_FRAMES: Final = 16
-"""Number of frames per aggregate for which rate control compares modes. Our choice, between 1 and the window."""
+"""Number of frames per aggregate for which rate control compares modes. An assumption, between 1 and the window."""
 
 _DELIMITER_BYTES: Final = 4
 MAX_PPDU_NS: Final = 5_484_000

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit lab`."""
-    parser.description = "Emulated robots that stay up until they are taken down: one lab per directory."
+    parser.description = "Emulated robots that run until they are stopped; a directory can have one lab."
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser(
         "up",
@@ -40,9 +40,9 @@ def add(parser: Parser) -> None:
         "user, in memory if there is /run/user. The lab exists as long as its process.",
     )
     shared.add_robots(action)
-    action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
+    action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random draws (default 1)")
     action.add_choice("--wifi", ("model", "linux"), help="Wi-Fi of the robots (default: the site file's, or model)")
-    action.add_argument("--foreground", action="store_true", help="keep this terminal; Ctrl-C takes the robots down")
+    action.add_argument("--foreground", action="store_true", help="run in this terminal; Ctrl-C stops the robots")
     action.set_defaults(run=up)
     listing = actions.add_parser(
         "ps",
