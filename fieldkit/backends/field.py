@@ -39,7 +39,10 @@ class FieldBackend:
     lab_bytes: Final = 0
 
     def __init__(
-        self, site: Site | None, document: Document | None, ask: passwords.Ask = passwords.at_terminal
+        self,
+        site: Site | None,
+        document: Document | None,
+        ask: passwords.PasswordSource = passwords.read_from_terminal,
     ) -> None:
         if site is None or document is None:
             raise ConfigurationError(
@@ -125,7 +128,7 @@ class FieldBackend:
             self._passwords[name],
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
-            on_air=self._site.control is Control.RADIO,
+            crosses_radio=self._site.control is Control.RADIO,
         )
 
 

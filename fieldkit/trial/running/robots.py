@@ -210,7 +210,7 @@ class Robots:
                 into,
                 expected_bytes=expected_bytes,
                 progress=progress,
-                foreign=partial(self._owners.refusal, role),
+                forbidden_reason=partial(self._owners.refusal, role),
             )
         except LinkError as error:
             return error.located, True

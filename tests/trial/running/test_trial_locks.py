@@ -63,7 +63,7 @@ def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> N
         begin(robot, ANNA)
         with (
             pytest.raises(
-                RobotError, match=r"turtlebot-1: anna@one holds it since \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
+                RobotError, match=r"turtlebot-1: anna@one locked it at \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
             ) as caught,
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
@@ -182,7 +182,7 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
         assert jobs.list_running(robot, Deadline.after(30)) == ()
-        with pytest.raises(RobotError, match="comes too late"):
+        with pytest.raises(RobotError, match="cannot start: the jobs of"):
             jobs.run(robot, Job(folder=FOLDER, name="ping", argv=("true",), limit_s=5, log="log"))
         with pytest.raises(
             LockLostError, match=r"^turtlebot-1: the trial was aborted by bert@two at \d\d:\d\d:\d\d UTC"
@@ -240,7 +240,7 @@ def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> Non
             path.unlink()
         begin(robot, ANNA)
         with (
-            pytest.raises(RobotError, match=r"somebody holds it since .*, for trial-a"),
+            pytest.raises(RobotError, match=r"unknown-user locked it at .*, for trial-a"),
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
