@@ -178,8 +178,8 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
             limitations.append(error.located)
     if len(selected_sources) < len(plans):
         limitations.append(
-            f"Packets, replies and the time line are of {len(selected_sources)} of {len(plans)} trials, chosen evenly "
-            "over the conditions; all other figures are of all trials. To choose other trials: --where."
+            f"Packets, replies and the time line are of {len(selected_sources)} of {len(plans)} trials, chosen "
+            "evenly over the conditions; all other figures are of all trials. To choose other trials: --where."
         )
     return Evidence(
         repeats, MappingProxyType(plans), tuple(limitations), frozenset(changed_folders), frozenset(selected_sources)
