@@ -99,7 +99,7 @@ class CampaignRun:
         adjustment_lines = (
             line for trial in remaining for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        shortfall_lines = (line for trial in remaining for line in shortfalls.of_plan(self._plans[trial]))
+        shortfall_lines = (line for trial in remaining for line in shortfalls.undecidable_expectations(self._plans[trial]))
         for line in dict.fromkeys((*adjustment_lines, *shortfall_lines)):
             self._sink(Note(line))
 
@@ -167,7 +167,7 @@ class CampaignRun:
             require_cast(plan, cast)
         placement = place(plan, testbed, self._sink)
         progress = TrialProgress.SKIPPED if placement.answer.skip else TrialProgress.PLACED
-        self._journal.add(trial, progress, note=placement.answer.note, took_s=placement.took_s)
+        self._journal.add(trial, progress, note=placement.answer.note, took_s=placement.duration_s)
         if not placement.answer.skip:
             # A stopped trial is resumed by the campaign's command, so `report_resume` is False.
             if folder is None:
@@ -218,7 +218,7 @@ class CampaignRun:
         placement = TimeEstimate(placing_s, placing_s)
         finished_repeats = self._finished_repeats()
         return estimates.total(
-            part for trial in trials for part in (placement, estimates.of_trial(self._plans[trial], finished_repeats))
+            part for trial in trials for part in (placement, estimates.estimate_trial(self._plans[trial], finished_repeats))
         )
 
     def _finished_repeats(self) -> list[FinishedRepeat]:

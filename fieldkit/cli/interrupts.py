@@ -40,7 +40,7 @@ def interruptible() -> Iterator[Stop]:
         nonlocal stopping
         if stopping:
             if stop.motions.is_ordered:
-                stop.motions.abandon()
+                stop.motions.cancel_wait()
                 _write_message(_WAIT_CANCELLED)
             return
         if stop.motions.order_stop(_write_message):

@@ -11,6 +11,11 @@ if TYPE_CHECKING:
     from fieldkit.core.processes import WorkerExecutor
 
 
+def usable_processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 @dataclass(frozen=True)
 class Workers:
     """The choice of workers by the options `--jobs` and `--cluster`.
@@ -30,7 +35,7 @@ class Workers:
 
     def processes(self, tasks: int) -> int:
         """Return the number of processes on this machine for a number of tasks; 0 if a cluster runs them."""
-        return 0 if self.cluster else min(self.jobs or len(os.sched_getaffinity(0)), tasks)
+        return 0 if self.cluster else min(self.jobs or usable_processors(), tasks)
 
     def open(self, tasks: int) -> "WorkerExecutor":
         """Return an executor for a number of tasks.

@@ -87,6 +87,11 @@ sleep_for() { # sleep for $1 seconds; rounded up if `sleep` supports whole secon
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
 }
 
+sleep_before_poll() { # sleep before poll number $polls + 1: 2 ms, then 20 ms, because polling uses the processor
+    polls=$((polls + 1))
+    if [ "$polls" -le 10 ]; then sleep_for 0.002; else sleep_for 0.02; fi
+}
+
 sync_to_disk() { # flush files and folders $@ to the disk
     # Old versions of sync accept no names, and flush everything.
     sync "$@" 2>/dev/null || sync

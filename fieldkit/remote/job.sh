@@ -88,10 +88,9 @@ detach() {
 
 wait_until_ready() { # wait until the job in $meta is ready
     [ "$how" != run ] || ready=-
-    # A job with a condition needs at least 10 ms to be ready, and polling earlier would use the processor.
-    [ "$ready" = - ] && pause=0.002 || pause=0.01
     read_uptime
-    until_s=$((now + within))
+    until_s=$((now + within)) polls=0
+    [ "$ready" = - ] || sleep_for 0.01 # a job with a condition needs at least this time
     until [ -s "$meta/pid" ] && is_ready "$ready" "$log"; do
         if ended "$meta"; then
             [ -s "$meta/exit" ] || [ ! -e .ended ] || fail_late
@@ -108,8 +107,7 @@ $(tail -n 3 "$log" 2>/dev/null)"
             fail "job $name was not ready within $within s
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
-        sleep_for "$pause"
-        pause=0.002
+        sleep_before_poll
     done
     [ -s "$meta/exit" ] || [ ! -e .ended ] || fail_late
 }
@@ -172,11 +170,11 @@ stop() {
 
 reports_end() { # true if $log contains $end_text within $1 seconds, which shows that the job in $meta has finished its work
     read_uptime
-    until_s=$((now + $1))
+    until_s=$((now + $1)) polls=0
     until has_line_with "$log" "$end_text"; do
         read_uptime
         [ "$now" -le "$until_s" ] && alive "$meta" || return 1
-        sleep_for 0.002
+        sleep_before_poll
     done
     printf '' >"$meta/leaves"
 }
@@ -257,7 +255,7 @@ main() {
     [ $# -gt 0 ] && shift
     case $verb in
         sample | health | poll) "$verb" "$@" ;;
-        snapshot) snapshot "$base/.sources-$$" - ;;
+        snapshot) snapshot "$base/.sources-$$" - - ;;
         start | run | serve) launch "$verb" "$@" ;;
         wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
         end) [ ! -d "$1" ] || end "$1" ;;

@@ -30,13 +30,13 @@ stop_samplers() { # $1 role: stop the samplers of the link and of the sources of
 
 end_sampler() { # stop the sampler in $meta
     read_uptime
-    until_s=$((now + 2))
+    until_s=$((now + 2)) polls=0
     # A job that was just started may not have written its pid yet.
-    while [ ! -s "$meta/pid" ] && read_uptime && [ "$now" -le "$until_s" ]; do sleep_for 0.002; done
+    while [ ! -s "$meta/pid" ] && read_uptime && [ "$now" -le "$until_s" ]; do sleep_before_poll; done
     if alive "$meta"; then
         mark_stopped
         signal TERM
-        while alive "$meta" && read_uptime && [ "$now" -le "$until_s" ]; do sleep_for 0.002; done
+        while alive "$meta" && read_uptime && [ "$now" -le "$until_s" ]; do sleep_before_poll; done
         ! alive "$meta" || signal KILL
     fi
 }
