@@ -99,7 +99,9 @@ class CampaignRun:
         adjustment_lines = (
             line for trial in remaining for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        shortfall_lines = (line for trial in remaining for line in shortfalls.undecidable_expectations(self._plans[trial]))
+        shortfall_lines = (
+            line for trial in remaining for line in shortfalls.undecidable_expectations(self._plans[trial])
+        )
         for line in dict.fromkeys((*adjustment_lines, *shortfall_lines)):
             self._sink(Note(line))
 
@@ -218,7 +220,9 @@ class CampaignRun:
         placement = TimeEstimate(placing_s, placing_s)
         finished_repeats = self._finished_repeats()
         return estimates.total(
-            part for trial in trials for part in (placement, estimates.estimate_trial(self._plans[trial], finished_repeats))
+            part
+            for trial in trials
+            for part in (placement, estimates.estimate_trial(self._plans[trial], finished_repeats))
         )
 
     def _finished_repeats(self) -> list[FinishedRepeat]:

@@ -226,7 +226,9 @@ def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Ite
         if what.startswith("fault-") and what.endswith(_HEALS_SUFFIX) and kind in {str(fault) for fault in FaultKind}:
             note = step_prefixed(step, outage.note_file(FaultKind(kind)))
             lasted_s = evidence.read_or_none(outage.cause_duration_s, note) or 0.0
-            yield Activity(f"fault {_step_label(kind, step)}", recovery_ns - round(lasted_s * 1e9), recovery_ns, "lost")
+            yield Activity(
+                f"fault {_step_label(kind, step)}", recovery_ns - round(lasted_s * 1e9), recovery_ns, "lost"
+            )
             yield from _outage(times, evidence, role, FaultKind(kind), step)
 
 

@@ -181,7 +181,9 @@ def build_contents(
     identities = Identities(cells)
     row = repeat_to_draw(cells, evidence, repeat)
     ranking = Ranking(evidence)
-    first = list(dict.fromkeys(plain_name(quantity.name) for quantity in ranking.first(measured_in(cells))))
+    first = list(
+        dict.fromkeys(plain_name(quantity.name) for quantity in ranking.first_quantities(measured_in(cells)))
+    )
     is_crowded = bool(sweep) and len({identities.of(cell).rank for cell in cells}) > len(CYCLE)
     against_distance: list[ChartSection] = []
     sections: list[ChartSection] = []
@@ -344,7 +346,7 @@ def _tables_of_protocol(
     """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, steps, words."""
     lines = [(wording.place(cell, differing=differing), cell) for cell in cells]
     words = word_labels(cells)
-    first = ranking.first(measured_in(cells))
+    first = ranking.first_quantities(measured_in(cells))
     if lab_words := {name: label for name, label in words.items() if ranking.is_lab_declared(name)}:
         words = {name: label for name, label in words.items() if name not in lab_words}
     if first or lab_words:

@@ -59,7 +59,7 @@ def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
     """Yield the dot plot of all quantities without a chart against distance, if there are any."""
     ranking = Ranking(evidence)
     quantities = measured(cells)
-    first_quantities = ranking.first(quantities)
+    first_quantities = ranking.first_quantities(quantities)
     ordered_quantities = [
         *first_quantities,
         *(quantity for quantity in quantities if quantity not in first_quantities),

@@ -121,7 +121,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
     yield writer.repeats(cells, unmeasured)
-    first_quantities = writer.ranking.first(measured(cells))[:_MAX_FIRST]
+    first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST]
     for quantity in first_quantities:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
@@ -220,7 +220,9 @@ class _HeadlineWriter:
                 filter(None, (quantity.step if len(variants) > 1 else "", describe(cell, differing=self.differing)))
             )
 
-        return Headline(subject, [*_missing(missing, place), *_worst_and_best(values, place, is_whole=not missing)])
+        return Headline(
+            subject, [*_missing(missing, place), *_worst_and_best(values, place, has_all_values=not missing)]
+        )
 
 
 def _missing(
