@@ -154,7 +154,7 @@ def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None
     campaign_plan, journal = begin(lawn)
     with (
         journal.locked(campaign_plan),
-        pytest.raises(ConfigurationError, match="another fieldkit runs this campaign"),
+        pytest.raises(ConfigurationError, match="another fieldkit process runs this campaign"),
         CampaignJournal(journal.folder).locked(campaign_plan),
     ):
         raise AssertionError("two at once")

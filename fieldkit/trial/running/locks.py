@@ -53,7 +53,7 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
             stack.enter_context(runtime.hold_lock(f"trial-{word(holder.token)}"))
         except NameHeldError as error:
             raise ConfigurationError(
-                "another fieldkit runs this trial, or another trial of its session",
+                "another fieldkit process runs this trial, or another trial of its session",
                 where=holder.purpose,
                 remedy="wait until it has ended, or stop it",
             ) from error

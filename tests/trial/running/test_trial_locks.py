@@ -402,7 +402,7 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with locked_exclusively(cast, anna, sink=fail_on_event):
         with (
-            pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+            pytest.raises(ConfigurationError, match="another fieldkit process runs this trial"),
             locked_exclusively(cast, anna, sink=fail_on_event),
         ):
             raise AssertionError("two run it")
