@@ -1,4 +1,4 @@
-"""Headlines of a report: first missing results, then each quantity with its worst condition first."""
+"""Headlines of a report: first the missing results, then each quantity, its worst condition first."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -110,9 +110,10 @@ class Headline:
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
-    """Yield the outcomes of repeats, then the expected, the lab's, and each protocol's quantities.
+    """Yield the headline of the outcomes of repeats, then headlines of quantities.
 
-    Steps that differ only in their names share a headline, in which the step is part of the condition.
+    Quantities with an expectation and quantities that a lab declares come first, then the quantities of each
+    protocol. Steps that differ only in their names share a headline, in which the step is part of the condition.
 
     Args:
         cells: Conditions.
@@ -120,12 +121,12 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         unmeasured: Planned conditions without any attempt, in words.
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
-    yield writer.repeats(cells, unmeasured)
+    yield writer.repeats_headline(cells, unmeasured)
     first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST]
     for quantity in first_quantities:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
-        yield from writer.quantity(quantity.label, [quantity], group_cells)
+        yield from writer.quantity_headlines(quantity.label, [quantity], group_cells)
     for protocol, names in _PROTOCOL_QUANTITIES.items():
         protocol_cells = [cell for cell in cells if cell.key["protocol"] == protocol]
         topic_cells = [cell for cell in protocol_cells if with_plain_name(measured([cell]), _TOPIC_QUANTITIES[0])]
@@ -133,7 +134,7 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         for group_cells, quantity_names in ((topic_cells, _TOPIC_QUANTITIES), (other_cells, names)):
             for quantities_of_name in _existing_quantities(measured(group_cells), quantity_names):
                 if quantities_of_name[0] not in first_quantities:
-                    yield from writer.quantity(
+                    yield from writer.quantity_headlines(
                         _subject(quantities_of_name, protocol, group_cells is topic_cells),
                         quantities_of_name,
                         group_cells,
@@ -154,7 +155,7 @@ class _HeadlineWriter:
     ranking: Ranking
     differing: Collection[str]
 
-    def repeats(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
+    def repeats_headline(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
         """Return the number of valid repeats, and the conditions of the other repeats, the worst first."""
         silent = coverage.everything_lost(self.evidence.repeats)
         cell_counts = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
@@ -178,7 +179,9 @@ class _HeadlineWriter:
             lines.append(HeadlineLine("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
         return Headline("Repeats", lines)
 
-    def quantity(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
+    def quantity_headlines(
+        self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]
+    ) -> Iterator[Headline]:
         """Yield the headline of a quantity, or of its variants in several steps; one per payload size of pings."""
         if len(variants) > 1 or plain_name(variants[0].name) != "rtt_median_s":
             sizes = {size: None for quantity in variants for size in self._sizes(quantity, cells)}
@@ -249,7 +252,8 @@ def _worst_and_best(
     end_names = ("least", "most") if values[0][1].value < values[-1][1].value else ("most", "least")
     lines = [_line_of_value(values, text, place) for text in dict.fromkeys((worst, best))]
     return [
-        replace(line, extreme=end if len(values) > 1 else "") for line, end in zip(lines, end_names, strict=False)
+        replace(line, extreme=end_name if len(values) > 1 else "")
+        for line, end_name in zip(lines, end_names, strict=False)
     ]
 
 
