@@ -276,5 +276,5 @@ def _shell(
         private_key=running.private_key,
         patience_s=patience_s,
         notice=notice,
-        on_air=laptop is not None,
+        crosses_radio=laptop is not None,
     )

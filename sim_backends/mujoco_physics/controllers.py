@@ -10,7 +10,7 @@ from typing import Final, Protocol
 from sim_backends.mujoco_physics.chassis import Wheels
 from sim_backends.mujoco_physics.mjcf import quaternion
 from sim_backends.physics.body import Velocity
-from sim_backends.physics.differential_drive import checked_twist
+from sim_backends.physics.differential_drive import require_twist
 from sim_backends.physics.quadrotor import FlightTarget, Quadrotor, VelocityController
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 
@@ -82,7 +82,7 @@ class WheelController:
 
     def command(self, command: object) -> None:
         """Implement `Controller.command`."""
-        twist, limits = checked_twist(command), self._limits
+        twist, limits = require_twist(command), self._limits
         self._target = _clamp(twist.forward_m_s, limits.speed_m_s), _clamp(twist.turn_rad_s, limits.turn_rad_s)
 
     def tick(self, registers: Registers, elapsed_s: float) -> bool:

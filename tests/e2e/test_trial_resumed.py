@@ -115,7 +115,7 @@ def test_two_fieldkits_cannot_run_one_trial(tmp_path: Path) -> None:
     process = begin(tmp_path, "--record", "30s", until='"record"')
     second = resume(tmp_path)
     assert second.code == 2
-    assert "another fieldkit runs this trial" in second.err
+    assert "another fieldkit process runs this trial" in second.err
     for _ in range(2):
         process.send_signal(signal.SIGINT)
     process.terminate()

@@ -144,7 +144,7 @@ def up(arguments: argparse.Namespace) -> int:
         print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
-        daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, ready=announce)
+        daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, on_ready=announce)
         return 0
 
     def serve(detach: daemon.OnReady) -> int:
@@ -153,7 +153,7 @@ def up(arguments: argparse.Namespace) -> int:
             detach(lab_folder.log)
 
         try:
-            daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, ready=ready)
+            daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, on_ready=ready)
         except FieldkitError as error:
             show_error(str(error))
             return error.exit_code

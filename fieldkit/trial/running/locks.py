@@ -13,7 +13,7 @@ from fieldkit.core.events import Note, Sink
 from fieldkit.core.runtime import NameHeldError
 from fieldkit.core.threads import run_parallel
 from fieldkit.remote import jobs
-from fieldkit.remote.jobs import REPLY_S, Aborted
+from fieldkit.remote.jobs import REPLY_S, AbortResult
 from fieldkit.remote.script import call, word
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
@@ -53,7 +53,7 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
             stack.enter_context(runtime.hold_lock(f"trial-{word(holder.token)}"))
         except NameHeldError as error:
             raise ConfigurationError(
-                "another fieldkit runs this trial, or another trial of its session",
+                "another fieldkit process runs this trial, or another trial of its session",
                 where=holder.purpose,
                 remedy="wait until it has ended, or stop it",
             ) from error
@@ -150,7 +150,7 @@ def _unlock(shell: Shell, holder: Holder, sink: Sink) -> None:
         sink(Note(f"{shell.robot} stays locked until its lock expires: {error.what}"))
 
 
-def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, Aborted]:
+def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, AbortResult]:
     """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
 
     Args:
@@ -160,10 +160,10 @@ def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str
     return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], user), robots), strict=True))
 
 
-def _abort(robot: Shell | FieldkitError, user: str) -> Aborted:
+def _abort(robot: Shell | FieldkitError, user: str) -> AbortResult:
     if isinstance(robot, FieldkitError):
-        return Aborted(error=robot)
+        return AbortResult(error=robot)
     try:
         return jobs.abort(robot, word(user), Deadline.after(4 * REPLY_S))
     except FieldkitError as error:
-        return Aborted(error=error)
+        return AbortResult(error=error)

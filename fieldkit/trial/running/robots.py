@@ -111,7 +111,7 @@ class Robots:
             return {}
         from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-        return telemetry_queries.of_robots(cast)
+        return telemetry_queries.queries_by_role(cast)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
         """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
@@ -210,7 +210,7 @@ class Robots:
                 into,
                 expected_bytes=expected_bytes,
                 progress=progress,
-                foreign=partial(self._owners.refusal, role),
+                forbidden_reason=partial(self._owners.refusal, role),
             )
         except LinkError as error:
             return error.located, True

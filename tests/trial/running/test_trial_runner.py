@@ -352,7 +352,7 @@ def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     with (
         journal.locked(only(tmp_path)),
-        pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+        pytest.raises(ConfigurationError, match="another fieldkit process runs this trial"),
     ):
         rebuild(only(tmp_path))
 
