@@ -70,20 +70,20 @@ class EmaneLocations:
 
         Raises:
             FederateError: An agent has a command.
-            UnansweredError: There is no location of an agent in time.
+            UnansweredError: No location of an agent has arrived in time.
         """
         if commands:
             raise FederateError(
                 f"the physics emane does not move robots, and {', '.join(commands)} has a command",
                 remedy="remove the motion of the agents from the scenario",
             )
-        begun_s = time.monotonic()
+        start_s = time.monotonic()
         if self._started_s is None:
-            self._wait_for_all(begun_s + self._options.wait)
+            self._wait_for_all(start_s + self._options.wait)
             self._started_s = time.monotonic()
         while (events := self._listener.receive(self._started_s + to_ns / 1e9)) is not None:
             self._apply(events)
-        self.waited_s += time.monotonic() - begun_s
+        self.waited_s += time.monotonic() - start_s
         return dict(self._states)
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ class Ns3Options(SimulatorOptions):
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
         pcap: Beginning of the names of captures of 802.11 frames with radiotap, one per radio, for example
-            `air-{seed}-`; with an access point, their times have 1 s more.
+            `air-{seed}-`; with an access point, their time stamps are 1 s later.
     """
 
     standard: Literal["802.11a", "802.11g", "802.11n"] | None = None
@@ -48,7 +48,7 @@ class Ns3Options(SimulatorOptions):
             yield from ((text, ("traffic", number, key)) for text, key in self._unsupported_traffic(traffic))
 
     def _unsupported_traffic(self, traffic: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Yield why traffic is not supported by ns-3's transports, with its key."""
+        """Yield each reason why ns-3's transports do not support some traffic, with the key."""
         if traffic["protocol"] in {"ros1", "ros1-udp"}:
             yield "ns-3 has no ROS 1; set network.transports: builtin", "protocol"
         elif traffic["protocol"] == "topic":

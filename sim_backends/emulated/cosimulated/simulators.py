@@ -174,7 +174,6 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
 
 def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
     """Start the program of a network. Arguments and errors are those of `start_physics`, but with all stations."""
-
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported = network.welcome.transports
     if supported and not {UNICAST, BROADCAST} <= {*supported}:
