@@ -149,7 +149,7 @@ class EmulatedBackend:
     @property
     def lab_bytes(self) -> int:
         """Implement `Backend.lab_bytes`: fixed links have no transmission attempts to record."""
-        if not self._options.record_air or self._options.radio.fixed:
+        if not self._options.record_air or self._options.radio.is_fixed:
             return 0
         from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (random streams of numpy: 20 ms)
 

@@ -222,15 +222,15 @@ class EmulatedOptions(Strict):
 
     @schema.model_validator(mode="after")
     def _check_wifi(self) -> "EmulatedOptions":
-        excluded = {
+        excluded_options = {
             "physics": self.physics,
             "network": self.network,
             "mesh": self.mesh,
             "record_air": self.record_air,
             "links": self.links,
-            "radio": self.radio.fixed,
+            "radio": self.radio.is_fixed,
         }
-        for key, value in excluded.items():
+        for key, value in excluded_options.items():
             if self.has_linux_wifi and value:
                 name = "a fixed link (loss, delay, rate or jitter)" if key == "radio" else f"`{key}`"
                 raise schema.validation_error(f"`wifi: linux` cannot be combined with {name}", key)

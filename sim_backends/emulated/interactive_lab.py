@@ -190,16 +190,16 @@ def overview(
     )
     channel.move(0, places_m)
     names = list(members)
-    pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
+    pairs = [] if options.radio.is_fixed else list(combinations(range(len(names)), 2))
     first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
         LabLink(
             (names[first_index], names[second_index]),
             min(channel.snr_db(first_index, second_index), channel.snr_db(second_index, first_index)),
             channel.are_linked(first_index, second_index),
-            tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
+            tuple(dict.fromkeys(crossing.obstacle for crossing in crossings)),
         )
-        for (first_index, second_index), crossed in zip(pairs, world.crossings(first, second), strict=True)
+        for (first_index, second_index), crossings in zip(pairs, world.crossings(first, second), strict=True)
     ]
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]

@@ -128,7 +128,7 @@ class MujocoPhysics:
         self._absent = {row for row, lifetime in lifetimes.items() if lifetime.appears_ns >= self.step_ns}
         self._changes = sorted(_changes(lifetimes, self.step_ns), reverse=True)
         for row in self._absent:
-            self._place(row, parked=True)
+            self._place(row, is_parked=True)
         mujoco.mj_step1(self.model, self.data)
         self._pending_commands: dict[str, Any] = {}
         self._commands_step = 0
@@ -160,11 +160,11 @@ class MujocoPhysics:
             return self._rows
         return {name: row for name, row in self._rows.items() if row not in self._absent}
 
-    def _place(self, row: int, *, parked: bool) -> None:
+    def _place(self, row: int, *, is_parked: bool) -> None:
         """Place an agent at its start, or far away on flat ground, at rest."""
         first = int(self.model.jnt_qposadr[self.model.body(f"a{row}").jntadr[0]])
         pose = self.model.qpos0[first : first + 7].copy()
-        if parked:
+        if is_parked:
             pose[:3] = (_PARKED_M + _PARKED_APART_M * row, _PARKED_M, _PARKED_UP_M)
         self._set_pose(row, pose)
 
@@ -180,7 +180,7 @@ class MujocoPhysics:
         """Place the agents that appear at the present step, and park those that disappear."""
         while self._changes and self._changes[-1].step <= self._step:
             _, row, appears = self._changes.pop()
-            self._place(row, parked=not appears)
+            self._place(row, is_parked=not appears)
             if appears:
                 self._absent.discard(row)
                 continue
@@ -249,9 +249,9 @@ class MujocoPhysics:
             return
         self._due = set()
         for row in tuple(rows):
-            elapsed = min(step - self._last_tick_steps[row], self._tick_steps)
+            elapsed_steps = min(step - self._last_tick_steps[row], self._tick_steps)
             self._last_tick_steps[row] = step
-            if not self._controllers[row].tick(self._registers, elapsed * self.step_ns / 1e9):
+            if not self._controllers[row].tick(self._registers, elapsed_steps * self.step_ns / 1e9):
                 self._active.discard(row)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "MujocoPhysics":

@@ -36,7 +36,7 @@ class Ns3Options(SimulatorOptions):
 
     @override
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        if RadioOptions.model_validate(scenario["radio"]).fixed:
+        if RadioOptions.model_validate(scenario["radio"]).is_fixed:
             for key in ("standard", "ampdu_bytes", "pcap"):
                 if getattr(self, key):
                     yield f"fixed links have no Wi-Fi; remove {key}", ("network", "options", key)
@@ -67,7 +67,7 @@ class Ns3Options(SimulatorOptions):
         """Return `link` with the parameters of fixed links, or `jammers` with a position (or None) per fault."""
         scenario = configuration["scenario"]
         radio = RadioOptions.model_validate(scenario["radio"])
-        if radio.fixed:
+        if radio.is_fixed:
             return {"link": dataclasses.asdict(radio.link())}
         world = World.model_validate(configuration["world"])
         return {"jammers": [_jammer_m(fault, world) for fault in scenario["faults"]]}

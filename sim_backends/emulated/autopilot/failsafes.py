@@ -74,13 +74,13 @@ class Failsafes(Protocol):
     def arming_errors(self) -> list[str]:
         """Reasons why they prevent arming."""
 
-    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:
+    def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:
         """Process a heartbeat: system id and MAV_TYPE of its sender."""
 
-    def mode_changed(self, now_ns: int) -> None:
+    def on_mode_change(self, now_ns: int) -> None:
         """Record that a client has changed the mode, or that the vehicle was disarmed."""
 
-    def set_points_lost(self) -> None:
+    def on_lost_set_points(self) -> None:
         """Record that the vehicle has changed its mode because set-points are missing, which only PX4 does."""
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
@@ -116,16 +116,16 @@ class ArduCopterFailsafes:
         """Implement `Failsafes.arming_errors`."""
         return ["Battery failsafe"] * (self._stage > 0) + ["GCS failsafe on"] * self._gcs_lost
 
-    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any type counts)
-        """Implement `Failsafes.heartbeat`."""
+    def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any type counts)
+        """Implement `Failsafes.on_heartbeat`."""
         if system == self._parameters["SYSID_MYGCS"]:
             self._gcs_heartbeat_ns = now_ns
 
-    def mode_changed(self, now_ns: int) -> None:
-        """Implement `Failsafes.mode_changed`: nothing depends on the mode."""
+    def on_mode_change(self, now_ns: int) -> None:
+        """Implement `Failsafes.on_mode_change`: nothing depends on the mode."""
 
-    def set_points_lost(self) -> None:
-        """Implement `Failsafes.set_points_lost`: ArduCopter has no such failsafe."""
+    def on_lost_set_points(self) -> None:
+        """Implement `Failsafes.on_lost_set_points`: ArduCopter has no such failsafe."""
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
         """Implement `Failsafes.advance`."""
@@ -216,17 +216,17 @@ class Px4Failsafes:
         is_missing = self._parameters["NAV_DLL_ACT"] > 0 and (self._gcs_lost or self._gcs_heartbeat_ns is None)
         return ["No connection to the ground control station"] * is_missing
 
-    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any system counts)
-        """Implement `Failsafes.heartbeat`."""
+    def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any system counts)
+        """Implement `Failsafes.on_heartbeat`."""
         if kind == dialect.MAV_TYPE_GCS:
             self._gcs_heartbeat_ns = now_ns
 
-    def mode_changed(self, now_ns: int) -> None:  # noqa: ARG002
-        """Implement `Failsafes.mode_changed`: the failsafe ends."""
+    def on_mode_change(self, now_ns: int) -> None:  # noqa: ARG002
+        """Implement `Failsafes.on_mode_change`: the failsafe ends."""
         self._active, self._pending_change = False, None
 
-    def set_points_lost(self) -> None:
-        """Implement `Failsafes.set_points_lost`: the failsafe lasts until a client changes the mode."""
+    def on_lost_set_points(self) -> None:
+        """Implement `Failsafes.on_lost_set_points`: the failsafe lasts until a client changes the mode."""
         self._active = True
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:

@@ -37,8 +37,8 @@ class Battery:
     def advance(self, now_ns: int, *, motors_on: bool) -> None:
         """Reduce the charge by the consumption since the last call."""
         self.current_a = _HOVER_A if motors_on else _REST_A
-        used = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
-        self.charge, self._last_ns = max(min(self.min_charge, self.charge), self.charge - used), now_ns
+        consumption = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
+        self.charge, self._last_ns = max(min(self.min_charge, self.charge), self.charge - consumption), now_ns
 
     @property
     def used_mah(self) -> float:

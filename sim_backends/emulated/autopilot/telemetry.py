@@ -133,9 +133,9 @@ class Telemetry:
 
     def _sys_status(self) -> Message:
         battery = self._vehicle.battery
-        failed = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
+        failed_check = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
         return dialect.MAVLink_sys_status_message(
-            *(_SENSORS, _SENSORS, _SENSORS & ~failed),
+            *(_SENSORS, _SENSORS, _SENSORS & ~failed_check),
             *(200, _u16(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.charge * 100)),
             *(0,) * 6,
         )

@@ -83,7 +83,7 @@ class Vehicle(VehicleBase):
         if self.armed and self.firmware.is_ardupilot:
             self.report(_INFO, "Disarming motors")
         self.armed = False
-        self.failsafes.mode_changed(self.body.now_ns)
+        self.failsafes.on_mode_change(self.body.now_ns)
         if not self.firmware.is_ardupilot:  # ArduCopter keeps its mode
             self.mode = Mode.LOITER
 
@@ -120,7 +120,7 @@ class Vehicle(VehicleBase):
             self.accept_set_point(SetPoint(goal_m, is_place=True))
         else:
             self._fly_to(Mode.LOITER, goal_m)
-            self.failsafes.mode_changed(self.body.now_ns)
+            self.failsafes.on_mode_change(self.body.now_ns)
 
     def accept_set_point(self, set_point: SetPoint) -> None:
         """Accept a set-point for mode OFFBOARD.
@@ -143,7 +143,7 @@ class Vehicle(VehicleBase):
             Refused: The mission, the set-points or the flight that the mode requires is missing.
         """
         self._switch(mode)
-        self.failsafes.mode_changed(self.body.now_ns)
+        self.failsafes.on_mode_change(self.body.now_ns)
 
     def load(self, items: tuple[Item, ...]) -> None:
         """Load a new mission; a mission in flight is aborted, and the vehicle holds its position."""
@@ -273,7 +273,7 @@ class Vehicle(VehicleBase):
         elif not has_recent_set_point:
             self.report(_CRITICAL, "Failsafe activated")
             self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
-            self.failsafes.set_points_lost()
+            self.failsafes.on_lost_set_points()
         elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.limits)):
             self.report(_CRITICAL, "Geofence: hold")
             self._switch_automatically(Mode.LOITER)

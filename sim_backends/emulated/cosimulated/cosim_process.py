@@ -204,11 +204,11 @@ class CosimulatedMedium(MediumServer):
         assert session is not None
         end_ns = self._clock.monotonic_ns(window.end_ns)
         if window.ended:
-            delivered = session.agents.delivered
-            arrived = [fate for fate in window.ended if fate.arrived_ns is not None]
-            for fate, packet in zip(arrived, delivered, strict=True):
+            delivered_packets = session.agents.delivered_packets
+            arrived_fates = [fate for fate in window.ended if fate.arrived_ns is not None]
+            for fate, packet in zip(arrived_fates, delivered_packets, strict=True):
                 self._write(session, fate, packet, window.end_ns, end_ns)
-            delivered.clear()
+            delivered_packets.clear()
             for fate in window.ended:
                 session.remove_packet(fate.packet)
         lag_ns = time.monotonic_ns() - end_ns
@@ -277,9 +277,9 @@ class CosimulatedMedium(MediumServer):
     def _delays(self, request: Message) -> Message:
         source, destination = (self._ports[request[key]].address.ip for key in ("source", "destination"))
         flow = source, destination, request["protocol"], request["port"]
-        added = self._added_delays.delay_parts(*flow)
+        added_delay = self._added_delays.delay_parts(*flow)
         parts = self._flows.delay_parts(*flow)
-        return vars(replace(parts, policy_ns=added.processing_ns, undivided_ns=added.transmission_ns))
+        return vars(replace(parts, policy_ns=added_delay.processing_ns, undivided_ns=added_delay.transmission_ns))
 
     @override
     def _stats(self) -> MediumStats:

@@ -123,7 +123,7 @@ class LabPhysics:
     @property
     def states(self) -> Mapping[str, State]:
         """The present states, including changes by the lab since the last call of `advance`."""
-        return self._combined()
+        return self._combine_states()
 
     def limit_m_s2(self, name: str) -> float:
         """Return the acceleration limit of a station; 0 if no program drives it."""
@@ -144,7 +144,7 @@ class LabPhysics:
         self._now_ns = to_ns
         if self._has_changed:
             self._has_changed = False
-            self._states = self._combined()
+            self._states = self._combine_states()
         return self._states
 
     def close(self) -> None:
@@ -189,7 +189,7 @@ class LabPhysics:
                     flight = self._physics.flight_status(name)
                 steering.report(at_ns, self._physics_states[name], flight)
 
-    def _combined(self) -> Mapping[str, State]:
+    def _combine_states(self) -> Mapping[str, State]:
         states = dict(self._assigned_states)
         for name, steering in self._steerings.items():
             if steering.is_driven and self._physics is not None:

@@ -71,12 +71,12 @@ class RealAgents(Agents):
         devices: Their devices.
 
     Attributes:
-        delivered: The payloads of the packets that arrived since the list was cleared, in order.
+        delivered_packets: The payloads of the packets that arrived since the list was cleared, in order.
     """
 
     def __init__(self, physics: PhysicsFederate, devices: Devices) -> None:
         super().__init__(physics, {})
-        self.delivered: list[RealPacket] = []
+        self.delivered_packets: list[RealPacket] = []
         self._devices = devices
         self._reached_ns = 0
         self._numbers: dict[str, int] = {}
@@ -96,7 +96,7 @@ class RealAgents(Agents):
 
     @override
     def deliver(self, receiver: str, received: Received) -> None:
-        self.delivered.append(received.payload)
+        self.delivered_packets.append(received.payload)
 
     @property
     @override

@@ -159,7 +159,7 @@ class Medium(MediumServer):
         self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
 
     def _new_model(self) -> RadioModel[bytes]:
-        if self._options.fixed:
+        if self._options.is_fixed:
             return UniformLinks(self._seed, self._options)
         return WifiInWorld(self._seed, self._options, self._antennas, self._world)
 

@@ -287,7 +287,7 @@ def _motion_files(spec: RobotSpec) -> list[int]:
     inputs: list[tuple[Path, int]] = []
     if spec.simulated_flight:
         inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLIGHT, os.O_RDWR)]
-    elif spec.base is not None and spec.base.simulated:
+    elif spec.base is not None and spec.base.is_simulated:
         inputs = [(VELOCITY_COMMAND, os.O_RDONLY)]
     if not inputs:
         return [os.open(services.MOTION_RECORD, os.O_RDONLY | os.O_CREAT, 0o600)]

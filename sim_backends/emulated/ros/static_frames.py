@@ -31,8 +31,8 @@ def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
         return ()
     child_frames = [sensor.child_frame for sensor in sensors if sensor.child_frame]
     base = child_frames[0] if child_frames else BASE
-    excluded = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
-    frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded)
+    excluded_frames = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
+    frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded_frames)
     base_links = [(base, BASE)] if base != BASE else []
     return (*base_links, *((BASE, frame) for frame in frames))
 
