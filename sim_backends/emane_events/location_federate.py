@@ -39,7 +39,7 @@ class EmaneLocations:
 
     Attributes:
         step_ns: See `PhysicsFederate`.
-        limits_m_s2: See `PhysicsFederate`; unknown, as events may contain any location.
+        limits_m_s2: See `PhysicsFederate`; infinite, because events may contain any location.
         waited_s: Total time that it has waited, in seconds of wall time.
         path_losses_db: See `PhysicsFederate`. Like EMANE's receivers, it uses the forward loss in the events for a
             NEM, which is the path loss from the other NEM to this NEM, and ignores the reverse loss.

@@ -81,7 +81,7 @@ def fields_by_number(message: bytes, required: tuple[int, ...]) -> dict[int, Val
     """Return the values of the fields of a message by number; the last value, if a field is repeated.
 
     Raises:
-        MalformedEventError: As for `fields`, or a required field is missing.
+        MalformedEventError: See `fields`; or a required field is missing.
     """
     values = dict(fields(message))
     missing = [field for field in required if field not in values]

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
 
-# Measured on 2 cores: from the start of three robots until they publish topics.
+# Measured on 2 cores: time from the start of three robots until they publish topics.
 _START_S: Final = {RosChoice.BUILTIN: 0.5, RosChoice.DEBIAN: 1.0}
 
 

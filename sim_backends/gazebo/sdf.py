@@ -98,7 +98,7 @@ def world_sdf(
     _add_plugin(element, version, "Physics", "physics")
     _add_plugin(element, version, "UserCommands", "user-commands")
     _add_texts(_add_plugin(element, version, "SceneBroadcaster", "scene-broadcaster"), dynamic_pose_hertz=POSE_HZ)
-    _add_fence(element, world, version)
+    _add_command_reply(element, world, version)
     sun = SubElement(element, "light", type="directional", name="sun")
     _add_texts(sun, cast_shadows="true", pose="0 0 20 0 0 0", direction="-0.5 0.1 -0.9", diffuse="0.8 0.8 0.8 1")
     ground = _static_model(element, "ground_plane")
@@ -125,12 +125,12 @@ def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int,
     return tostring(root, encoding="unicode")
 
 
-def _add_fence(world: Element, parent: World, version: Version) -> None:
+def _add_command_reply(parent: Element, world: World, version: Version) -> None:
     """Add a plugin that answers the message after the commands of a window; the answer proves their reception."""
-    plugin = _add_plugin(world, version, "TriggeredPublisher", "triggered-publisher")
+    plugin = _add_plugin(parent, version, "TriggeredPublisher", "triggered-publisher")
     kind = "ignition.msgs.Empty" if version == "fortress" else "gz.msgs.Empty"
     for tag, topic in (("input", "fence"), ("output", "passed")):
-        SubElement(plugin, tag, type=kind, topic=f"/world/{parent.name}/fieldkit/{topic}")
+        SubElement(plugin, tag, type=kind, topic=f"/world/{world.name}/fieldkit/{topic}")
 
 
 def _add_plugin(parent: Element, version: Version, name: str, file: str) -> Element:
@@ -209,7 +209,7 @@ def _add_shape(
 
 
 def _add_inertia(link: Element, mass_kg: float, size_m: Vector, position_m: Vector = (0.0, 0.0, 0.0)) -> None:
-    """Add the mass and the inertia of a homogeneous box of a size."""
+    """Add the mass and the inertia of a homogeneous box of this size."""
     x, y, z = (size * size * mass_kg / 12 for size in size_m)
     inertial = SubElement(link, "inertial")
     _add_pose(inertial, position_m)

@@ -58,7 +58,8 @@ class WorldMonitor
     std::mutex mutex;
     std::condition_variable changed;
     int64_t clock_ns = -1, pose_ns = -1;
-    int64_t awaited_ns = -1; // time whose poses are awaited: earlier messages do not notify; -1: all messages do
+    // Time of the awaited poses: messages of earlier times do not notify. -1: all messages notify.
+    int64_t awaited_ns = -1;
     int repeated_clocks = 0;
     std::vector<Pose> poses;
     std::set<std::string> present; // models that have a pose

@@ -18,7 +18,7 @@ class Wheels:
 
     Attributes:
         axles_m: Positions of the axles, forward of the middle; each has a wheel on both sides.
-        track_m: Distance of the wheels on both sides.
+        track_m: Distance between the left and the right wheels.
         turning_track_m: Difference of the speeds of the two sides per yaw rate, as assumed by the robot's controller.
         radius_m: Radius of a wheel.
         width_m: Width of a wheel.

@@ -220,7 +220,7 @@ class _Document:
         """Add a quadrotor: a thrust along its axis, and torques towards the attitude of a body without mass."""
         inertia_kg_m2, centre_m = quadrotor_inertia_kg_m2(limits), (0.0, 0.0, limits.height_m / 2)
         _add_inertia(body, limits.mass_kg, centre_m, inertia_kg_m2)
-        # A cylinder that turns on a plane gets wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
+        # A cylinder that turns on a plane has wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
         half_axes_m = (limits.radius_m, limits.radius_m, limits.height_m / 2)
         shape = f"{name}b"
         _add(body, "geom", name=shape, type="ellipsoid", size=_text(half_axes_m), pos=_text(centre_m))

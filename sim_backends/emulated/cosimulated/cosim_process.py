@@ -56,7 +56,7 @@ _START_NS: Final = 5_000_000
 
 
 class _NewSession(BaseException):
-    """Ends the coordinator of an old session."""
+    """Raised to end the coordinator of an old session."""
 
 
 class CosimulatedMedium(MediumServer):

@@ -41,7 +41,7 @@ class Placing(PhysicsFederate, Protocol):
 
 @runtime_checkable
 class Flying(PhysicsFederate, Protocol):
-    """A physics that flies drones by the commands of their autopilots."""
+    """A physics that moves drones according to the commands of their autopilots."""
 
     def flight_status(self, name: str) -> FlightStatus:
         """Return attitude and support of a drone at its present state."""
@@ -49,7 +49,7 @@ class Flying(PhysicsFederate, Protocol):
 
 
 StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
-"""Starts a physics with the robots at these states of their antennas; its time begins at 0."""
+"""Starts a physics with the robots at these states of their antennas; its time starts at 0."""
 
 
 class LabPhysics:

@@ -67,7 +67,7 @@ class RealAgents(Agents):
     most one step of the physics. If there is no event, they get the time of that step.
 
     Args:
-        physics: Moves the robots, also by the commands of their programs.
+        physics: Moves the robots, and receives the commands of their programs.
         devices: Their devices.
 
     Attributes:

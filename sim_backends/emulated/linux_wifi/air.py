@@ -223,7 +223,7 @@ class Air:
         world: Obstacles; None for open ground.
 
     Raises:
-        ValueError: There is no radio, or one has the empty name.
+        ValueError: There is no radio, or the name of a radio is empty.
     """
 
     def __init__(

@@ -129,7 +129,7 @@ def uncompressed_kernel(image: bytes) -> bytes:
     payload = image[start : start + size]
     if not payload.startswith(b"\xfd7zXZ\0"):
         return image
-    # The payload ends with its uncompressed size, which the decompressor leaves out.
+    # The payload ends with its uncompressed size, which the decompressor does not expect.
     return lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(payload)
 
 

@@ -164,8 +164,8 @@ class Init:
                 self._supervisor.reap()
             if self._channel.fileno() in readable:
                 is_connected = self._serve()
-        # Until the interface is down, hwsim stores frames without a status, and these prevent that the kernel removes
-        # this network namespace.
+        # Until the interface is down, hwsim stores frames without a status, and these prevent the kernel from
+        # removing this network namespace.
         if self._wifi is not None:
             network.switch_off(self._interface)
 

@@ -69,7 +69,7 @@ def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> i
 
 
 def fork(name: str, work: Callable[[], None], log: Path) -> int:
-    """Call `work` in a forked process of this name, in a new session, with its output in `log`; return its id.
+    """Call `work` in a forked process of this name, in a new session, that writes to `log`; return its process id.
 
     The fork inherits the memory of this process, but no descriptors. Call it from a process with one thread.
     """
