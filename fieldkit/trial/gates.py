@@ -100,8 +100,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     names = {role: scene.robot(role).name for role in sort_roles(plan.procedure.roles())}
-    roaming = _roaming(plan.procedure)
-    problems += attempt_states.problems(evidence, {role: name for role, name in names.items() if role not in roaming})
+    roaming = roaming_roles(plan.procedure)
+    fixed = {role: name for role, name in names.items() if role not in roaming}
+    problems += attempt_states.problems(evidence, fixed, plan.radios)
     measured = attempt_states.measure(evidence, names, measured)
     # Otherwise an optional file would count as missing, and the error of its reader would be lost.
     problems += (
@@ -110,7 +111,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
 
 
-def _roaming(procedure: Procedure) -> frozenset[Role]:
+def roaming_roles(procedure: Procedure) -> frozenset[Role]:
     """Return the roles of the robots whose channel may change."""
     steps = (placed.step for placed in procedure.walk())
     return frozenset[Role]().union(*(step.roams() for step in steps if isinstance(step, Roams)))

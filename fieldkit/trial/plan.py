@@ -55,6 +55,8 @@ class Plan(Strict):
         lab_bytes: Maximum number of bytes that the lab itself adds to an attempt.
         simulators: Physics, network and sync policy of a backend that simulates them; empty otherwise.
         step_packages: The package of each kind of step that does not ship with fieldkit.
+        radios: Channel and regulatory domain of each robot's radio at the start, which must not change during the
+            trial; empty if they are unknown.
         columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
             planned the trial.
     """
@@ -79,6 +81,7 @@ class Plan(Strict):
     lab_bytes: Int = 0
     simulators: dict[str, str] = Field(default_factory=dict, exclude_if=schema.is_empty)
     step_packages: dict[str, StepPackage] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    radios: dict[Role, dict[str, str]] = Field(default_factory=dict, exclude_if=schema.is_empty)
     columns: Columns | None = None
 
     @property
