@@ -62,7 +62,6 @@ class RobotOptions(Strict):
 
     def programs(self) -> set[str]:
         """Return the programs that these variants need on this machine, in addition to those that every lab needs."""
-
         programs = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
         if self.netcat is not None:
             programs.add(NETCATS[self.netcat])

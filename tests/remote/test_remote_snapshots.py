@@ -78,7 +78,7 @@ def test_programs_that_hang_fail_or_flood_give_no_value_and_delay_little(shell: 
 def test_a_source_that_hung_is_not_started_again_in_the_trial(shell: LocalShell, tmp_path: Path) -> None:
     calls = tmp_path / "calls"
     give(tmp_path, "chronyc", f"echo chronyc >>{shlex.quote(str(calls))}; exec sleep 600")
-    give(tmp_path, "iw", f"exec sleep 600")
+    give(tmp_path, "iw", "exec sleep 600")
     give(tmp_path, "pmc", f"echo pmc >>{shlex.quote(str(calls))}; echo 'code 137'")
     folders = [FOLDER, jobs.work_folder("trial", "udp-02-1")]
     for number, folder in enumerate(folders):
