@@ -82,7 +82,7 @@ def test_a_kernel_that_sends_no_rate_flags_is_understood() -> None:
 def test_the_address_of_an_interface_is_the_attribute_receiver() -> None:
     interface = bytes.fromhex("020000000100")
     event = decode_event(encode_generic(CMD_ADD_MAC_ADDR, 1, {1: interface, 2: RADIO}))
-    assert event == InterfaceAddress(RADIO, interface, added=True)
+    assert event == InterfaceAddress(RADIO, interface, is_added=True)
 
 
 def test_other_commands_are_no_events() -> None:
