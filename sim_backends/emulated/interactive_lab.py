@@ -131,8 +131,8 @@ class EmulatedLab:
         if before is None:
             return None
         now, bound_ns = self._running.medium.stats(), round(self._options.late_bound * 1e9)
-        packets = _new_counts(before.late, now.late)
-        windows = _new_counts(before.late_windows, now.late_windows)
+        packets = _new_counts(before.packet_lateness_counts, now.packet_lateness_counts)
+        windows = _new_counts(before.window_lateness_counts, now.window_lateness_counts)
         return LabLateness(
             bound_s=self._options.late_bound,
             packet_max_s=max(packets) / 1e9 if packets else None,

@@ -28,15 +28,15 @@ class VehicleState:
 
     Attributes:
         now_ns: Time.
-        armed: True if it is armed.
-        landed: True if it is on the ground.
+        is_armed: True if it is armed.
+        has_landed: True if it is on the ground.
         mode: Its mode.
         battery: Its battery.
     """
 
     now_ns: int
-    armed: bool
-    landed: bool
+    is_armed: bool
+    has_landed: bool
     mode: Mode
     battery: Battery
 
@@ -171,9 +171,9 @@ class ArduCopterFailsafes:
         self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
     ) -> Iterator[Reaction]:
         mode = modes.get(action)
-        if not state.armed or mode is None:
+        if not state.is_armed or mode is None:
             yield Reaction(text)
-        elif state.landed:
+        elif state.has_landed:
             yield Reaction(text, disarm=True)
         elif state.mode in LANDING:
             yield Reaction(f"{text} - Continuing Landing")
@@ -262,8 +262,8 @@ class Px4Failsafes:
     def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
         if (
             mode is None
-            or not state.armed
-            or state.landed
+            or not state.is_armed
+            or state.has_landed
             or state.mode in (LANDING if mode is Mode.LAND else RETURNING)
         ):
             return
@@ -339,7 +339,7 @@ class Fence:
         (east, north, up), (radius_m, height_m) = place_m, self.limits_m
         fences = ["Max Alt"] * (up > height_m) + ["Circle"] * (math.hypot(east, north) > radius_m)
         is_new, self._is_breached = bool(fences) and not self._is_breached, bool(fences)
-        if not is_new or not state.armed or state.landed:
+        if not is_new or not state.is_armed or state.has_landed:
             return None
         text = f"{' and '.join(fences)} fence{'s' * (len(fences) > 1)} breached"
         mode = None if state.mode in LANDING else _FENCE_ACTIONS[int(self._parameters["FENCE_ACTION"])]

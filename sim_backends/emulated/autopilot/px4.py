@@ -101,7 +101,7 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
     """Return the refusal of a change of mode."""
-    is_on_ground = not conditions.armed or conditions.on_ground
+    is_on_ground = not conditions.is_armed or conditions.on_ground
     if mode in {Mode.LAND, Mode.RTL} and is_on_ground:
         return ModeRefusal(f"{mode.name} denied: not in the air")
     if mode is Mode.OFFBOARD and not conditions.has_recent_set_point:

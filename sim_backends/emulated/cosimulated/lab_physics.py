@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import itemgetter
 from typing import Any, Final, Protocol, runtime_checkable
 
 from typing_extensions import override
@@ -137,7 +138,7 @@ class LabPhysics:
         if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
             self._poll_placements(now_ns)
         if self._physics is not None:
-            for at_ns, name, command in sorted(self._commands(to_ns), key=lambda timed: timed[0]):
+            for at_ns, name, command in sorted(self._commands(to_ns), key=itemgetter(0)):
                 self._drive(name, max(at_ns, self._now_ns), command)
             self._advance(to_ns)
             self._report(to_ns)

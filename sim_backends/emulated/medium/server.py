@@ -96,7 +96,7 @@ class MediumServer(ABC):
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
         # Number of packets by lateness.
-        self._late: Counter[int] = Counter()
+        self._packet_lateness_counts: Counter[int] = Counter()
         self._flows = FlowDelays()
         self._scheduling = _raise_priority()
         self._timer = Timer()
@@ -238,7 +238,7 @@ class MediumServer(ABC):
             for name, port in self._ports.items()
             for source, parts in port.delay_parts().items()
         }
-        return MediumStats(self._scheduling, self._late, self._link_counters(), ports, delays)
+        return MediumStats(self._scheduling, self._packet_lateness_counts, self._link_counters(), ports, delays)
 
 
 def _raise_priority() -> str:
