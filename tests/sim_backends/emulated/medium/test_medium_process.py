@@ -355,9 +355,9 @@ def test_the_medium_continues_between_the_other_robots(bench: Bench) -> None:
 def test_invalid_requests_are_rejected(routed_namespaces: tuple[MediumClient, dict[str, Namespace]]) -> None:
     medium, spaces = routed_namespaces
     fd = spaces["a"].tun("wlan1", "10.9.1.1/24")
-    with pytest.raises(RobotError, match="attached already"):
+    with pytest.raises(RobotError, match="already attached"):
         medium.attach("a", "10.9.1.1/24", RADIO, fd)
-    with pytest.raises(RobotError, match="attached already"):
+    with pytest.raises(RobotError, match="already attached"):
         medium.attach("new", "10.9.0.2/24", RADIO, fd)
     with pytest.raises(RobotError, match="nonsense"):
         medium.attach("new", "nonsense", RADIO, fd)
