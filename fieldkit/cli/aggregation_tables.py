@@ -54,7 +54,7 @@ def show(arguments: argparse.Namespace) -> int:
         use_index=arguments.use_index,
     ).with_filter(arguments.where)
     condition_columns = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
-    selected, words = data.chosen(arguments.quantity)
+    selected, words = data.select(arguments.quantity)
     if words and output_format == "latex":
         raise ConfigurationError(
             f"--quantity: the values of {words[0].name} are words, and latex tables have no column for words",

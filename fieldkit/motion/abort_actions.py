@@ -62,7 +62,7 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
 
     def guarded_roles(self, plan: TrialOutline) -> tuple[Role, ...]:
         """Return the roles of drones that no step flies, so that guards must monitor them."""
-        moved = plan.procedure.moved()
+        moved = plan.procedure.moved_roles()
         return tuple(role for role in self.root if role not in moved)
 
 

@@ -84,8 +84,8 @@ class LoadOptions(OverLink):
         *,
         reverse: bool = False,
         ports: tuple[tuple[int, int], ...] = (),
-        lasts_s: float | None = None,
-        until_ns: int | None = None,
+        duration_s: float | None = None,
+        receiver_end_ns: int | None = None,
     ) -> LoadStreams:
         """Return the packet filter of the load's data streams in captures.
 
@@ -93,8 +93,8 @@ class LoadOptions(OverLink):
             scene: The attempt.
             reverse: Whether the server sends.
             ports: As `LoadStreams.ports`.
-            lasts_s: As `FlowSchedule.lasts_s`.
-            until_ns: As `FlowSchedule.until_ns`.
+            duration_s: As `FlowSchedule.duration_s`.
+            receiver_end_ns: As `FlowSchedule.receiver_end_ns`.
         """
         ends = [scene.link(role, self.over).address for role in (self.sender, self.receiver)]
         source, destination = reversed(ends) if reverse else ends
@@ -111,8 +111,8 @@ class LoadOptions(OverLink):
             expected=FlowSchedule(
                 interval_s=self.interval_s(scene.protocol),
                 head_bytes=0 if reverse or transport is Protocol.UDP else COOKIE_BYTES,
-                lasts_s=lasts_s,
-                until_ns=until_ns,
+                duration_s=duration_s,
+                receiver_end_ns=receiver_end_ns,
             ),
         )
 

@@ -28,7 +28,7 @@ class View:
     def capture(self, role: Role) -> Capture | None:
         """Return the capture of a robot around the step; None if there is none or it is incomplete."""
         name = capture_around(self.within, role)
-        return None if name is None or self.dropped_packets(role) else self.evidence.whole_capture(name)
+        return None if name is None or self.dropped_packets(role) else self.evidence.undamaged_capture(name)
 
     def dropped_packets(self, role: Role) -> int:
         """Return the number of packets that a robot's kernel and interface dropped before tcpdump.
@@ -37,7 +37,9 @@ class View:
         counters.
         """
         name = capture_around(self.within, role)
-        log = None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_of(name))
+        log = (
+            None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.capture_log_file(name))
+        )
         return 0 if log is None else (log.dropped_by_kernel or 0) + (log.dropped_by_interface or 0)
 
     def has_captures(self, *roles: Role) -> bool:

@@ -21,7 +21,7 @@ from sim_backends.federates.named import (
     PythonFederate,
     command_line,
     default_options,
-    named,
+    named_federate,
 )
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, quadrotor
 from sim_backends.radio.radio_options import INFRASTRUCTURE
@@ -68,7 +68,7 @@ def _physics(options: EmulatedOptions) -> str:
     name = options.physics or KINEMATIC
     if name == KINEMATIC:
         return name
-    federate = named(name, PHYSICS)
+    federate = named_federate(name, PHYSICS)
     if isinstance(federate, ProgramFederate):
         return federate.command()
     if isinstance(federate, PythonFederate):

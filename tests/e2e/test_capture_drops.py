@@ -50,7 +50,7 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
     plan = plans.read_plan(trial)
-    (entry,) = journal.ended(journal.history(trial, plan))
+    (entry,) = journal.ended_attempts(journal.history(trial, plan))
     return plan, store.attempt_folder(trial, entry.folder), entry
 
 

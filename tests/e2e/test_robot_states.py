@@ -80,7 +80,7 @@ def test_conditions_of_robots_are_named_and_not_compared(tmp_path: Path) -> None
     for reason in (
         "turtlebot-2 is off by 1.0 s, although chrony has the source 10.9.0.2",
         "turtlebot-2: the supply voltage is too low",
-        "turtlebot-2: its processor is slowed down (throttled)",
+        "turtlebot-2: the processor is throttled (throttled)",
         "turtlebot-2: others use 60 % of the airtime on channel 6",
     ):
         assert reason in row["marks_reason"]

@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = cli_options.backend(arguments, sink)
         if (code := cli_options.run_elsewhere(backend, arguments, Path("trials"))) is not None:
             return code
-        cast = backend.cast(request.chosen_topology)
+        cast = backend.cast(request.effective_topology)
         plan = make_plan(
             request,
             backend=name,

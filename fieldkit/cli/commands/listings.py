@@ -90,15 +90,15 @@ def run_columns(arguments: argparse.Namespace) -> int:
 
 def _columns_of(procedure: str) -> int:
     """List the columns that the steps of a procedure fill. The procedure is given by its name or its file."""
-    from fieldkit.trial.columns import filled_by
+    from fieldkit.trial.columns import filled_columns
     from fieldkit.trial.procedure import load_procedure, read_procedure
 
     path = Path(procedure)
     parsed_procedure = read_procedure(path) if path.suffix == ".yaml" else load_procedure(procedure)
-    filled_columns = filled_by(placed.step for placed in parsed_procedure.walk())
+    shown_columns = filled_columns(placed.step for placed in parsed_procedure.walk())
     rows = [
         (column.name, column.unit, column.figure.kind if column.figure else "", column.meaning)
-        for column in filled_columns
+        for column in shown_columns
     ]
     table(("column", "unit", "aggregated as", "meaning"), rows)
     return 0
@@ -107,9 +107,9 @@ def _columns_of(procedure: str) -> int:
 def _columns(name: str | None) -> int:
     """List the columns of all files, or the columns called `name`."""
     from fieldkit.analysis.quantities import DEFAULT_BY
-    from fieldkit.trial.columns import installed
+    from fieldkit.trial.columns import installed_columns
 
-    trial = installed()
+    trial = installed_columns()
     columns_by_file = {
         "trial.csv": trial,
         "summary.csv": (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow)),

@@ -12,7 +12,7 @@ from fieldkit.cli.parser import Parser
 from fieldkit.core.text import print_text
 
 if TYPE_CHECKING:
-    from fieldkit.trial.stored.rebuild import Rebuilt
+    from fieldkit.trial.stored.rebuild import RebuildResult
 
 
 def add(parser: Parser) -> None:
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _show_summary(rebuilt: "Rebuilt", *, show_all: bool) -> None:
+def _show_summary(rebuilt: "RebuildResult", *, show_all: bool) -> None:
     from fieldkit.cli import results
 
     if left_out := results.show_summary(rebuilt.cells, show_all=show_all, expected=rebuilt.expected):
@@ -82,10 +82,10 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
     return exit_code
 
 
-def _note_missing_manifest(folder: Path, rebuilt: "Rebuilt") -> None:
+def _note_missing_manifest(folder: Path, rebuilt: "RebuildResult") -> None:
     if not rebuilt.has_manifest:
         show_note(f"{folder}: there is no manifest to verify its evidence with")
 
 
-def _changes(rebuilt: "Rebuilt") -> str:
+def _changes(rebuilt: "RebuildResult") -> str:
     return f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before"

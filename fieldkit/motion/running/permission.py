@@ -42,7 +42,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
 
 
 def _self_moving(plan: Plan) -> tuple[Role, ...]:
-    moved = plan.procedure.moved()
+    moved = plan.procedure.moved_roles()
     return tuple(role for role, robot in plan.cast.items() if role in moved and (can_drive(robot) or can_fly(robot)))
 
 

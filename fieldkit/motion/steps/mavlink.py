@@ -95,7 +95,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         during: Steps that run at the same time.
     """
 
-    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.OF_POSITIONS)
+    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.POSITION_CHECKS)
 
     robot: Role
     at: Role | None = None

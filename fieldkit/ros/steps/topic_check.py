@@ -19,7 +19,7 @@ from fieldkit.steps.capabilities import Subscribes
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.check import software
 from fieldkit.trial.check.report import Report
-from fieldkit.trial.check.software import Probed
+from fieldkit.trial.check.software import ProbeResult
 from fieldkit.trial.check.system import judge_battery
 from fieldkit.trial.plan import Plan
 
@@ -38,7 +38,7 @@ _END_BYTES: Final = 4096
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
 
-def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: Report) -> None:
+def check_topics(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResult, report: Report) -> None:
     """Record for a short time; report whether each recorded topic is published, and the charge of the battery.
 
     It is the entry point `topics` of `fieldkit.checks`.
@@ -53,10 +53,12 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: R
         "" if has_shared_battery(plan, role) else battery_of(robot),
     )
     topics = tuple(dict.fromkeys((*topics_to_check, *((battery,) if battery else ()))))
-    if not topics or not can_record(plan, role, probed):
+    if not topics or not can_record(plan, role, probe_result):
         return
     step = recording(role, robot, topics)
-    scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: probed.variants})
+    scene = plan.scene(
+        RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: probe_result.variants}
+    )
     with tempfile.TemporaryDirectory() as into:
         try:
             path, recorded_bag = _record(scene, step, shell, Path(into), waits_full_time=bool(topics_to_check))
@@ -69,12 +71,12 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: R
         _check_battery(path, battery, report)
 
 
-def can_record(plan: Plan, role: Role, probed: Probed) -> bool:
+def can_record(plan: Plan, role: Role, probe_result: ProbeResult) -> bool:
     """Return False if a program that a recording needs is missing on the robot."""
     ros = plan.cast[role].profile.ros
     if ros is None or not required_topics(plan, role):
         return True
-    return probed.has_program(ros.command.record[0], software.needs_of(plan, role))
+    return probe_result.has_program(ros.command.record[0], software.needs_of(plan, role))
 
 
 def _check_battery(path: Path, topic: str, report: Report) -> None:

@@ -309,7 +309,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         from fieldkit.measure.transfers.deliveries import FlowSchedule  # noqa: PLC0415 (as above)
 
         # The last sample is sent one interval before the end.
-        return FlowSchedule(interval_s=1 / self.rate, lasts_s=max(self.duration - 1 / self.rate, 0.0))
+        return FlowSchedule(interval_s=1 / self.rate, duration_s=max(self.duration - 1 / self.rate, 0.0))
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

@@ -134,7 +134,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         during: Steps that run at the same time.
     """
 
-    cross_checks = position_checks.OF_POSITIONS
+    cross_checks = position_checks.POSITION_CHECKS
 
     robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
     heights: schema.Bool = False

@@ -285,7 +285,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 role_columns = [column for column in self.columns if column.name.startswith(f"{role}_")]
                 measured |= Measured.all_missing(role_columns, f"the {role} does not capture")
                 continue
-            capture = view.evidence.whole_capture(self._file(role))
+            capture = view.evidence.undamaged_capture(self._file(role))
             log = view.evidence.read_or_none(tcpdump_log.read, self._log(role))
             values = {
                 f"{role}_captured": capture.frames if capture else None,

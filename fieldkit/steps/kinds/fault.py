@@ -271,7 +271,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
-        return (*outage_columns.declared(self.kind), *across.recovery_columns(self))
+        return (*outage_columns.fault_columns(self.kind), *across.recovery_columns(self))
 
     @override
     def measure(self, view: View) -> Measured:

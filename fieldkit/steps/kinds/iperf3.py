@@ -237,7 +237,7 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
                 receiver_counters=view.evidence.counters(self.destination),
             )
             flow = self._flow(view, source_test, destination_test)
-            yield from load_checks.find(flow, source_test, destination_test, load_evidence)
+            yield from load_checks.find_contradictions(flow, source_test, destination_test, load_evidence)
         interface = view.scene.link(self.destination, self.over).interface
         interface_bytes = view.evidence.interface_bytes(self.destination, interface)
         payload_bytes = sum(interval.payload_bytes for interval in destination_test.intervals)
@@ -287,8 +287,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             view.scene,
             reverse=self.reverse,
             ports=ports,
-            lasts_s=self._duration_s if self.size is None else None,
-            until_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
+            duration_s=self._duration_s if self.size is None else None,
+            receiver_end_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
         )
 
     def _report(self, view: View, role: Role) -> IperfTest | None:

@@ -336,7 +336,9 @@ class TransferStep(
         else:
             finished = listener_exit is not None and listener_exit.code == 0
             was_stopped = endings[0] is not None and listener_exit is None
-            yield from transfer_checks.find(view.evidence, transfer, finished=finished, cut=was_stopped)
+            yield from transfer_checks.find_contradictions(
+                view.evidence, transfer, finished=finished, was_stopped=was_stopped
+            )
         texts = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
         if listener_exit is not None and netcat.listener_failed(listener_exit.code, texts[0]):
             yield f"{self._logs[0]}: netcat was terminated by a signal, or could not write {self._into}"

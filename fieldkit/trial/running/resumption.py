@@ -168,7 +168,7 @@ def require_cast(plan: Plan, cast: Cast) -> None:
     """
     for role, robot in plan.cast.items():
         current = cast.get(role)
-        is_moved = role in plan.procedure.moved()
+        is_moved = role in plan.procedure.moved_roles()
         if current and is_moved and robot.abilities - current.abilities:
             options = " ".join(map(permissions.option, permissions.repeated(permissions.installed())))
             raise ConfigurationError(
@@ -187,7 +187,7 @@ def require_cast(plan: Plan, cast: Cast) -> None:
 
 def _step_code_changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
     """Yield a sentence for each kind of step whose code differs from the plan although the version is equal."""
-    for kind, current in step_packages.of_kinds(planned).items():
+    for kind, current in step_packages.packages_of_kinds(planned).items():
         frozen = planned[kind]
         if (frozen.package, frozen.version) == (
             current.package,

@@ -203,13 +203,13 @@ class CosimulatedMedium(MediumServer):
         session = self._session
         assert session is not None
         end_ns = self._clock.monotonic_ns(window.end_ns)
-        if window.ended:
+        if window.decided_fates:
             delivered_packets = session.agents.delivered_packets
-            arrived_fates = [fate for fate in window.ended if fate.arrived_ns is not None]
+            arrived_fates = [fate for fate in window.decided_fates if fate.arrived_ns is not None]
             for fate, packet in zip(arrived_fates, delivered_packets, strict=True):
                 self._write(session, fate, packet, window.end_ns, end_ns)
             delivered_packets.clear()
-            for fate in window.ended:
+            for fate in window.decided_fates:
                 session.remove_packet(fate.packet)
         lag_ns = time.monotonic_ns() - end_ns
         self._window_lateness_counts[round_up(max(lag_ns, 0))] += 1

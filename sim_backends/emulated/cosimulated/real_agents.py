@@ -5,10 +5,10 @@ from typing import Final, NamedTuple, Protocol
 
 from typing_extensions import override
 
-from sim_backends.cosim.agents import Agents, Sent
+from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, broadcast_flow
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
@@ -95,8 +95,8 @@ class RealAgents(Agents):
         return self._reached_ns
 
     @override
-    def deliver(self, receiver: str, received: Received) -> None:
-        self.delivered_packets.append(received.payload)
+    def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
+        self.delivered_packets.append(received_datagram.payload)
 
     @property
     @override
@@ -104,7 +104,7 @@ class RealAgents(Agents):
         return False
 
     @override
-    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
+    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[SentDatagram], Mapping[str, State]]:
         self._devices.wait(end_ns)
         packets = self._devices.pop_packets(last_ns)
         states = self.states(end_ns)
@@ -121,7 +121,7 @@ class RealAgents(Agents):
         if len(contents) > _KEPT_PACKETS:
             del contents[next(iter(contents))]
 
-    def _datagrams(self, packet: RealPacket, states: Mapping[str, State]) -> list[Sent]:
+    def _datagrams(self, packet: RealPacket, states: Mapping[str, State]) -> list[SentDatagram]:
         """Return the datagram of a packet, or one per receiver of a broadcast."""
         source = packet.source
         if packet.destination is not None:
@@ -129,12 +129,12 @@ class RealAgents(Agents):
             number = self._numbers[flow] = self._numbers.get(flow, -1) + 1
             self._store_content((flow, number), packet.content)
             datagram = Datagram(packet.destination, packet.size_bytes, flow, number, packet, UNICAST)
-            return [Sent(packet.at_ns, source, datagram, states)]
+            return [SentDatagram(packet.at_ns, source, datagram, states)]
         flow = broadcast_flow(source)
         number = self._numbers[flow] = self._numbers.get(flow, -1) + 1
         self._store_content((flow, number), packet.content)
         return [
-            Sent(
+            SentDatagram(
                 packet.at_ns,
                 source,
                 Datagram(name, packet.size_bytes, f"{flow}: {name}", number, packet, BROADCAST),

@@ -13,7 +13,7 @@ from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
-from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.named import PythonFederate, named_federate
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, BareBroadcast, BareIp
 from sim_backends.network.ip import Fragment
@@ -126,7 +126,7 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
         bodies = {robot: _body(settings.bodies[robot].limits, state) for robot, state in states.items()}
         return Bodies(bodies, settings.world, step_ns=step_ns)
     hello = _hello(settings, PHYSICS, states)
-    federate = named(name, PHYSICS)
+    federate = named_federate(name, PHYSICS)
     if isinstance(federate, PythonFederate):
         python_physics: PhysicsFederate = federate.load().make(hello)
         return python_physics

@@ -69,9 +69,10 @@ def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> i
 
 
 def fork(name: str, work: Callable[[], None], log: Path) -> int:
-    """Call `work` in a forked process of this name, in a new session, that writes to `log`; return its process id.
+    """Call `work` in a forked process of this name and in a new session; return the process id.
 
-    The fork inherits the memory of this process, but no descriptors. Call it from a process with one thread.
+    Its output is written to `log`. The fork inherits the memory of this process, but no descriptors. Call it from a
+    process with one thread.
     """
     gc.freeze()  # a garbage collection in the fork would write to, and so copy, every page of inherited objects
     pid = os.fork()

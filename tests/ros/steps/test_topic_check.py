@@ -13,7 +13,7 @@ from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check import software
 from fieldkit.trial.check.probe import Sections
 from fieldkit.trial.check.report import Report
-from fieldkit.trial.check.software import Probed
+from fieldkit.trial.check.software import ProbeResult
 from tests.helpers.casts import TURTLEBOT, ros_of
 from tests.trial.check.test_check_judges import (
     FAIL,
@@ -29,8 +29,8 @@ from tests.trial.check.test_check_judges import (
 )
 
 
-def probed(sections: Sections) -> Probed:
-    return Probed(sections, variants.expected(TURTLEBOT))
+def probed(sections: Sections) -> ProbeResult:
+    return ProbeResult(sections, variants.expected(TURTLEBOT))
 
 
 def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
