@@ -22,7 +22,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RateStage,
     SentFrame,
     decode_event,
-    encode_received,
+    encode_reception,
     encode_status,
 )
 from sim_backends.emulated.linux_wifi.hwsim_socket import open_registered
@@ -90,7 +90,7 @@ class Cell:
             if event.frame[0] & 0x0C == _DATA and not event.is_group and event.radio == self._addresses[0]:
                 return event
             other = self._addresses[event.radio == self._addresses[0]]
-            received = encode_received(event, type(event.radio)(other), rate_index=4, signal_dbm=SIGNAL_DBM)
+            received = encode_reception(event, type(event.radio)(other), rate_index=4, signal_dbm=SIGNAL_DBM)
             if received is not None:
                 self._kernel.send(received)
             self.report(event, [1], acknowledged=True)

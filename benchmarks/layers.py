@@ -61,7 +61,7 @@ class Layer:
     def model(self, stations: int) -> RadioModel[int]:
         """Return the radio model, without a medium."""
         options = self.radio()
-        if options.fixed:
+        if options.is_fixed:
             return UniformLinks(1, options)
         return WifiInWorld(1, options, {_name(n): antenna_of(RADIO) for n in range(stations)}, self.load())
 
