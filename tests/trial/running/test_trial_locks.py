@@ -81,7 +81,7 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
         lock = locks.read_lock(robot)
         assert lock is not None
         assert lock.holder == ANNA
-        assert 50 < lock.left_s <= 60
+        assert 50 < lock.remaining_s <= 60
         alter(robot, (4, "0"))
         assert locks.read_lock(robot) is None, "it has expired"
     assert locks.read_lock(robot) is None
@@ -271,7 +271,7 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
         lock = locks.read_lock(robot)
         assert lock is not None
-        assert lock.left_s > 7200
+        assert lock.remaining_s > 7200
         fresh = record(robot)
         jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
         assert record(robot) == fresh
@@ -402,7 +402,7 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with locked_exclusively(cast, anna, sink=fail_on_event):
         with (
-            pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+            pytest.raises(ConfigurationError, match="another process of fieldkit runs this trial"),
             locked_exclusively(cast, anna, sink=fail_on_event),
         ):
             raise AssertionError("two run it")

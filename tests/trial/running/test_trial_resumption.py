@@ -64,7 +64,9 @@ def test_a_self_moving_robot_needs_permission_again() -> None:
     by_hand = {role: robot.model_copy(update={"abilities": frozenset()}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
     resumption.require_cast(plan, driving)
-    with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:
+    with pytest.raises(
+        ConfigurationError, match="moves without a person in this trial, which is not permitted now"
+    ) as caught:
         resumption.require_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
     # Permission to move does not matter if nothing moves the robot, or if a person does.
