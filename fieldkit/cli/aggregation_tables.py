@@ -68,7 +68,9 @@ def show(arguments: argparse.Namespace) -> int:
     counted = list(data.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
-    needed = {name for quantity in quantities for name in quantity.needed} | {quantity.name for quantity in counted}
+    needed = {name for quantity in quantities for name in quantity.needed_columns} | {
+        quantity.name for quantity in counted
+    }
     mixed = {column.name for column in data.columns if plain_name(column.name) in MIXTURE_COLUMNS}
     repeats = data.read({*by, *needed, *mixed, "started_utc_ns"})
     for mixture in mixtures(repeats, by):

@@ -154,7 +154,7 @@ class Ledger:
         return cells
 
     def _rename(self, attempt: Attempt) -> None:
-        """Rename the folder of an attempt to the name of a void attempt if its repeat was reopened after it failed."""
+        """Rename the folder of an attempt to the name of a void attempt if its repeat was reopened later."""
         if not attempt.reopened:
             return
         before = attempt.repeat.folder(Status.FAILED, attempt.number)
