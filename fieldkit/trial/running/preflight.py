@@ -61,7 +61,7 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
 
 
 @dataclass(frozen=True)
-class CheckResult:
+class PreflightResult:
     """Result of `check`.
 
     Attributes:
@@ -75,7 +75,7 @@ class CheckResult:
 
 def check(
     plan: Plan, shells: Shells, out: Path, *, all_checks: bool, fleet_checks: Sequence[FleetCheck] = ()
-) -> CheckResult:
+) -> PreflightResult:
     """Check every robot of the cast and this machine, and install the job script on each robot.
 
     Args:
@@ -102,7 +102,7 @@ def check(
     elif fleet_checks:  # packets of these checks would disturb the measurement of the other user
         laptop.warn("network", "not checked, because a robot is locked", HELD_REMEDY)
     system.judge_laptop(plan, out, laptop)
-    return CheckResult(_all_findings([*reports.values(), laptop]), variants_by_role)
+    return PreflightResult(_all_findings([*reports.values(), laptop]), variants_by_role)
 
 
 def check_before_trial(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
