@@ -78,9 +78,9 @@ def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) ->
         ttl_s: Lifetime of a lock that is not renewed, in seconds.
 
     Raises:
-        LinkError: A robot did not answer. RobotError: Another holder has locked a robot. The message contains the
-        holder, start and end of the lock, and a
-            remedy.
+        LinkError: A robot did not answer.
+        RobotError: Another holder has locked a robot. The message contains the holder, start and end of the lock,
+            and a remedy.
     """
     contacted: list[Shell] = []
     sorted_shells = sorted(shells.values(), key=lambda shell: shell.robot)

@@ -80,7 +80,9 @@ def continue_trial(
 
     Raises:
         ConfigurationError: `folder` is not a trial, the trial was started with other code, or another process runs
-        it. EvidenceError: The journal is damaged. FieldkitError: As for `begin`.
+            it.
+        EvidenceError: The journal is damaged.
+        FieldkitError: As for `begin`.
     """
     plan = resumable(folder)
     with journal.locked(folder), converting_write_errors(folder):
