@@ -100,10 +100,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     names = {role: scene.robot(role).name for role in sort_roles(plan.procedure.roles())}
-    roaming_roles = _roaming_roles(plan.procedure)
-    problems += attempt_states.problems(
-        evidence, {role: name for role, name in names.items() if role not in roaming_roles}
-    )
+    roaming = roaming_roles(plan.procedure)
+    fixed = {role: name for role, name in names.items() if role not in roaming}
+    problems += attempt_states.problems(evidence, fixed, plan.radios)
     measured = attempt_states.measure(evidence, names, measured)
     # Without this, an optional file would be treated as missing, and the error of its reader would not be reported.
     problems += (
@@ -112,7 +111,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
 
 
-def _roaming_roles(procedure: Procedure) -> frozenset[Role]:
+def roaming_roles(procedure: Procedure) -> frozenset[Role]:
     """Return the roles of the robots whose channel may change."""
     steps = (placed.step for placed in procedure.walk())
     return frozenset[Role]().union(*(step.roams() for step in steps if isinstance(step, Roams)))

@@ -32,7 +32,7 @@ class FileOwners:
                 for name in (planned.job.log, planned.job.stdout):
                     if name:
                         owners[name.casefold()] = planned.role
-        owners |= {file.name.casefold(): role for role, files in scene.recorded.items() for file in files}
+        owners |= {file.name.casefold(): role for role, files in scene.recordings.items() for file in files}
         return cls(owners, procedure.roles())
 
     def refusal(self, role: Role, name: str) -> str | None:

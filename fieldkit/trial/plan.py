@@ -56,8 +56,10 @@ class Plan(Strict):
         lab_bytes: Maximum number of bytes that the lab adds to an attempt.
         simulators: Physics, network and sync policy of a backend that simulates them; otherwise empty.
         step_packages: The package of each kind of step that does not ship with fieldkit.
-        columns: Columns of the steps that not every trial has; None if there are none, or if an earlier version of
-            fieldkit planned the trial.
+        radios: Channel and regulatory domain of each robot's radio at the start, which must not change during the
+            trial; empty if they are unknown.
+        columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
+            planned the trial.
     """
 
     schema_version: Int
@@ -80,6 +82,7 @@ class Plan(Strict):
     lab_bytes: Int = 0
     simulators: dict[str, str] = Field(default_factory=dict, exclude_if=schema.is_empty)
     step_packages: dict[str, StepPackage] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    radios: dict[Role, dict[str, str]] = Field(default_factory=dict, exclude_if=schema.is_empty)
     columns: Columns | None = None
 
     @property

@@ -37,4 +37,4 @@ def captures(plan: Plan) -> Mapping[str, Role]:
 def bags(plan: Plan) -> Mapping[Role, str]:
     """Return the name of the first file that is recorded on each robot, relative to an attempt's folder."""
     scene = plan.procedure.scene(plan.protocols[0], plan.cast, "")
-    return {role: recordings[0].name for role, recordings in scene.recorded.items()}
+    return {role: recordings[0].name for role, recordings in scene.recordings.items()}

@@ -231,11 +231,11 @@ class Procedure(catalog.Named, Sectioned):
             folder: The attempt's folder on every robot.
             variants: The tools of each robot, as determined by the preflight checks.
         """
-        recorded: dict[Role, tuple[RecordedFile, ...]] = {}
+        recordings: dict[Role, tuple[RecordedFile, ...]] = {}
         for step in self._steps():
-            for file in step.recorded(cast) if isinstance(step, Records) else ():
-                recorded[file.role] = (*recorded.get(file.role, ()), file)
-        scene = Scene(protocol, cast, folder, recorded, variants, sections=self.sections)
+            for file in step.recordings(cast) if isinstance(step, Records) else ():
+                recordings[file.role] = (*recordings.get(file.role, ()), file)
+        scene = Scene(protocol, cast, folder, recordings, variants, sections=self.sections)
         senders = (step for step in self._steps() if isinstance(step, SendsTraffic))
         return replace(scene, flows=tuple(flow for step in senders for flow in step.flows(scene)))
 
@@ -317,7 +317,7 @@ class PlacedStep:
             ):
                 conflict = f"port {listener.port} is used twice at the same time on {listener.role}"
                 return f"{conflict}; change the {listener.by} of one of them"
-            if is_captured and listener.looks_like(other_listener):
+            if is_captured and listener.is_ambiguous_with(other_listener):
                 conflict = (
                     f"port {listener.port} is used twice in one capture, from {listener.peer} to {listener.role}"
                 )

@@ -95,4 +95,4 @@ def test_without_drops_nothing_is_withheld(attempt: tuple[Plan, Path, journal.At
 
 def test_a_transfer_needs_its_whole_capture(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
     problems, _ = with_drops(attempt, "transfer.sender")
-    assert problems == ("transfer: sender capture: dropped 12 packets, its interface 0",)
+    assert problems == ("transfer: sender capture: its kernel dropped 12 packets, its interface 0",)

@@ -243,7 +243,7 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
             view = View(scene, result, placed.within)
             placed.step.measure(view)
             list(placed.step.check(view))
-        for error in result._failed.values():
+        for error in result._errors.values():
             if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ReaderError):
                 raise error.__cause__
 
@@ -342,7 +342,7 @@ def _measure_tlog(path: Path) -> None:
 def _measure_topic_log(path: Path) -> None:
     result = topic_samples.read_log(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
-    plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
+    plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, uses_expected_ports=True)
     list(topic_checks.check_logs(plan, result, result))
     list(topic_captures.check_captures(plan, result, result, CapturedTopic(None, None, complete=False)))
     topic_columns.measure(flow, result, result, None, None)

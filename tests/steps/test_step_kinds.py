@@ -44,7 +44,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
     install()
     assert list(step_types()) == [*BUILTIN, *MOTION, *ROS]
-    assert kinds.shipped() == {*BUILTIN, *MOTION, *ROS}
+    assert kinds.shipped_names() == {*BUILTIN, *MOTION, *ROS}
     for kind in BUILTIN:
         step = step_types()[kind]
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")

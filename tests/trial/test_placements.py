@@ -76,7 +76,7 @@ def test_missing_positions_contradict_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("off_m", "expected_reason"), [(0.0, None), (200.0, "has the receiver 200.0 m from where it was placed")]
+    ("off_m", "expected_reason"), [(0.0, None), (200.0, "has the receiver 200.0 m from its placement")]
 )
 def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     off_m: float, expected_reason: str | None, tmp_path: Path

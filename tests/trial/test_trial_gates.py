@@ -115,12 +115,12 @@ def fewer_frames(folder: Path) -> None:
             text("sender-capture.log", FIRST_LINE_OF_LOG),
             "sender capture: tcpdump ended without its counters",
         ),
-        (text("sender-capture.log", log(dropped=3)), "sender capture: dropped 3 packets, its interface 0"),
+        (text("sender-capture.log", log(dropped=3)), "sender capture: its kernel dropped 3 packets, its interface 0"),
         (
             text("sender-capture.log", f"{log()}2 packets dropped by interface\n"),
-            "sender capture: dropped 0 packets, its interface 2",
+            "sender capture: its kernel dropped 0 packets, its interface 2",
         ),
-        (text("sender-capture.log", log(matched=23)), "sender capture: 23 packets matched, 24 were written"),
+        (text("sender-capture.log", log(matched=23)), "sender capture: 23 packets matched, but 24 were written"),
         (
             text("lateness.txt", "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
             "lateness.txt: 3 packets were delivered too late, by up to 41.9 ms; the bound is 5 ms",
@@ -133,9 +133,9 @@ def fewer_frames(folder: Path) -> None:
         (text("link.csv", "utc_ns"), "link.csv: is not a file of link samples"),
         (text("lateness.txt", "bound"), "lateness.txt: is not a file of packet lateness"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),
-        (fewer_frames, "receiver capture: the file has 23 packets, tcpdump counted 24"),
+        (fewer_frames, "receiver capture: the file has 23 packets, but tcpdump counted 24"),
         (without("ping.txt"), "ping.txt is missing"),
-        (text("ping.txt", FIRST_LINE_OF_PING), "ping.txt: ping was stopped early, its summary is missing"),
+        (text("ping.txt", FIRST_LINE_OF_PING), "ping.txt: ping was stopped early; its summary is missing"),
         (text("ping.txt", PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
     ],
 )

@@ -1,7 +1,7 @@
-"""Stream samples with sequence numbers and times from one robot to another, and log both sides.
+"""Stream samples with sequence numbers and times from one robot to another, and log them at both.
 
-A sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data begin with a
-magic number, the sequence number and the time; the rest is random, so that no compression changes its size.
+A sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data start with a
+magic number, the sequence number and the time. Random bytes follow, so that compression does not change its size.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class SampleCodec:
     def decode(self, data: bytes) -> tuple[int, int] | None:
         """Return the sequence number and the time of a sample, or None if it does not belong to this stream."""
         start = len(self._envelope)
-        # Some implementations pad CDR to a multiple of 4 bytes without a note in the header.
+        # Some implementations pad CDR to a multiple of 4 bytes and do not indicate this in the header.
         if not 0 <= len(data) - self._size < 4 or data[start : start + len(MAGIC)] != MAGIC:
             return None
         _, sequence, sent_ns = HEAD.unpack_from(data, start)
@@ -85,10 +85,10 @@ class SampleCodec:
 def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
     """Wait for a subscription, publish samples at their scheduled times, and log each of them.
 
-    A sample whose time has passed while the previous one was written is skipped, as timers of robots do.
+    A sample is skipped if its time has passed while the previous one was written. Timers of robots do the same.
 
     Args:
-        middleware: The middleware, which is started.
+        middleware: The started middleware.
         topic: The topic.
         stream: Parameters of the stream.
         log: The log.
@@ -105,8 +105,8 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
             return
     log.note(records.MATCHED, time.time_ns())
     stop_event.wait(SETTLING_S)
-    start_s, sequence, tick, ticks = time.monotonic(), 0, 0, round(stream.duration_s * stream.rate_hz)
-    while tick < ticks:
+    start_s, sequence, tick, tick_count = time.monotonic(), 0, 0, round(stream.duration_s * stream.rate_hz)
+    while tick < tick_count:
         wait_s = start_s + tick / stream.rate_hz - time.monotonic()
         if stop_event.wait(wait_s) if wait_s > 0 else stop_event.is_set():
             return
@@ -115,7 +115,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
         kind = records.SAMPLE if publisher.write(data) else records.REFUSED
         log.note(kind, time.time_ns(), size=len(data), sequence=sequence, sent_ns=sent_ns)
         sequence += 1
-        due_tick = min(int((time.monotonic() - start_s) * stream.rate_hz), ticks)
+        due_tick = min(int((time.monotonic() - start_s) * stream.rate_hz), tick_count)
         if due_tick > tick + 1:
             log.note(records.SKIPPED, time.time_ns(), sequence=due_tick - tick - 1)
         tick = max(tick + 1, due_tick)
@@ -140,14 +140,14 @@ def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, st
             else:
                 log.note(records.SAMPLE, at_ns, size=len(data), sequence=header[0], sent_ns=header[1])
         except LogError as error:
-            # An exception in a thread of the middleware would be lost, as if no more samples arrived.
+            # An exception in a thread of the middleware would be lost, and would look like an end of the stream.
             errors.append(error)
             stop_event.set()
 
-    matched = middleware.subscribe(topic, on_sample)
+    count_publishers = middleware.subscribe(topic, on_sample)
     is_matched = False
     while not stop_event.wait(_POLL_S if not is_matched else WAIT_S):
-        if not is_matched and matched() != 0:
+        if not is_matched and count_publishers() != 0:
             is_matched = True
             log.note(records.MATCHED, time.time_ns())
     if errors:

@@ -62,12 +62,13 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
     from fieldkit.core.tasks import completed
     from fieldkit.trial.stored import rebuild
 
-    absolute = [folder.absolute() for folder in folders]  # workers of a cluster have another working directory
+    # Workers of a cluster have another working directory.
+    absolute_folders = [folder.absolute() for folder in folders]
     exit_code = 0
     with showing_progress() as sink:
         report = partial(Progress, "rebuild", total=len(folders), unit="trials")
         workers = Workers(arguments.jobs, arguments.cluster)
-        for done, end in enumerate(completed(rebuild.rebuild, absolute, workers, show_note), start=1):
+        for done, end in enumerate(completed(rebuild.rebuild, absolute_folders, workers, show_note), start=1):
             sink(report(done=done))
             folder = folders[end.number]
             if end.result is not None:

@@ -110,5 +110,5 @@ def _announcement(plans: "list[Plan]") -> str:
     protocols = " and ".join(protocol.upper() for protocol in plans[0].protocols)
     places = f" at each of {len(plans)} distances" if len(plans) > 1 else ""
     duration = estimates.total(estimates.estimate_trial(plan, []) for plan in plans)
-    failed_links = "" if duration.is_certain else " if links fail"
-    return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}{failed_links}"
+    condition = "" if duration.is_certain else " if links fail"
+    return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}{condition}"

@@ -52,14 +52,23 @@ def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Meas
     return measured | marks.measure(all_marks, is_known=is_known)
 
 
-def problems(evidence: AttemptEvidence, names: Mapping[Role, str]) -> Iterator[str]:
-    """Yield each reason why the states of the robots make an attempt void. The arguments are those of `measure`."""
+def problems(
+    evidence: AttemptEvidence, names: Mapping[Role, str], radios: Mapping[Role, Mapping[str, str]]
+) -> Iterator[str]:
+    """Yield each reason why the states of the robots make an attempt void.
+
+    Args:
+        evidence: The attempt.
+        names: Name of the robot in each role.
+        radios: Settings of the robots' radios at the start of the trial.
+    """
     for role, name in names.items():
         pair = snapshots.read_attempt(evidence, role)
         if any(RADIO_SOURCES & snapshot.keys() for snapshot in pair):
             from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (few robots have iw)
 
-            if reason := neighbourhood.channel_problem(tuple(map(neighbourhood.parse, pair))):
+            states = tuple(map(neighbourhood.parse, pair))
+            if reason := neighbourhood.setting_problem(states, radios.get(role, {})):
                 yield f"{name}: {reason}"
 
 

@@ -26,6 +26,9 @@ SCAN_NAME: Final = "iw-scan"
 SURVEY_NAME: Final = "iw-survey"
 """Name of the source with two outputs of `iw dev INTERFACE survey dump`."""
 
+SETTINGS: Final = ("channel", "regulatory_domain")
+"""Settings of a radio that must not change during a trial."""
+
 BUSY_CHANNEL: Final = "busy channel"
 BUSY_SHARE: Final = 0.2
 """A repeat is marked if others use more than this share of the airtime."""
@@ -95,6 +98,12 @@ class RadioState:
     country: str | None = None
     signals_dbm: tuple[float | None, ...] | None = None
     others_share: float | None = None
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """Its known settings, by the names in `SETTINGS`."""
+        values = (str(self.channel or ""), self.country or "")
+        return {name: value for name, value in zip(SETTINGS, values, strict=True) if value}
 
 
 def parse(snapshot: Snapshot) -> RadioState:
@@ -175,13 +184,20 @@ def measure(role: Role, states: Sequence[RadioState]) -> Measured:
     return Measured.from_optional(prefixed, "the robot's radio does not report it, or received no network of others")
 
 
-def channel_problem(states: Sequence[RadioState]) -> str | None:
-    """Return a sentence if the channel or the regulatory domain changed between two states, or None."""
-    channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
-    countries = list(dict.fromkeys(state.country for state in states if state.country))
-    for setting, values in (("channel", channels), ("regulatory domain", countries)):
+def setting_problem(states: Sequence[RadioState], at_start: Mapping[str, str]) -> str | None:
+    """Return a sentence if a setting of a radio changed, or None.
+
+    Args:
+        states: The radio before and after an attempt.
+        at_start: Its settings at the start of the trial; a missing one is not compared.
+    """
+    for name in SETTINGS:
+        label = name.replace("_", " ")
+        values = list(dict.fromkeys(state.settings[name] for state in states if name in state.settings))
         if len(values) > 1:
-            return f"the {setting} of its radio changed during the repeat, from {values[0]} to {values[1]}"
+            return f"the {label} of its radio changed during the repeat, from {values[0]} to {values[1]}"
+        if values and values[0] != at_start.get(name, values[0]):
+            return f"the {label} of its radio is {values[0]}, but it was {at_start[name]} at the start of the trial"
     return None
 
 

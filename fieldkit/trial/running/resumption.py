@@ -12,6 +12,7 @@ from fieldkit.core.prompts import Operator
 from fieldkit.trial import journal, step_packages
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan, simulators_text
+from fieldkit.trial.running import radio_settings
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.runner import Outcome, converting_write_errors, place, run_repeats
 from fieldkit.trial.running.stop import Stop
@@ -85,6 +86,7 @@ def continue_trial(
         FieldkitError: As for `begin`.
     """
     plan = resumable(folder)
+    radio_settings.require_unchanged(plan, testbed.shells)
     with journal.locked(folder), converting_write_errors(folder):
         if failed and not journal.reopen_failed(folder, plan) and report_resume:
             sink(Note("no repeat of this trial failed"))

@@ -29,7 +29,7 @@ from fieldkit.core.units import TimeEstimate
 from fieldkit.trial import estimates, journal, rows, store
 from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import motion_control, preflight
+from fieldkit.trial.running import motion_control, preflight, radio_settings
 from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.robots import Robots
@@ -108,6 +108,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
         RobotError: A preflight check failed.
         KeyboardInterrupt: A stop was requested.
     """
+    plan = plan.model_copy(update={"radios": radio_settings.read(plan, testbed.shells)})
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
     with journal.locked(folder), converting_write_errors(folder):

@@ -47,7 +47,7 @@ def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
     entry = to.begin(repeat)
     partial = store.open_attempt(folder, repeat)
     (partial / "ping.txt").write_text(PING, encoding="ascii")
-    to.measured(entry)
+    to.record_measured(entry)
     measured = gates.judge(plan, repeat, AttemptEvidence(partial)).measured
     to.commit(partial, replace(entry, status=Status.VALID), measured)
 
@@ -90,7 +90,7 @@ def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypat
         for repeat in plan.repeats_in_order():
             keep(to, plan, folder, repeat)
         to.summarize()
-        assert to.done == now
+        assert to.finished_count == now
         assert rendered[now] == now
         assert verification.verify(folder) == []
     assert written[120] < 3 * written[60]
@@ -117,7 +117,7 @@ def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
     monkeypatch.setattr(manifest.Manifest, "add", never)
     to = reopened(trial)
     assert to.differences == {}
-    assert (to.done, to.counts(Status.VALID)) == (2, 2)
+    assert (to.finished_count, to.counts(Status.VALID)) == (2, 2)
     to.summarize()
     assert (trial / store.TRIAL_CSV).read_bytes() == table
 
