@@ -20,7 +20,9 @@ def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
     assert resumption.resumable(TRIAL) == PLAN
     monkeypatch.setattr(resumption, "code_hash", lambda: "another")
-    with pytest.raises(ConfigurationError, match=f"started by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
+    with pytest.raises(
+        ConfigurationError, match=f"started with other code .fieldkit .*, {PLAN.code_sha256}"
+    ) as caught:
         resumption.resumable(TRIAL)
     assert caught.value.where == str(TRIAL)
     assert shell_command("fieldkit", "rebuild", TRIAL) in caught.value.remedy

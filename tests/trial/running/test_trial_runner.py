@@ -376,7 +376,7 @@ def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
     assert resumable(folder) == trial
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
-    with pytest.raises(ConfigurationError, match=r"started by other code \(lab-steps 1\.0\)"):
+    with pytest.raises(ConfigurationError, match=r"started with other code \(lab-steps 1\.0\)"):
         resumable(folder)
 
 
