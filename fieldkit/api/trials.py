@@ -124,7 +124,7 @@ class Trials:
     @cached_property
     def repeats(self) -> Table:
         """A row per attempt at a repeat, including void and failed ones, as in `fieldkit export --format parquet`."""
-        return table.of_repeats(self._attempts)
+        return table.repeats_table(self._attempts)
 
     def cells(self, by: str | Iterable[str] = DEFAULT_BY, quantities: str | Iterable[str] | None = None) -> Table:
         """Return a row per condition and quantity with value and 95 % interval, as printed by `fieldkit aggregate`.
@@ -141,7 +141,7 @@ class Trials:
         self._warn_of_mixtures(keys)
         columns_by_name = {column.name: column for column in (*self._attempts.columns, _SOURCE)}
         cells = aggregate(self._attempts, keys, quantities=selected_quantities, words=words)
-        return table.of_cells([columns_by_name[name] for name in keys], cells)
+        return table.cells_table([columns_by_name[name] for name in keys], cells)
 
     def cell(self, **condition: str | float) -> TrialCell:
         """Return the figures of the only cell that matches a condition: `trials.cell(protocol="udp").file_loss.high`.
@@ -205,7 +205,7 @@ class Trials:
                 remedy=did_you_mean(step, transfers, f"its transfers: {names_text}"),
             )
         selected_transfers = transfers if step is None else {step: transfers[step]}
-        return table.of_packets(
+        return table.packets_table(
             {name: fates.read_sent_packets(attempt, transfer) for name, transfer in selected_transfers.items()}
         )
 

@@ -143,7 +143,7 @@ class CampaignRun:
                 self._backend,
                 cast,
                 session=self._plan.session,
-                what=f"campaign {self._plan.campaign.name}",
+                purpose=f"campaign {self._plan.campaign.name}",
                 seed=self._plan.campaign.seed,
                 sink=self._sink,
                 operator=operator,

@@ -259,7 +259,7 @@ class OpenedLab:
                     self.backend,
                     cast,
                     session=self.session,
-                    what="pytest",
+                    purpose="pytest",
                     seed=self.options.seed,
                     sink=self.keeper.add_event,
                     operator=self._operator,

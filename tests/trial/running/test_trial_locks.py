@@ -81,7 +81,7 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
         lock = locks.read_lock(robot)
         assert lock is not None
         assert lock.holder == ANNA
-        assert 50 < lock.left_s <= 60
+        assert 50 < lock.remaining_s <= 60
         alter(robot, (4, "0"))
         assert locks.read_lock(robot) is None, "it has expired"
     assert locks.read_lock(robot) is None
@@ -271,7 +271,7 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
         lock = locks.read_lock(robot)
         assert lock is not None
-        assert lock.left_s > 7200
+        assert lock.remaining_s > 7200
         fresh = record(robot)
         jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
         assert record(robot) == fresh
