@@ -34,7 +34,7 @@ class PublishedTopic(Strict):
         points: For a laser scan, beams per turn; for a point cloud, points of 16 bytes.
         width: For an image, width in pixels of 3 bytes.
         height: For an image, height in pixels.
-        size: For any other type, size of the first list of numbers in each message, `100kB`.
+        size: For any other type, size of the first array of numbers in each message, `100kB`.
         definition: Message definition, as `rosmsg show -r` prints it; needed for types that ROS does not have.
     """
 
