@@ -121,7 +121,7 @@ def index() -> str:
         ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
         (
             "[Classes of the co-simulation](cosim-protocols.md)",
-            "for your own sync policy, physics or network",
+            "for your own sync policy, physics or network simulator",
         ),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Rules and layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),

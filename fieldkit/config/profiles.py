@@ -314,7 +314,7 @@ class RobotProfile(catalog.Named, Sectioned):
     `sensor_msgs/LaserScan` (needs `points`), `Imu`, `BatteryState`, `Range`, `NavSatFix`, `MagneticField`,
     `FluidPressure`, `Temperature`, `nav_msgs/Odometry`, `tf2_msgs/TFMessage` and `geometry_msgs/PoseStamped` the
     values are the measurements of such a sensor on [the moving robot](add-a-robot.md#messages-of-an-emulated-robot).
-    In messages of other types, strings are empty, numbers are 0, quaternions are the identity, and the first list of
+    In messages of other types, strings are empty, numbers are 0, quaternions are the identity, and the first array of
     numbers is noise of the size in the profile. Types with a `definition` need ROS 1.
 
     Attributes:

@@ -209,7 +209,7 @@ CROSS_CHECKS: Final = (
         "file received over TCP",
         ("received_bytes", "file_loss", "hash_match", "goodput_bit_s", "completion_s"),
         "`recv.bag`",
-        ("`scan.bag`: the same content up to there", "both captures: bytes that arrived", "how the listener ended"),
+        ("`scan.bag`: its first bytes", "both captures: bytes that arrived", "how the listener ended"),
         "bytes that its listener did not read before its time limit",
     ),
     CrossCheck(

@@ -83,7 +83,7 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
             ),
             _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
             *_end_fields("known", "that the network assumed when the packet entered it"),
-            *_end_fields("true", "when the packet was sent, without the errors of the sync policy"),
+            *_end_fields("true", "when the packet was sent (true value)"),
         ]
     ),
     "states": pa.schema(
