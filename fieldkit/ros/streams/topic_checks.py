@@ -106,7 +106,9 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
         yield f"the {name}'s log is of another topic than {plan.topic}"
     has_valid_count = (log.kinds.get(topic_samples.BEGUN) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
     unexpected_kinds = (
-        (topic_samples.FOREIGN,) if end == topic_samples.PUBLISHER else (topic_samples.REFUSED, topic_samples.SKIPPED)
+        (topic_samples.FOREIGN, topic_samples.READ, topic_samples.UNREADABLE)
+        if end == topic_samples.PUBLISHER
+        else (topic_samples.REFUSED, topic_samples.SKIPPED)
     )
     if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
         yield f"the {name}'s log has records that no {name} writes"
