@@ -199,7 +199,7 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        return ("topics",)
+        return ("topics", read_checks.SEEN) if self.reads and self.image else ("topics",)
 
     @override
     def files(self) -> tuple[str, ...]:

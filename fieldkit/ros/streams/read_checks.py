@@ -11,6 +11,8 @@ from fieldkit.measure.captures.arrays import Ints
 from fieldkit.ros.streams.topic_checks import MAX_SLEW_NS
 from fieldkit.ros.streams.topic_samples import TopicLog
 
+SEEN: Final = "frames that are seen"
+"""Exclusive resource of steps with the columns of frames that are seen."""
 _HANDOVER_NS: Final = 200_000_000
 """On a busy robot, this much time may pass between the time of arrival of a sample and its first possible read."""
 

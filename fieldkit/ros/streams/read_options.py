@@ -20,7 +20,7 @@ class Reads(Strict):
             time after which the robot stops.
     """
 
-    rate: Annotated[Hertz, Field(gt=0, le=1000)] = 30.0
+    rate: Annotated[Hertz, Field(gt=0, le=1000)] = 60.0
     limit: Annotated[Duration, Field(gt=0, le=60)] = 0.5
 
 

@@ -119,6 +119,16 @@ def checked(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], meas
 
 
 def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
+    """Return the complete logs by role, and an error message for each other log and for samples of other programs."""
+    logs, errors = read_logs(view, files)
+    for name in files.values():
+        log = view.evidence.read_or_none(topic_samples.read_log, name)
+        if log is not None and log.foreign:
+            errors.append(f"{name}: another program also publishes {step.topic}: use another topic or domain")
+    return logs, errors
+
+
+def read_logs(view: View, files: Mapping[Role, str]) -> tuple[dict[Role, TopicLog], list[str]]:
     """Return the complete logs by role, and an error message for each other log."""
     logs, errors = dict[Role, TopicLog](), list[str]()
     for role, name in files.items():
@@ -131,6 +141,4 @@ def read(step: StreamOptions, view: View, files: Mapping[Role, str]) -> tuple[di
             errors.append(f"{name} is incomplete: the agent was stopped")
         else:
             logs[role] = log
-        if log.foreign:
-            errors.append(f"{name}: another program also publishes {step.topic}: use another topic or domain")
     return logs, errors
