@@ -18,7 +18,7 @@ from fieldkit.trial.plan import Plan
 _LAB_KINDS: Final = frozenset(("ask", "run"))
 """Kinds of step whose columns a lab declares."""
 _MORE_IS_BETTER: Final = frozenset(("bit/s", "dBm", "dB"))
-_LOSSES: Final = frozenset((*LOSSES, "topic_loss", "iperf3_loss", "iperf3_captured_loss"))
+_LOSSES: Final = frozenset((*LOSSES, "topic_loss", "video_loss", "iperf3_loss", "iperf3_captured_loss"))
 
 
 class Ranking:
@@ -63,8 +63,8 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
 
 
 _OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
-_OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
-"""Quantities of trials that stream topics, in which pings and transfers only provide clock offset and load."""
+_OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s", "video_loss", "used_age_p95_s", "seen_age_p95_s")
+"""Quantities of trials that stream topics or video, in which pings and transfers only give clock offset and load."""
 _MAX_FIRST: Final = 6
 """Maximum number of headlines of expected quantities and of a lab's quantities."""
 _MAX_PLACES: Final = 3
@@ -128,7 +128,9 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         yield from writer.quantity(quantity.label, [quantity], group_cells)
     for protocol, names in _OF_PROTOCOLS.items():
         of_protocol = [cell for cell in cells if cell.key["protocol"] == protocol]
-        with_topics = [cell for cell in of_protocol if with_plain_name(measured([cell]), _OF_TOPICS[0])]
+        with_topics = [
+            cell for cell in of_protocol if any(with_plain_name(measured([cell]), name) for name in _OF_TOPICS)
+        ]
         others = [cell for cell in of_protocol if cell not in with_topics]
         for group_cells, quantity_names in ((with_topics, _OF_TOPICS), (others, names)):
             for quantities_of_name in _existing_quantities(measured(group_cells), quantity_names):

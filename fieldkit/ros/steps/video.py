@@ -213,9 +213,9 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         sent, received = logs[self.sender], logs[self.receiver]
         reasons = [*topic_checks.check_logs(self._plan(), sent, received), *read_checks.check_reads(received)]
         yield from reasons
-        packets = self._rtp_packets(view, self.sender), self._rtp_packets(view, self.receiver)
-        if not reasons and packets[0] is not None and packets[1] is not None:
-            yield from video_checks.check_captures(sent, received, *packets)
+        sender, receiver = (self._rtp_packets(view, role) for role in (self.sender, self.receiver))
+        if not reasons and sender is not None and receiver is not None:
+            yield from video_checks.check_captures(sent, received, sender, receiver)
 
     def _plan(self) -> "TopicPlan":
         """Return the settings with which the logs are compared."""
@@ -243,17 +243,18 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
         from fieldkit.ros.video import video_columns  # noqa: PLC0415 (as above)
 
         logs, _ = topic_evidence.read_logs(view, self._files)
-        ends = logs.get(self.sender), logs.get(self.receiver)
         roles = self.sender, self.receiver
-        captured = (self._rtp_packets(view, role) for role in roles)
-        captures = (view.capture(role) for role in roles)
-        packets = [capture.packets if capture else None for capture in captures]
+        sent, received = (logs.get(role) for role in roles)
+        rtp_sent, rtp_received = (self._rtp_packets(view, role) for role in roles)
+        captures = [view.capture(role) for role in roles]
+        sender, receiver = (capture.packets if capture else None for capture in captures)
         plan = sample_reads.ReadPlan("seen", self.reads.rate, self.reads.limit, 1 / self.rate)
-        clocks = sample_reads.read_clocks(*packets, *(view.scene.robot(role).address for role in roles))
+        addresses = (view.scene.robot(role).address for role in roles)
+        clocks, unknown_clocks = sample_reads.read_clocks(sender, receiver, *addresses)
         return (
-            video_columns.measure_frames(*ends)
-            | video_columns.measure_packets(*captured, ends[1], 1 / self.rate)
-            | sample_reads.measure(plan, *ends, *clocks)
+            video_columns.measure_frames(sent, received)
+            | video_columns.measure_packets(rtp_sent, rtp_received, received, 1 / self.rate)
+            | sample_reads.measure(plan, sent, received, clocks, unknown_clocks)
         )
 
     def _rtp_packets(self, view: View, role: Role) -> "RtpPackets | None":

@@ -1,4 +1,4 @@
-"""Packets of a video over RTP in captures (RFC 3550, section 5.1). A frame is the packets with the same time stamp."""
+"""Packets of a video over RTP in captures (RFC 3550, section 5.1). Packets of a frame have the same time stamp."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -41,8 +41,10 @@ _OF_CAPTURES: Final = columns(
     (
         "video_undecoded",
         "count",
-        "Frames whose packets all arrived, but which the receiver's pipeline did not return, for example because "
-        "packets were reordered.",
+        (
+            "Frames whose packets all arrived, but which the receiver's pipeline did not return, because its socket "
+            "buffer was full, or packets were reordered."
+        ),
     ),
 )
 COLUMNS: Final = (*_OF_LOGS, *_OF_CAPTURES, *sample_reads.declare_columns("seen", "video_sent"))
