@@ -32,7 +32,7 @@ from fieldkit.agent.messaging.middleware import Network, Topic
 from fieldkit.agent.messaging.stream import HEAD, MAGIC
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 
 HOST: Final = "127.0.0.1"
 DOMAIN: Final = 61
@@ -164,7 +164,9 @@ def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) 
     running = middleware.adapter(middleware_name)(
         Network(HOST, discovery="peers", peers=(HOST,), domain=DOMAIN, settings=settings)
     )
-    topic = Topic.from_json(topics.describe(shipped(), name, TYPE, PROFILES["default"], domain=DOMAIN, node="end"))
+    topic = Topic.from_json(
+        topics.describe(standard_types(), name, TYPE, PROFILES["default"], domain=DOMAIN, node="end")
+    )
     if deliver is None:
         publisher = running.publisher(topic)
         return lambda data: (running, publisher.write(_CDR + data))

@@ -63,7 +63,7 @@ def discover(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:
     states = {name: State(place_m) for name, place_m in places_m.items()}
     for to_ns in range(STEP_NS, TIMEOUT_NS + 1, STEP_NS):
         network.advance(to_ns, (), states)
-        if to_ns >= SECOND_NS and topics[0].matched:
+        if to_ns >= SECOND_NS and topics[0].is_matched:
             return sum(at_ns < SECOND_NS for at_ns in sent_ns), to_ns / SECOND_NS
     return sum(at_ns < SECOND_NS for at_ns in sent_ns), math.inf
 

@@ -31,7 +31,7 @@ from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.loading import load_scenario
-from sim_backends.network.packets import Packet, Received
+from sim_backends.network.packets import Packet, ReceivedDatagram
 from sim_backends.network.radio import RadioNetwork
 from sim_backends.physics.paths import Paths
 from sim_backends.radio.antennas import Antenna
@@ -134,7 +134,7 @@ class PlainLoop:
     def run(self, to_ns: int) -> None:
         """Advance to `to_ns`, window by window."""
         physics, network, wakes, in_transit = self._physics, self._network, self._wakes, self._in_transit
-        received_by_name: dict[str, list[Received]] = {}
+        received_by_name: dict[str, list[ReceivedDatagram]] = {}
         now_ns = 0
         while now_ns < to_ns:
             packets: list[Packet] = []
@@ -151,7 +151,7 @@ class PlainLoop:
             arrivals, drops = network.advance(now_ns, packets, physics.advance(now_ns, {}))
             for arrival in arrivals:
                 packet, payload = in_transit.pop(arrival.packet_id)
-                received_packet = Received(packet.source, payload, packet.sent_ns, arrival.at_ns)
+                received_packet = ReceivedDatagram(packet.source, payload, packet.sent_ns, arrival.at_ns)
                 received_by_name.setdefault(arrival.receiver, []).append(received_packet)
                 self.arrived.append((*packet.identity, arrival.at_ns))
             for drop in drops:
@@ -162,7 +162,9 @@ class PlainLoop:
         if wake_ns is not None:
             heapq.heappush(self._wakes, (wake_ns, name))
 
-    def _wake(self, name: str, at_ns: int, states: Mapping[str, State], received: Sequence[Received]) -> list[Packet]:
+    def _wake(
+        self, name: str, at_ns: int, states: Mapping[str, State], received: Sequence[ReceivedDatagram]
+    ) -> list[Packet]:
         """Wake a program; return the packets that it sends."""
         packets = []
         for datagram in self._programs[name].wake(at_ns, states[name], received).datagrams:

@@ -69,7 +69,7 @@ def store_attempt(ledger: Ledger, plan: Plan, folder: Path, repeat: RepeatId) ->
     attempt = ledger.begin(repeat)
     attempt_folder = store.open_attempt(folder, repeat)
     (attempt_folder / "ping.txt").write_text(_PING, encoding="ascii")
-    ledger.measured(attempt)
+    ledger.record_measured(attempt)
     verdict = gates.judge(plan, repeat, AttemptEvidence(attempt_folder))
     ledger.commit(attempt_folder, replace(attempt, status=Status.VALID), verdict.measured)
     return time.perf_counter() - started_s
@@ -81,7 +81,7 @@ def run(out: Path, repeats: int) -> Path:
     folder = store.create(out, plan)
     (folder / journal.JOURNAL_FILE).touch()
     ledger = Ledger(plan, folder, Stop())
-    times_s = [store_attempt(ledger, plan, folder, repeat) for repeat in list(plan.order())[:repeats]]
+    times_s = [store_attempt(ledger, plan, folder, repeat) for repeat in list(plan.repeats_in_order())[:repeats]]
     started_s = time.perf_counter()
     ledger.summarize()
     print(
@@ -99,9 +99,9 @@ def reopen(folder: Path) -> None:
     started_s = time.perf_counter()
     ledger = Ledger(plan, folder, Stop())
     opened_s = time.perf_counter()
-    done = ledger.done
+    done = ledger.finished_count
     counted_s = time.perf_counter()
-    remaining = [repeat for repeat in plan.order() if not ledger.is_finished(repeat)]
+    remaining = [repeat for repeat in plan.repeats_in_order() if not ledger.is_finished(repeat)]
     times_s = [store_attempt(ledger, plan, folder, repeat) for repeat in remaining[:NEXT]]
     print(
         f"{done:>7} repeats: opened in {opened_s - started_s:7.2f} s, counted in {1e3 * (counted_s - opened_s):9.2f} "

@@ -46,7 +46,7 @@ Row = tuple[str, float, float]
 
 def ns3_name(mode: WifiMode) -> str:
     """Return the name of a mode in ns-3."""
-    return f"HtMcs{mode.name[1:]}" if mode.ht else f"ErpOfdmRate{mode.name[1:]}Mbps"
+    return f"HtMcs{mode.name[1:]}" if mode.is_high_throughput else f"ErpOfdmRate{mode.name[1:]}Mbps"
 
 
 @dataclass(frozen=True)

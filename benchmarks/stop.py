@@ -41,7 +41,7 @@ FIGURES: Final = {
 def measure(lab: RoverLab, out: str) -> dict[str, float]:
     """Return the times of one round, in seconds, by the names of `FIGURES`."""
     lab.place_at("5m")
-    with MotionSampler(lab.field_robots.testbed.robots[Role.SENDER].steered, lab.place_m) as sampler:
+    with MotionSampler(lab.field_robots.testbed.robots[Role.SENDER].recorded_motion, lab.place_m) as sampler:
         trial = start(lab.folder, "trial", "drive", "5m", "--yes", "--allow-motion", "--out", out)
         try:
             lab.wait_until_it_drives(trial)

@@ -28,7 +28,7 @@ from fieldkit.analysis import statistics
 from fieldkit.core.threads import run_parallel
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from fieldkit.ros.streams import topic_samples
 
 PLAIN: Final = {"dds": ("plain",), "zenoh": ("plain", "attached"), "ros1": ("plain",)}
@@ -103,7 +103,7 @@ class AgentPair:
 
     def _topic(self, verb: str) -> dict[str, Any]:
         return topics.describe(
-            shipped(), "/harness", TYPE, PROFILES["default"], domain=_DOMAIN, node=f"harness_{verb}"
+            standard_types(), "/harness", TYPE, PROFILES["default"], domain=_DOMAIN, node=f"harness_{verb}"
         )
 
     def _log(self, verb: str) -> Path:

@@ -1,6 +1,6 @@
 """Field trials of robots whose radio links are under test.
 
-`fieldkit.load("trials")` gives the repeats, cells and packets of trials as tables: docs/python-api.md.
+`fieldkit.load("trials")` returns the repeats, cells and packets of trials as tables; see docs/python-api.md.
 """
 
 TYPE_CHECKING = False  # importing it from `typing` would take longer; type checkers recognize the name
@@ -12,8 +12,8 @@ __version__ = "0.1.0"
 
 if not TYPE_CHECKING:
 
-    def __getattr__(name):  # noqa: ANN001, ANN202 (types are those above)
-        """Import the reader of trials on first use, so that commands that do not need it start faster."""
+    def __getattr__(name):  # noqa: ANN001, ANN202 (the types are declared above)
+        """Import `fieldkit.api.trials` on first use, so that commands that do not need it start faster."""
         if name not in {"Trials", "load"}:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from fieldkit.api import trials  # noqa: PLC0415

@@ -25,7 +25,7 @@ from benchmarks.studies.middleware import LAB, ROOT
 from fieldkit.core import files
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from fieldkit.ros.middlewares import tuning
 from fieldkit.ros.streams import topic_samples
 
@@ -123,7 +123,7 @@ class ImageLab:
             node = f"fieldkit_{verb}"
             network = {"address": address, "domain": _DOMAIN, "port": _PORT, "node": node}
             topic = topics.describe(
-                shipped(),
+                standard_types(),
                 "/images",
                 "std_msgs/msg/UInt8MultiArray",
                 PROFILES[setting.profile],

@@ -29,7 +29,7 @@ from fieldkit.measure.transfers.fates import PACKET_COLUMNS
 from fieldkit.pytest import plugin
 from fieldkit.steps.base import Step, step_types
 from fieldkit.steps.capabilities import CAPABILITIES
-from fieldkit.trial.columns import installed
+from fieldkit.trial.columns import installed_columns
 from fieldkit.trial.procedure import Procedure
 from sim_backends.cosim.recording.packet_tables import SCHEMAS
 from sim_backends.cosim.scenario.agent_plans import MotionPlan, Traffic
@@ -274,7 +274,7 @@ def recording_tables() -> str:
 
 def columns() -> str:
     """Return the page of columns of `trial.csv`, `summary.csv` and comparisons."""
-    trial = installed()
+    trial = installed_columns()
     summary = (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow))
     files = {"trial.csv": trial, "summary.csv": summary, "fieldkit compare": declared(DifferenceRow)}
     blocks = [

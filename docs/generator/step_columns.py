@@ -12,7 +12,7 @@ from fieldkit.motion.logs import drive_log, fly_log, tlog
 from fieldkit.ros.bags import recorded_topics
 from fieldkit.ros.streams import topic_columns, topic_stalls
 from fieldkit.telemetry import telemetry_columns
-from fieldkit.trial.columns import installed
+from fieldkit.trial.columns import installed_columns
 
 STEP_COLUMNS: Final[Mapping[str, tuple[Column, ...]]] = {
     "`ping` with `gap: true`": (*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS),
@@ -55,7 +55,7 @@ def table_rows() -> str:
     """Return the page of the rows of printed tables, with their columns."""
     lines = (
         (column.figure.label, f"`{column.name}`", escaped(column.meaning))
-        for columns in (installed(), *STEP_COLUMNS.values())
+        for columns in (installed_columns(), *STEP_COLUMNS.values())
         for column in columns
         if column.figure is not None
     )

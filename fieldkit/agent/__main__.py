@@ -31,9 +31,10 @@ Arguments = Mapping[str, Any]
 
 
 class StopRequest(threading.Event):
-    """An event that stops the program. A signal handler's request is visible before the main thread's next statement.
+    """An event that stops the program.
 
-    A program that was suspended (SIGSTOP) when the signal arrived therefore sends nothing before it stops.
+    After a signal, `is_set` returns True from the next statement of the main thread on. Therefore, a program that was
+    suspended (SIGSTOP) when the signal arrived sends nothing after it is resumed.
     """
 
     _signalled = False
@@ -51,10 +52,10 @@ class StopRequest(threading.Event):
 
 def main(argv: Sequence[str]) -> int:
     """Run a command line and return its exit code."""
-    if len(argv) == 3 and argv[0] in _WITH_LOG:
-        run = partial(_WITH_LOG[argv[0]], path=argv[2])
-    elif len(argv) == 2 and argv[0] in _WITHOUT_LOG:
-        run = partial(_WITHOUT_LOG[argv[0]])
+    if len(argv) == 3 and argv[0] in _TASKS_WITH_LOG:
+        run = partial(_TASKS_WITH_LOG[argv[0]], path=argv[2])
+    elif len(argv) == 2 and argv[0] in _TASKS_WITHOUT_LOG:
+        run = partial(_TASKS_WITHOUT_LOG[argv[0]])
     else:
         sys.stderr.write(f"{_USAGE}\n")
         return 2
@@ -81,10 +82,10 @@ def _route(arguments: Arguments, stop_event: threading.Event) -> int:
 
 
 def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
-    """Record MAVLink until `stop_event` is set."""
+    """Record MAVLink messages until `stop_event` is set."""
     from fieldkit.agent.autopilots import mavlink  # noqa: PLC0415 (loaded only if needed)
 
-    with _naming_connection(arguments["connection"]):
+    with _add_connection_to_errors(arguments["connection"]):
         try:
             mavlink.record(mavlink.FlightRecording(**arguments), path, stop_event)
         except mavlink.MissingMessageError as error:
@@ -93,25 +94,25 @@ def _record(arguments: Arguments, stop_event: threading.Event, path: str) -> int
 
 
 def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
-    """Drive a robot along its path; return the exit code: 0 if it is back at its origin, 4 if it stopped before."""
+    """Drive a robot along its path; return the exit code: 0 if it is back at its origin, 4 if it stopped earlier."""
     session = middleware.adapter(arguments["over"])(Network(**arguments["network"]))
     try:
         _report(f"up, {session.version}")
-        stopped = drive.drive(session, arguments, Path(path), stop_event)
+        stop_reason = drive.drive(session, arguments, Path(path), stop_event)
     except OSError as error:
-        raise MiddlewareError(f"the robot was stopped: {path} cannot be written: {error.strerror}") from error
+        raise MiddlewareError(f"the robot was stopped, because {path} cannot be written: {error.strerror}") from error
     finally:
         session.close()
-    if stopped:
-        _report(f"stopped: {stopped}")
-    return 4 if stopped else 0
+    if stop_reason:
+        _report(f"stopped: {stop_reason}")
+    return 4 if stop_reason else 0
 
 
 def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
     """Fly a drone, guard it or rescue it, as the plan requires; return the exit code."""
     from fieldkit.agent.flying import flight, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
-    with _naming_connection(arguments["connection"]):
+    with _add_connection_to_errors(arguments["connection"]):
         return flight.fly(flight_plan.FlightPlan(**arguments), stop_event)
 
 
@@ -119,7 +120,7 @@ def _check_arming(arguments: Arguments, stop_event: threading.Event) -> int:
     """Print the faults that prevent a flight; return the exit code."""
     from fieldkit.agent.flying import arming, flight_plan  # noqa: PLC0415 (loaded only if needed)
 
-    with _naming_connection(arguments["connection"]):
+    with _add_connection_to_errors(arguments["connection"]):
         return arming.check_arming(arguments["connection"], flight_plan.FlightNeeds(**arguments["needs"]), stop_event)
 
 
@@ -127,7 +128,7 @@ def _survey(arguments: Arguments, stop_event: threading.Event) -> int:
     """Test a connection; print the result and other possible connections; return the exit code."""
     from fieldkit.agent.links import survey  # noqa: PLC0415 (loaded only if needed)
 
-    with _naming_connection(arguments["connection"]):
+    with _add_connection_to_errors(arguments["connection"]):
         return survey.survey(arguments["connection"], stop_event)
 
 
@@ -135,21 +136,21 @@ def _link(arguments: Arguments, stop_event: threading.Event) -> int:
     """Start a link server, which shares a connection to an autopilot between the programs on this computer."""
     from fieldkit.agent.links import server  # noqa: PLC0415 (loaded only if needed)
 
-    with _naming_connection(arguments["connection"]):
+    with _add_connection_to_errors(arguments["connection"]):
         server.serve(arguments["connection"], stop_event)
     return 0
 
 
 def _datagrams(arguments: Arguments, stop_event: threading.Event) -> int:
-    """Send test datagrams to other robots, or count those that arrive; return the exit code."""
+    """Send test datagrams to other robots, or count received ones; return the exit code."""
     from fieldkit.agent import datagrams  # noqa: PLC0415 (loaded only if needed)
 
     return datagrams.run(arguments, stop_event)
 
 
 @contextmanager
-def _naming_connection(connection: str) -> Iterator[None]:
-    """Add the name of the connection to errors of a connection to an autopilot."""
+def _add_connection_to_errors(connection: str) -> Iterator[None]:
+    """Raise errors of the connection to an autopilot as `MiddlewareError`, with the name of the connection."""
     try:
         yield
     except (OSError, ValueError) as error:
@@ -159,15 +160,15 @@ def _naming_connection(connection: str) -> Iterator[None]:
 def _stream(arguments: Arguments, stop_event: threading.Event, path: str, *, publishes: bool) -> int:
     """Publish a stream of samples, or subscribe to it."""
     settings = Stream(**arguments["stream"])
-    start = middleware.adapter(settings.over)
+    start_middleware = middleware.adapter(settings.over)
     log = Log(path)
     log.origin(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, arguments["topic"]["name"])
-    log.note(records.BEGUN, time.time_ns())
-    session = start(Network(**arguments["network"]))
+    log.note(records.DISCOVERY_STARTED, time.time_ns())
+    session = start_middleware(Network(**arguments["network"]))
     try:
         _report(f"up, {session.version}")
-        transfer = stream.publish if publishes else stream.subscribe
-        transfer(session, Topic.from_json(arguments["topic"]), settings, log, stop_event)
+        run_stream = stream.publish if publishes else stream.subscribe
+        run_stream(session, Topic.from_json(arguments["topic"]), settings, log, stop_event)
     finally:
         session.close()
     log.end(time.time_ns())
@@ -180,7 +181,7 @@ def _stream_video(arguments: Arguments, stop_event: threading.Event, path: str, 
 
     log = Log(path)
     log.origin(time.time_ns(), records.PUBLISHER if sends else records.SUBSCRIBER, rtp_stream.NAME)
-    log.note(records.BEGUN, time.time_ns())
+    log.note(records.DISCOVERY_STARTED, time.time_ns())
     transfer = rtp_stream.send if sends else rtp_stream.receive
     transfer(rtp_stream.Video(**arguments), log, stop_event)
     log.end(time.time_ns())
@@ -192,7 +193,7 @@ def _report(text: str) -> None:
     sys.stderr.flush()
 
 
-_WITH_LOG: Mapping[str, Callable[..., int]] = {
+_TASKS_WITH_LOG: Mapping[str, Callable[..., int]] = {
     "publish": partial(_stream, publishes=True),
     "subscribe": partial(_stream, publishes=False),
     "send-video": partial(_stream_video, sends=True),
@@ -200,7 +201,7 @@ _WITH_LOG: Mapping[str, Callable[..., int]] = {
     "mavlink": _record,
     "drive": _drive,
 }
-_WITHOUT_LOG: Mapping[str, Callable[..., int]] = {
+_TASKS_WITHOUT_LOG: Mapping[str, Callable[..., int]] = {
     "route": _route,
     "fly": _fly,
     "arming": _check_arming,

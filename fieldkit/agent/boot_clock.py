@@ -1,4 +1,4 @@
-"""CLOCK_BOOTTIME (clock_gettime(2)): a monotonic clock that includes the time in which the computer was suspended."""
+"""CLOCK_BOOTTIME (clock_gettime(2)): a monotonic clock that includes time during which the computer is suspended."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Test datagrams between robots: multicast, unicast, and unicast in fragments; each robot counts what arrives.
+"""Test datagrams between robots: multicast, unicast, and unicast in fragments. Each robot counts received datagrams.
 
-They use the multicast group and ports of a DDS domain (RTPS 2.5, section 9.6.2), beside the domain's participants,
-which ignore them because they do not start with `RTPS`.
+They are sent to the multicast group and the ports of a DDS domain (RTPS 2.5, section 9.6.2). Participants of the
+domain ignore them, because they do not start with `RTPS`.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ MULTICAST = "multicast"
 UNICAST = "unicast"
 FRAGMENTED = "fragmented"
 SIZES = {MULTICAST: 200, UNICAST: 200, FRAGMENTED: 8000}
-"""Bytes of payload of each kind; 8,000 bytes are 6 fragments at an MTU of 1,500 bytes."""
+"""Payload size of each kind in bytes; 8,000 bytes are 6 fragments at an MTU of 1,500 bytes."""
 
 _POLL_S = 0.2
-_LAST_S = 0.2
-"""Time after a stop in which datagrams are counted that arrived before it."""
+_DRAIN_S = 0.2
+"""Maximum time after a stop for counting the datagrams that arrived before it."""
 _MAX_BYTES = 65_536
 _MAX_SENDERS = 64
 """Number of sender addresses that are counted; others are ignored."""
@@ -74,13 +74,13 @@ def send(ports: DatagramPorts, peers: Sequence[str], count: int, interval_s: flo
 def receive(ports: DatagramPorts, stop_event: threading.Event, limit_s: float) -> dict[str, dict[str, int]]:
     """Count the datagrams of the test until `stop_event` is set, for at most `limit_s`.
 
-    Writes `up` to standard error when it listens.
+    Writes `up` to standard error when the sockets are open.
 
     Returns:
-        Number of different datagrams by kind, by address of the sender.
+        Number of distinct datagrams by address of the sender, then by kind.
 
     Raises:
-        OSError: A port is used by another program that does not share it, or the address is not of this robot.
+        OSError: Another program uses a port and does not share it, or this robot does not have the address.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as group, socket.socket(
         socket.AF_INET, socket.SOCK_DGRAM
@@ -99,11 +99,11 @@ def receive(ports: DatagramPorts, stop_event: threading.Event, limit_s: float) -
 def _count(
     sockets: Sequence[socket.socket], token: str, stop_event: threading.Event, end_s: float
 ) -> dict[str, dict[str, int]]:
-    numbers: dict[str, dict[str, set[bytes]]] = {}
+    numbers_by_sender: dict[str, dict[str, set[bytes]]] = {}
     while True:
         if stop_event.is_set():
-            end_s = min(end_s, time.monotonic() + _LAST_S)
-        readable, _, _ = select.select(sockets, [], [], _LAST_S if stop_event.is_set() else _POLL_S)
+            end_s = min(end_s, time.monotonic() + _DRAIN_S)
+        readable, _, _ = select.select(sockets, [], [], _DRAIN_S if stop_event.is_set() else _POLL_S)
         # Datagrams that arrived before the stop are still counted.
         if time.monotonic() >= end_s or (stop_event.is_set() and not readable):
             break
@@ -113,14 +113,17 @@ def _count(
             if len(words) < 4 or words[:2] != [b"fieldkit", token.encode("ascii")]:
                 continue
             kind = words[2].decode("ascii", "replace")
-            known = address in numbers or len(numbers) < _MAX_SENDERS
-            if known and len(data) == SIZES.get(kind) and words[3].isdigit() and len(words[3]) <= 4:
-                numbers.setdefault(address, {}).setdefault(kind, set()).add(words[3])
-    return {address: {kind: len(seen) for kind, seen in kinds.items()} for address, kinds in numbers.items()}
+            is_counted_sender = address in numbers_by_sender or len(numbers_by_sender) < _MAX_SENDERS
+            if is_counted_sender and len(data) == SIZES.get(kind) and words[3].isdigit() and len(words[3]) <= 4:
+                numbers_by_sender.setdefault(address, {}).setdefault(kind, set()).add(words[3])
+    return {
+        address: {kind: len(numbers) for kind, numbers in numbers_by_kind.items()}
+        for address, numbers_by_kind in numbers_by_sender.items()
+    }
 
 
 def run(arguments: Mapping[str, Any], stop_event: threading.Event) -> int:
-    """Send test datagrams if there are peers, otherwise print the counts of received ones; return the exit code."""
+    """Send test datagrams if there are peers, otherwise receive them and print their counts; return the exit code."""
     ports = DatagramPorts(**arguments["ports"])
     try:
         if arguments["peers"]:

@@ -14,33 +14,33 @@ class NumberedLines:
     """A log of JSON objects, one per line.
 
     Args:
-        lines: The open file.
+        file: The open file.
     """
 
-    def __init__(self, lines: IO[str]) -> None:
-        self._lines = lines
+    def __init__(self, file: IO[str]) -> None:
+        self._file = file
         self._count = self._checksum = 0
 
     def write(self, values: Mapping[str, Any]) -> str:
         """Write a line with its number as `n`, and return it; raises `OSError` if it cannot be written."""
-        return self._append(self._numbered(values))
+        return self._append(self._numbered_line(values))
 
     def end(self, values: Mapping[str, Any]) -> str:
         """Write the last line and return it; its last member `crc32` is the CRC-32 of everything before that member.
 
         Raises:
-            OSError: It cannot be written.
+            OSError: The line cannot be written.
         """
-        line = self._numbered(values)
-        total = zlib.crc32(line.encode("ascii"), self._checksum)
-        return self._append(f'{line[:-1]}, "crc32": {total}}}')
+        line = self._numbered_line(values)
+        checksum = zlib.crc32(line.encode("ascii"), self._checksum)
+        return self._append(f'{line[:-1]}, "crc32": {checksum}}}')
 
-    def _numbered(self, values: Mapping[str, Any]) -> str:
+    def _numbered_line(self, values: Mapping[str, Any]) -> str:
         return json.dumps({"n": self._count, **values})
 
     def _append(self, line: str) -> str:
-        self._lines.write(line + "\n")
-        self._lines.flush()
+        self._file.write(line + "\n")
+        self._file.flush()
         self._checksum = zlib.crc32((line + "\n").encode("ascii"), self._checksum)
         self._count += 1
         return line

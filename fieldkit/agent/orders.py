@@ -1,4 +1,4 @@
-"""Orders of the laptop to a program on a robot. Each order is valid for a time, its lease.
+"""Orders from the laptop to a program on a robot. Each order is valid for a limited time, its lease.
 
 The laptop replaces a file with one line `NUMBER ORDER SECONDS`; the number increases with each order.
 """
@@ -15,7 +15,7 @@ _MAX_BYTES = 100
 
 
 class Orders:
-    """The present order of the laptop and its lease.
+    """The current order of the laptop and its lease.
 
     Args:
         path: The file, which may be missing.
@@ -23,7 +23,7 @@ class Orders:
         lease_s: Timeout for the first order.
 
     Attributes:
-        order: The last order; the first of the valid orders before an order arrived.
+        order: The last order; the first of the valid orders until an order arrives.
     """
 
     def __init__(self, path: str, valid_orders: Sequence[str], lease_s: float) -> None:
@@ -37,17 +37,17 @@ class Orders:
         """Read the file; return True if it contains a new order, which may be a renewal of the last one."""
         try:
             with open(self._path, encoding="ascii") as file:  # noqa: PTH123 (Python 3.8)
-                number, order, lease = file.read(_MAX_BYTES).split()
-            count, lease_s = int(number), float(lease)
+                number_text, order, lease_text = file.read(_MAX_BYTES).split()
+            number, lease_s = int(number_text), float(lease_text)
         except (OSError, ValueError):
             return False
-        if count <= self._number or order not in self._valid_orders or math.isnan(lease_s):
+        if number <= self._number or order not in self._valid_orders or math.isnan(lease_s):
             return False
-        self._number, self.order = count, order
+        self._number, self.order = number, order
         self._expiry_s = now_s() + min(max(lease_s, 0.0), _MAX_LEASE_S)
         return True
 
     @property
     def expired(self) -> bool:
-        """Whether the last order was not renewed in time; includes time in which the computer was suspended."""
+        """Whether the last order was not renewed in time. Time during which the computer was suspended counts."""
         return now_s() > self._expiry_s

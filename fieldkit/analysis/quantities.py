@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, Self
 
-from fieldkit.core.columns import BACKGROUND, FIRST_OF_OTHERS, Bounds, Column, Kind, plain_name, step_prefixed
+from fieldkit.core.columns import BACKGROUND, FIRST_EXTERNAL_RANK, Bounds, Column, Kind, plain_name, step_prefixed
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import BITS_PER_S_PER_UNIT, FRACTION_PER_UNIT, SECONDS_PER_UNIT, parse_quantity
 
@@ -42,7 +42,7 @@ class Quantity:
     arrived: str | None = None
     sent: str | None = None
     possible: Bounds = (-sys.float_info.max, sys.float_info.max)
-    rank: int = FIRST_OF_OTHERS
+    rank: int = FIRST_EXTERNAL_RANK
     at_least: str | None = None
     of_sent: str | None = None
 
@@ -78,7 +78,7 @@ class Quantity:
     @property
     def is_builtin(self) -> bool:
         """Whether it is a built-in quantity; False if another package or a lab declares it."""
-        return not FIRST_OF_OTHERS <= self.rank < BACKGROUND
+        return not FIRST_EXTERNAL_RANK <= self.rank < BACKGROUND
 
     @property
     def payload(self) -> str | None:

@@ -136,7 +136,7 @@ class Trials:
         Raises:
             ConfigurationError: There is no such column, or it cannot be aggregated.
         """
-        chosen, words = self._sources.chosen(_names(quantities or ()), option="quantities")
+        chosen, words = self._sources.select(_names(quantities or ()), option="quantities")
         keys = self._sources.condition(",".join(_names(by)), option="by")
         self._warn_of_mixtures(keys)
         declared = {column.name: column for column in (*self._attempts.columns, _SOURCE)}

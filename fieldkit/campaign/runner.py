@@ -99,7 +99,7 @@ class CampaignRun:
         shortened = (
             line for trial in remaining for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        undecided = (line for trial in remaining for line in shortfalls.of_plan(self._plans[trial]))
+        undecided = (line for trial in remaining for line in shortfalls.undecidable_expectations(self._plans[trial]))
         for line in dict.fromkeys((*shortened, *undecided)):
             self._sink(Note(line))
 
@@ -167,7 +167,7 @@ class CampaignRun:
             require_cast(plan, cast)
         placement = place(plan, testbed, self._sink)
         progress = TrialProgress.SKIPPED if placement.answer.skip else TrialProgress.PLACED
-        self._journal.add(trial, progress, note=placement.answer.note, took_s=placement.took_s)
+        self._journal.add(trial, progress, note=placement.answer.note, took_s=placement.duration_s)
         if not placement.answer.skip:
             # A stopped trial is resumed by the campaign's command, so `report_resume` is False.
             if folder is None:
@@ -216,7 +216,7 @@ class CampaignRun:
         placement = TimeEstimate(placing_s, placing_s)
         finished = self._finished_repeats()
         return estimates.total(
-            part for trial in trials for part in (placement, estimates.of_trial(self._plans[trial], finished))
+            part for trial in trials for part in (placement, estimates.estimate_trial(self._plans[trial], finished))
         )
 
     def _finished_repeats(self) -> list[FinishedRepeat]:

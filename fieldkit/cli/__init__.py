@@ -23,13 +23,13 @@ INTERRUPTED: Final = 130
 
 EXIT_CODES: Final[Mapping[int, str]] = MappingProxyType(
     {
-        0: "Done; for `trial`: every repeat ended valid.",
+        0: "Done; for `trial`: every repeat is valid.",
         1: "A threshold was missed, an expectation was not shown to hold, or something was not done because the "
         "operator skipped it.",
         INTERRUPTED: "Interrupted by Ctrl-C; all finished repeats are saved.",
     }
 )
-"""Exit codes that do not belong to a family of errors."""
+"""Exit codes that do not belong to a subclass of `FieldkitError`."""
 
 _COLLECT_AFTER: Final = 50_000
 """New objects between two runs of the cyclic garbage collector.
@@ -44,8 +44,8 @@ The threads are useful only for larger matrices.
 """
 
 _EPILOG: Final = """\
-begin with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s
-begin with real ones:        fieldkit init
+start with emulated robots:  fieldkit trial los 30ft --repeats 1 --record 1s
+start with real robots:      fieldkit init
 
 exit codes: 0 valid, 1 threshold missed or something not done, 2 usage or
 configuration, 3 robot or link, 4 evidence not valid, 130 interrupted with the
@@ -63,14 +63,14 @@ def parser() -> Parser:
     top.add_argument("--version", action="version", version=f"fieldkit {__version__}")
     subparsers = top.add_commands(title="commands", metavar="COMMAND")
     commands.add_all(subparsers)
-    top.set_defaults(outside=None)
+    top.set_defaults(plugin=None)
     add_plugin_commands(subparsers)
     return top
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
-    _fill_streams()
+    _open_missing_streams()
     gc.set_threshold(_COLLECT_AFTER)
     os.environ.setdefault(*_ONE_THREAD)
     if "_ARGCOMPLETE" in os.environ:  # a shell requests completions
@@ -78,21 +78,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         completion.write_completions(parser())
     top = parser()
-    with hints.completing(top) as options:
-        return _run_guarded(top, argv, options)
+    with hints.adding_options(top) as options:
+        return _run_with_error_messages(top, argv, options)
 
 
-def _fill_streams() -> None:
+def _open_missing_streams() -> None:
     """Open standard streams that the caller closed (`>&-`).
 
-    Otherwise a file of a trial would get the free file descriptor, and output of a child process would go into it.
+    Otherwise a file of a trial could get the free file descriptor, and output of a child process would be written to
+    it.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115 (open until exit)
 
 
-def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOptions) -> int:
+def _run_with_error_messages(top: Parser, argv: Sequence[str] | None, options: hints.CliOptions) -> int:
     """Parse and run the command. Print any error that stops it, and return its exit code."""
     try:
         arguments = top.parse_args(argv)
@@ -110,10 +111,11 @@ def _run_guarded(top: Parser, argv: Sequence[str] | None, options: hints.CliOpti
         return 0
     except OSError as error:
         # Library functions wrap the errors that they expect. A full disk can make any write fail.
-        fix = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct this"
+        remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct this"
         location = error.filename or "its output"
         _show_error(
-            f"{location}: {error.strerror}\n  remedy: {fix}, then run the command again; finished repeats are saved"
+            f"{location}: {error.strerror}\n"
+            f"  remedy: {remedy}, then run the command again; finished repeats are saved"
         )
         return ConfigurationError.exit_code
     except MemoryError:
@@ -130,7 +132,7 @@ def _run(arguments: argparse.Namespace) -> int:
         arguments.parser.print_help()
         return 0
     run: Callable[[argparse.Namespace], int]
-    run = arguments.run if arguments.outside is None else load_plugin(arguments.outside, arguments.run)
+    run = arguments.run if arguments.plugin is None else load_plugin(arguments.plugin, arguments.run)
     return run(arguments)
 
 

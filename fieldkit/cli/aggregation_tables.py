@@ -53,8 +53,8 @@ def show(arguments: argparse.Namespace) -> int:
         workers=Workers(arguments.jobs, arguments.cluster),
         use_index=arguments.use_index,
     ).with_filter(arguments.where)
-    by = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
-    selected, words = data.chosen(arguments.quantity)
+    condition_columns = (arguments.by == CONDITION and data.sweep_condition) or data.condition(arguments.by)
+    selected, words = data.select(arguments.quantity)
     if words and output_format == "latex":
         raise ConfigurationError(
             f"--quantity: the values of {words[0].name} are words, and latex tables have no column for words",
@@ -65,30 +65,34 @@ def show(arguments: argparse.Namespace) -> int:
             f"--width: {output_format} has no column for it", remedy="choose --format table, csv or json"
         )
     quantities = _default_quantities(output_format, data.quantities) if selected is None else selected
-    counted = list(data.words.values()) if words is None else words
+    text_columns = list(data.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
-    needed = {name for quantity in quantities for name in quantity.needed} | {quantity.name for quantity in counted}
-    mixed = {column.name for column in data.columns if plain_name(column.name) in MIXTURE_COLUMNS}
-    repeats = data.read({*by, *needed, *mixed, "started_utc_ns"})
-    for mixture in mixtures(repeats, by):
+    needed_names = {name for quantity in quantities for name in quantity.needed} | {
+        quantity.name for quantity in text_columns
+    }
+    mixture_names = {column.name for column in data.columns if plain_name(column.name) in MIXTURE_COLUMNS}
+    repeats = data.read({*condition_columns, *needed_names, *mixture_names, "started_utc_ns"})
+    for mixture in mixtures(repeats, condition_columns):
         show_note(mixture.removesuffix("."))
-    cells = aggregate(repeats, by, quantities=quantities, words=counted)
-    more = additional_repeats_by_cell(cells, widths) if widths else ()
+    cells = aggregate(repeats, condition_columns, quantities=quantities, words=text_columns)
+    additional = additional_repeats_by_cell(cells, widths) if widths else ()
     if output_format in _FOR_PROGRAMS:
-        print_text(_FOR_PROGRAMS[output_format](by, cells, more), end="")
+        print_text(_FOR_PROGRAMS[output_format](condition_columns, cells, additional), end="")
     elif output_format in _FOR_PAPERS:
         if output_format == "latex":
             _require_figures(cells, quantities)
-        print_text(_FOR_PAPERS[output_format](by, cells, quantities), end="")
+        print_text(_FOR_PAPERS[output_format](condition_columns, cells, quantities), end="")
     else:
-        judgements = _judgements_shown(data, repeats, cells, quantities)
+        judgements = _shown_judgements(data, repeats, cells, quantities)
         expected = {judgement.expectation.quantity for judgement in judgements}
         show_all = arguments.all or selected is not None or bool(widths)
-        shown = table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
-        _show(by, cells, shown, more)
-        _show_expected(by, cells, judgements)
-        _note_omitted(cells, shown)
+        shown_lines = (
+            table_lines.lines(cells, quantities) if show_all else table_lines.operator_lines(cells, expected)
+        )
+        _show(condition_columns, cells, shown_lines, additional)
+        _show_expected(condition_columns, cells, judgements)
+        _note_omitted(cells, shown_lines)
     available = {name for cell in cells for name in (*cell.estimates, *cell.tallies)}
     if missing := [name for name in arguments.quantity if name not in available]:
         show_note(f"no valid repeat has {' or '.join(missing)}")
@@ -137,88 +141,102 @@ def _width(text: str, quantities: Sequence[Quantity]) -> tuple[str, float]:
     return unit, width
 
 
-def _note_omitted(cells: Sequence[Cell], shown: Sequence[TableLine]) -> None:
+def _note_omitted(cells: Sequence[Cell], shown_lines: Sequence[TableLine]) -> None:
     """Print the number of quantities that are not shown."""
-    names = {quantity.name for line in shown for quantity in line.quantities}
-    if left_out := len({quantity.name for quantity in wording.measured(cells)} - names):
-        print_folded(f"{results.more_rows_note(left_out)}: add --all")
+    names = {quantity.name for line in shown_lines for quantity in line.quantities}
+    if omitted_count := len({quantity.name for quantity in wording.measured(cells)} - names):
+        print_folded(f"{results.more_rows_note(omitted_count)}: add --all")
 
 
-def _show(by: Sequence[str], cells: Sequence[Cell], shown: Sequence[TableLine], more: _AdditionalRepeats) -> None:
-    """Print a table of the repeats, and a table for each line of `shown`."""
+def _show(
+    condition_columns: Sequence[str],
+    cells: Sequence[Cell],
+    shown_lines: Sequence[TableLine],
+    additional: _AdditionalRepeats,
+) -> None:
+    """Print a table of the repeats, and a table for each line of `shown_lines`."""
     counts = [{"valid": str(cell.n_valid), "void": str(cell.n_void), "failed": str(cell.n_failed)} for cell in cells]
-    _show_table("repeats", by, cells, counts)
-    differing, _ = wording.varying_and_common(by, cells)
-    for line in shown:
+    _show_table("repeats", condition_columns, cells, counts)
+    differing_columns, _ = wording.varying_and_common(condition_columns, cells)
+    for line in shown_lines:
         measured_cells = [cell for cell in cells if line.estimate(cell) or line.is_lacking(cell)]
         scale = line.scale(measured_cells)
         figures = [_figures(line, cell, scale) for cell in measured_cells]
-        if any(quantity.name in additional for additional in more for quantity in line.quantities):
+        if any(quantity.name in cell_repeats for cell_repeats in additional for quantity in line.quantities):
             figures = [
-                {**figure, "more": str(_additional_repeats(line, cell, more[cells.index(cell)]))}
+                {**figure, "more": str(_additional_repeats(line, cell, additional[cells.index(cell)]))}
                 for figure, cell in zip(figures, measured_cells, strict=True)
             ]
         if measured_cells:
-            _show_table(scale.head(line.label.removesuffix(", median")), differing, measured_cells, figures)
+            _show_table(scale.head(line.label.removesuffix(", median")), differing_columns, measured_cells, figures)
     for name, label in wording.word_labels(cells).items():
         measured_cells = [cell for cell in cells if name in cell.tallies]
         figures = [
             {"n": _repeat_count(cell.tallies[name].n, cell), "repeats with each": wording.tally(cell, name)}
             for cell in measured_cells
         ]
-        _show_table(label, differing, measured_cells, figures, words=1)
-    for caution in wording.cautions(cells, {quantity.name for line in shown for quantity in line.quantities}):
+        _show_table(label, differing_columns, measured_cells, figures, words=1)
+    for caution in wording.cautions(cells, {quantity.name for line in shown_lines for quantity in line.quantities}):
         print_folded(caution)
 
 
-def _judgements_shown(
+def _shown_judgements(
     data: Sources, repeats: Repeats, cells: Sequence[Cell], quantities: Sequence[Quantity]
 ) -> Sequence[Judgement]:
     """Return the judgements of the trials' expectations about the quantities that are shown."""
-    shown = {quantity.name for quantity in quantities}
+    shown_names = {quantity.name for quantity in quantities}
     if not (expected := data.expectations()):
         return ()
     rows = repeats.groups(tuple(cells[0].key))
 
     def expectations_of(cell: Cell) -> Iterator[Expectation]:
         for source in dict.fromkeys(repeats.texts[SOURCE][rows[tuple(cell.key.values())]]):
-            yield from (item for item in expected.get(source, ()) if item.quantity in shown)
+            yield from (item for item in expected.get(source, ()) if item.quantity in shown_names)
 
     return judge_by_trial((cell, expectations_of(cell)) for cell in cells)
 
 
-def _show_expected(by: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
+def _show_expected(condition_columns: Sequence[str], cells: Sequence[Cell], judgements: Sequence[Judgement]) -> None:
     """Print for each condition whether its expectations are shown to hold; without expectations, print nothing."""
-    differing, _ = wording.varying_and_common(by, cells)
+    differing_columns, _ = wording.varying_and_common(condition_columns, cells)
     rows = []
     for judgement in judgements:
-        expected, _, *judged = judgement_texts(judgement)
+        expected, _, *judgement_columns = judgement_texts(judgement)
         rows.append(
-            (expected, *(wording.key(judgement.cell, name) if judgement.cell else "" for name in differing), *judged)
+            (
+                expected,
+                *(wording.key(judgement.cell, name) if judgement.cell else "" for name in differing_columns),
+                *judgement_columns,
+            )
         )
     if rows:
-        head = ("expected", *differing, "measured", "95 % interval", "")
+        head = ("expected", *differing_columns, "measured", "95 % interval", "")
         table(head, rows, fold=(0, len(head) - 1))
 
 
 def _show_table(
-    title: str, by: Sequence[str], cells: Sequence[Cell], figures: Sequence[Mapping[str, str]], *, words: int = 0
+    title: str,
+    condition_columns: Sequence[str],
+    cells: Sequence[Cell],
+    figures: Sequence[Mapping[str, str]],
+    *,
+    words: int = 0,
 ) -> None:
     """Print a row per cell. Key columns that all cells share go into the title. The last `words` columns are text."""
-    differing, common = wording.varying_and_common(by, cells)
+    differing_columns, common = wording.varying_and_common(condition_columns, cells)
     full_title = ", ".join([title, *dict.fromkeys(wording.key(cells[0], name) for name in common)])
-    head = [*differing, *figures[0]]
+    head = [*differing_columns, *figures[0]]
     rows = [
-        [*(wording.key(cell, name) for name in differing), *values.values()]
+        [*(wording.key(cell, name) for name in differing_columns), *values.values()]
         for cell, values in zip(cells, figures, strict=True)
     ]
-    table(head, rows, title=full_title, right=range(len(differing), len(head) - words))
+    table(head, rows, title=full_title, right=range(len(differing_columns), len(head) - words))
 
 
-def _additional_repeats(line: TableLine, cell: Cell, more: Mapping[str, int]) -> int | str:
+def _additional_repeats(line: TableLine, cell: Cell, additional: Mapping[str, int]) -> int | str:
     """Return the number of additional repeats that a cell needs, or an empty string if it is unknown."""
     estimate = line.estimate(cell)
-    return more.get(estimate.quantity.name, "") if estimate else ""
+    return additional.get(estimate.quantity.name, "") if estimate else ""
 
 
 def _repeat_count(n: int, cell: Cell) -> str:

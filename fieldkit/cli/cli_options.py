@@ -46,7 +46,7 @@ def request(arguments: argparse.Namespace, distance: Distance, *, seed: int = 1,
 
 @contextmanager
 def operator(arguments: argparse.Namespace, sink: Sink) -> Iterator[Operator]:
-    """Yield the operator: none with `--yes`, the answers of a file or a pipe, or the person at the terminal.
+    """Yield the operator: the person at the terminal, a file or pipe with answers, or no person with `--yes`.
 
     Raises:
         ConfigurationError: The answers cannot be read.
@@ -74,18 +74,18 @@ def _open_answers(path: str) -> TextIO:
         ) from error
 
 
-def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
+def run_elsewhere(selected_backend: Backend, arguments: argparse.Namespace, results: Path) -> int | None:
     """Run this command line where the backend requires it. Return its exit code; None if it must run here.
 
     Args:
-        chosen: The backend.
+        selected_backend: The backend.
         arguments: The arguments of the command.
         results: Folder of the results.
 
     Raises:
         ConfigurationError: The command would write a file outside of that folder.
     """
-    if not isinstance(chosen, Relocating) or not chosen.must_relocate:
+    if not isinstance(selected_backend, Relocating) or not selected_backend.must_relocate:
         return None
     junit: Path | None = getattr(arguments, "junit", None)
     if junit is not None and not junit.resolve().is_relative_to(results.resolve()):
@@ -94,7 +94,7 @@ def run_elsewhere(chosen: Backend, arguments: argparse.Namespace, results: Path)
             where="--junit",
             remedy=f"write for example --junit {results / junit.name}",
         )
-    return chosen.run_elsewhere(arguments.words, results)
+    return selected_backend.run_elsewhere(arguments.words, results)
 
 
 def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
@@ -107,6 +107,6 @@ def backend(arguments: argparse.Namespace, sink: Sink) -> tuple[str, Backend]:
     if site is None and arguments.backend is None:
         sink(Note(f"no site file {SITE_FILE} here: using emulated robots"))
     name = backend_name(arguments, site)
-    chosen = load_backend(name, site, document)
-    chosen.permissions = permissions.granted(arguments)
-    return name, chosen
+    selected_backend = load_backend(name, site, document)
+    selected_backend.permissions = permissions.granted(arguments)
+    return name, selected_backend

@@ -17,7 +17,7 @@ from fieldkit.trial.stored import sources
 from fieldkit.trial.stored.sources import Sources
 
 _DISTANCE: Final = frozenset({"distance", "distance_m"})
-_OF_SETTINGS: Final = frozenset({"procedure_sha256", "profiles_sha256"})
+_SETTINGS_HASHES: Final = frozenset({"procedure_sha256", "profiles_sha256"})
 """Hashes that contain the settings of a sweep."""
 _EXAMPLE: Final = "write for example --between policy=sliding_window,scheduled"
 
@@ -67,19 +67,19 @@ def read(arguments: argparse.Namespace) -> Sides:
     if is_default:
         by = tuple(other for other in by if other not in varied)
     rows = [run.read(also=(*by, name)) for run in (a, b)]
-    of_a, of_b = _two_values(rows, name, values)
+    value_a, value_b = _two_values(rows, name, values)
     is_sweep = bool(a.sweep_condition) and paths[0] == paths[1]
     return Sides(
-        _with_value(rows[0], name, of_a),
-        _with_value(rows[1], name, of_b),
+        _with_value(rows[0], name, value_a),
+        _with_value(rows[1], name, value_b),
         by,
         a,
-        varied | (_OF_SETTINGS if is_sweep else frozenset()),
+        varied | (_SETTINGS_HASHES if is_sweep else frozenset()),
     )
 
 
 def _same_factor(run: Sources) -> list[frozenset[str]]:
-    """Return the columns of each factor of a sweep: its values as in the command, and as numbers."""
+    """Return the columns of each factor of a sweep: its values as in the command, and its values as numbers."""
     return [frozenset(names) for names in run.sweep_columns.items()]
 
 
@@ -108,18 +108,18 @@ def _two_values(sides: Sequence[Repeats], name: str, text: str) -> tuple[str, st
     Raises:
         ConfigurationError: There are not two different values in the data.
     """
-    in_a, in_b = (dict.fromkeys(_texts(side, name)) for side in sides)
+    values_a, values_b = (dict.fromkeys(_texts(side, name)) for side in sides)
     parts = text.split(",")
     splits = [(",".join(parts[:count]), ",".join(parts[count:])) for count in range(1, len(parts))]
     if not splits:
         raise ConfigurationError(f"--between: {name}={text}: write two values, separated by a comma", remedy=_EXAMPLE)
     for first, second in splits:
-        if first in in_a and second in in_b:
+        if first in values_a and second in values_b:
             if first == second:
                 raise ConfigurationError(f"--between: {name}={text}: write two different values", remedy=_EXAMPLE)
             return first, second
     first, second = splits[0]
-    missing, values = (first, in_a) if first not in in_a else (second, in_b)
+    missing, values = (first, values_a) if first not in values_a else (second, values_b)
     raise ConfigurationError(
         f"--between: no attempt has {name} {missing!r}",
         remedy=did_you_mean(missing, values, f"it is one of: {', '.join(values)}"),

@@ -38,7 +38,7 @@ def show(arguments: argparse.Namespace) -> int:
         raise ConfigurationError(
             "A and B are not comparable:" + "".join(f"\n  {refusal}" for refusal in comparison.refusals),
             remedy=f"run both under the same conditions (to look up a name: fieldkit columns show NAME)"
-            f"{_without_marks(comparison)}; or, to compare them anyway, add --force",
+            f"{_marks_remedy(comparison)}; or, to compare them anyway, add --force",
         )
     for concern in comparison.concerns:
         show_note(f"{_concern_text(comparison, concern)}: {concern}")
@@ -49,10 +49,10 @@ def show(arguments: argparse.Namespace) -> int:
     return THRESHOLD_MISSED if comparison.exceeds_threshold else 0
 
 
-def _without_marks(comparison: Comparison) -> str:
-    """Return the option that leaves out marked repeats, if marks are a reason for the refusal."""
+def _marks_remedy(comparison: Comparison) -> str:
+    """Return the option that excludes marked repeats; empty if marks are not a reason for the refusal."""
     has_marks = any(refusal.what.startswith(f"{MARKS}, ") for refusal in comparison.refusals)
-    return f""", or leave out marked repeats: --where '{MARKS} == "{NO_MARKS}"'""" if has_marks else ""
+    return f""", or exclude marked repeats: --where '{MARKS} == "{NO_MARKS}"'""" if has_marks else ""
 
 
 def _threshold(text: str, quantities: Mapping[str, Quantity]) -> tuple[str, float]:
@@ -86,12 +86,12 @@ def _concern_text(comparison: Comparison, concern: Concern) -> str:
 
 def _require_common_condition(comparison: Comparison, arguments: argparse.Namespace) -> None:
     if all(pair.missing_in for pair in comparison.pairs):
-        has_a, has_b = (
+        conditions_a, conditions_b = (
             "; ".join(pair.name for pair in comparison.pairs if pair.missing_in == other) or "nothing"
             for other in "BA"
         )
         raise ConfigurationError(
-            f"A and B have no condition in common:\n  A has {has_a}\n  B has {has_b}",
+            f"A and B have no condition in common:\n  A has {conditions_a}\n  B has {conditions_b}",
             remedy=_pairing_remedy(comparison, arguments),
         )
 
@@ -100,8 +100,10 @@ def _pairing_remedy(comparison: Comparison, arguments: argparse.Namespace) -> st
     """Return a remedy for two runs without a common condition: columns by which they can be paired."""
     sides = [[pair.key for pair in comparison.pairs if pair.missing_in == other] for other in "BA"]
     values = {name: [{key[name] for key in keys} for keys in sides] for name in comparison.by}
-    disjoint = [name for name, (in_a, in_b) in values.items() if in_a.isdisjoint(in_b)]
-    distinguishing = [name for name, (in_a, in_b) in values.items() if name not in disjoint and len(in_a | in_b) > 1]
+    disjoint = [name for name, (values_a, values_b) in values.items() if values_a.isdisjoint(values_b)]
+    distinguishing = [
+        name for name, (values_a, values_b) in values.items() if name not in disjoint and len(values_a | values_b) > 1
+    ]
     by = ("--by", ",".join(distinguishing) or "protocol")
     options = ("--between", arguments.between) if arguments.between else ()
     paths = [arguments.a] if arguments.b is None else [arguments.a, arguments.b]

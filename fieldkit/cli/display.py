@@ -22,7 +22,7 @@ from rich.text import Text
 from typing_extensions import override
 
 from fieldkit.cli.event_words import event_words
-from fieldkit.cli.hints import completed
+from fieldkit.cli.hints import add_options
 from fieldkit.core.events import Event, Finding, Sink
 from fieldkit.core.model import Verdict
 from fieldkit.core.text import json_text, sanitized
@@ -46,12 +46,12 @@ def _console(*, stderr: bool = False) -> Console:
 
 def show_error(text: str) -> None:
     """Print an error with its remedy on standard error."""
-    _console(stderr=True).print(_sanitized(Text.assemble(("error: ", "bold red"), completed(text))))
+    _console(stderr=True).print(_sanitized(Text.assemble(("error: ", "bold red"), add_options(text))))
 
 
 def show_note(text: str) -> None:
     """Print a note about the output on standard error."""
-    _console(stderr=True).print(_sanitized(Text.assemble(("note: ", "yellow"), completed(text))))
+    _console(stderr=True).print(_sanitized(Text.assemble(("note: ", "yellow"), add_options(text))))
 
 
 def fits(head: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
@@ -139,9 +139,9 @@ def _fold_words(words: Sequence[str], width: int) -> list[str]:
     """Return lines of whole words. A word that is longer than `width` is put on a separate line and is not broken."""
     lines = [""]
     for word in words:
-        longer = f"{lines[-1]} {word}".lstrip()
-        if cell_len(longer) <= width or not lines[-1]:
-            lines[-1] = longer
+        extended_line = f"{lines[-1]} {word}".lstrip()
+        if cell_len(extended_line) <= width or not lines[-1]:
+            lines[-1] = extended_line
         else:
             lines.append(word)
     return lines
@@ -173,11 +173,11 @@ def show_findings(findings: Sequence[Finding]) -> None:
             grid.add_column(width=width)
             grid.add_column(overflow="fold")
             grid.add_row(Text(word, style=style), Text(finding.check), _sanitized(Text(finding.detail)))
-            with console.capture() as shown:
+            with console.capture() as capture:
                 console.print(grid, soft_wrap=False)
-            print("\n".join(line.rstrip() for line in shown.get().splitlines()))
+            print("\n".join(line.rstrip() for line in capture.get().splitlines()))
             if finding.remedy:  # not folded, so that it can be copied
-                console.print(_sanitized(Text.assemble("        ", (completed(finding.remedy), "cyan"))))
+                console.print(_sanitized(Text.assemble("        ", (add_options(finding.remedy), "cyan"))))
     counts = {verdict: sum(finding.status is verdict for finding in findings) for verdict in Verdict}
     names = {Verdict.OK: "ok", Verdict.WARN: "warned", Verdict.FAIL: "failed"}
     worst = max(findings, key=lambda item: list(Verdict).index(item.status)).status
@@ -251,7 +251,7 @@ def _serialize(sink: Sink) -> Sink:
 def event_text(event: Event, width: int | None = None) -> Text | None:
     """Return the displayed text of an event, or None if only the live line shows it. Raises as `event_words`."""
     parts = event_words(event, width)
-    return _sanitized(Text.assemble(*((completed(text), style) for text, style in parts))) if parts else None
+    return _sanitized(Text.assemble(*((add_options(text), style) for text, style in parts))) if parts else None
 
 
 def _sanitized(text: Text) -> Text:
@@ -266,7 +266,7 @@ def _print_plain(event: Event) -> None:
 
 def _print_json(event: Event) -> None:
     name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(event).__name__).lower()
-    fields = {key: completed(value) if isinstance(value, str) else value for key, value in asdict(event).items()}
+    fields = {key: add_options(value) if isinstance(value, str) else value for key, value in asdict(event).items()}
     print(json_text({"event": name, "utc_ns": time.time_ns(), **fields}), flush=True)
 
 

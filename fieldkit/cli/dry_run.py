@@ -74,9 +74,9 @@ def _commands(plan: Plan) -> Iterator[CommandPlanned]:
                 (0, "begin", quote(evidence.begin_command(*location, sources=_telemetry_sources(plan, role)))),
                 *((0, "put", _copy_command(put, robot, folder)) for put in plan.program_copies() if put.role is role),
                 *(
-                    (number, planned.job.name, in_shell(planned.job))
-                    for number, planned in enumerate(all_jobs, start=1)
-                    if planned.role is role
+                    (number, planned_job.job.name, shell_line(planned_job.job))
+                    for number, planned_job in enumerate(all_jobs, start=1)
+                    if planned_job.role is role
                 ),
                 (len(all_jobs) + 1, "pack", quote(fetching.pack_command(*location))),
             ]
@@ -100,7 +100,7 @@ def _copy_command(put: PutProgram, robot: Robot, folder: str) -> str:
     return f"{quote(argv)}  # SHA-256 {put.program.sha256}"
 
 
-def in_shell(job: Job) -> str:
+def shell_line(job: Job) -> str:
     """Return a job's command as a person would type it in its folder."""
     text = quote((("sudo", "-n") if job.as_root else ()) + job.argv)
     text += f" < {quote((job.stdin,))}" if job.stdin else ""

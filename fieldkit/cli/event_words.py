@@ -52,7 +52,7 @@ def event_words(event: Event, width: int | None = None) -> Words:
         case TrialEnded(folder, valid, void, failed):
             counts = (
                 f"{valid} valid"
-                + (f", {void} void and redone" if void else "")
+                + (f", {void} void and repeated" if void else "")
                 + (f", {failed} failed" if failed else "")
             )
             words = ((f"{counts}: {folder}", "bold"),)
@@ -65,7 +65,7 @@ def event_words(event: Event, width: int | None = None) -> Words:
 
 
 def _repeat_words(event: RepeatEnded, width: int | None) -> Words:
-    """Return a repeat as one line. On a terminal, a longer line is folded, with the measured figures below it."""
+    """Return the text of a repeat. On a terminal, a text that is longer than a line is folded."""
     head, status = f"{event.done:3d}/{event.total}  {event.repeat:7} ", f"{event.status:6} "
     measured = f"measured: {event.summary}" if event.reason and event.summary else event.summary
     text = "; ".join(filter(None, (event.reason, measured)))

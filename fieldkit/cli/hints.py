@@ -1,6 +1,6 @@
 """Add the operator's options to the commands in remedies and hints, so that they can be typed as they are shown.
 
-The code that writes a remedy has neither the name of the site file nor the command line. This module has both.
+The code that creates a remedy has no access to the command line. This module adds the options of the command line.
 """
 
 import argparse
@@ -41,8 +41,8 @@ class CliOptions:
         if granted_names := permissions.granted(arguments):
             self._options += [(permissions.option(name), "") for name in permissions.repeated(granted_names)]
 
-    def completed(self, match: re.Match[str]) -> str:
-        """Return the matched command, with the stored options that this command accepts added."""
+    def add_to_command(self, match: re.Match[str]) -> str:
+        """Return the matched command with those of the stored options that it accepts."""
         parser, words = self._parser, list[str]()
         for word in match["words"].split():
             subparser = parser.command(word)
@@ -64,8 +64,8 @@ _options: ContextVar[CliOptions | None] = ContextVar("options", default=None)
 
 
 @contextmanager
-def completing(parser: Parser) -> Iterator[CliOptions]:
-    """Yield an object that stores options. While the body runs, `completed` adds these options to commands."""
+def adding_options(parser: Parser) -> Iterator[CliOptions]:
+    """Yield an object that stores options. While the body runs, `add_options` adds these options to commands."""
     options = CliOptions(parser)
     token = _options.set(options)
     try:
@@ -74,7 +74,7 @@ def completing(parser: Parser) -> Iterator[CliOptions]:
         _options.reset(token)
 
 
-def completed(text: str) -> str:
-    """Return a text with the given options added to its fieldkit commands."""
+def add_options(text: str) -> str:
+    """Return a text with the operator's options added to its fieldkit commands."""
     options = _options.get()
-    return text if options is None else _COMMAND.sub(options.completed, text)
+    return text if options is None else _COMMAND.sub(options.add_to_command, text)

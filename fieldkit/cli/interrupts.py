@@ -14,7 +14,7 @@ from fieldkit.core.units import format_duration
 from fieldkit.trial.running.stop import Stop
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_FINISHING: Final = "finishing the repeat that runs{left}; Ctrl-C again stops it now"
+_FINISHING: Final = "finishing the current repeat{left}; Ctrl-C again stops it now"
 _STOPPING: Final = "stopping: terminating the programs on the robots"
 _WAIT_CANCELLED: Final = "no longer waiting for confirmations; the order to stop was sent"
 _CLEAR_LINE: Final = "\r\x1b[K"
@@ -40,7 +40,7 @@ def interruptible() -> Iterator[Stop]:
         nonlocal stopping
         if stopping:
             if stop.motions.is_ordered:
-                stop.motions.abandon()
+                stop.motions.cancel_wait()
                 _write_message(_WAIT_CANCELLED)
             return
         if stop.motions.order_stop(_write_message):
@@ -60,17 +60,17 @@ def interruptible() -> Iterator[Stop]:
             raise KeyboardInterrupt
 
     with _stop_thread(stop):
-        before = {number: signal.signal(number, handle) for number in _SIGNALS}
+        previous = {number: signal.signal(number, handle) for number in _SIGNALS}
         try:
             yield stop
         finally:
-            for number, handler in before.items():
+            for number, handler in previous.items():
                 signal.signal(number, handler)
 
 
 @contextmanager
 def _stop_thread(stop: Stop) -> Iterator[None]:
-    """Run a thread that orders robots to stop at a signal, independent of the main thread."""
+    """Run a thread that orders robots to stop at a signal, even if the main thread is blocked."""
     receiver, sender = socket.socketpair()
 
     def watch() -> None:
@@ -82,11 +82,11 @@ def _stop_thread(stop: Stop) -> Iterator[None]:
     with receiver, sender:
         sender.setblocking(False)
         thread.start()
-        before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+        previous = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
         try:
             yield
         finally:
-            signal.set_wakeup_fd(before)
+            signal.set_wakeup_fd(previous)
             sender.shutdown(socket.SHUT_RDWR)
             thread.join()
 

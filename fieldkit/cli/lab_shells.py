@@ -13,7 +13,7 @@ from fieldkit.remote.ssh import SshShell
 
 
 @contextmanager
-def opened(folder: LabFolder) -> Iterator[dict[str, SshShell]]:
+def open_shells(folder: LabFolder) -> Iterator[dict[str, SshShell]]:
     """Yield the connections to the robots by name; empty if no lab is up. A connection is opened at its first use.
 
     Raises:

@@ -51,7 +51,7 @@ def _require_terminal(what: str, remedy: str) -> None:
         raise ConfigurationError(f"{what}, but standard input is not a terminal", remedy=remedy)
 
 
-def confirmed(question: str, *, remedy: str) -> bool:
+def confirm(question: str, *, remedy: str) -> bool:
     """Return True if the person at the terminal answers yes.
 
     Args:

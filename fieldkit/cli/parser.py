@@ -44,7 +44,7 @@ class Parser(argparse.ArgumentParser):
         self._words: Sequence[str] = ()
 
     def add_commands(self, **options: Any) -> Commands:  # noqa: ANN401 (passed to argparse unchanged)
-        """Return the object of `add_subparsers`; an error about an unknown subcommand names the nearest one.
+        """Return the object of `add_subparsers`; an error about an unknown subcommand contains the most similar one.
 
         Without a subcommand, `run` of the parsed arguments is None, and `parser` is this parser, whose help is
         printed.
@@ -142,7 +142,7 @@ class Parser(argparse.ArgumentParser):
         raise ConfigurationError(message, remedy=f"{self.prog} --help")
 
     def add_choice(self, name: str, choices: Iterable[str], **options: Any) -> None:  # noqa: ANN401 (passed to argparse unchanged)
-        """Add an argument with one of `choices` as its value; an error about another value names the nearest one."""
+        """Add an argument with one of `choices` as its value. An error about another value suggests a similar one."""
         values = tuple(choices)
         self.add_argument(
             name, choices=values, type=self._choice_converter(options.get("metavar", name), values), **options
@@ -155,11 +155,11 @@ class Parser(argparse.ArgumentParser):
 
         return convert
 
-    def _require_choice(self, argument: str, typed: str, choices: Iterable[str]) -> None:
-        if typed not in choices:
+    def _require_choice(self, argument: str, text: str, choices: Iterable[str]) -> None:
+        if text not in choices:
             raise ConfigurationError(
-                f"{argument} cannot be {typed!r}; it is one of: {', '.join(choices)}",
-                remedy=did_you_mean(typed, choices, f"{self.prog} --help"),
+                f"{argument} cannot be {text!r}; it is one of: {', '.join(choices)}",
+                remedy=did_you_mean(text, choices, f"{self.prog} --help"),
             )
 
 
@@ -175,7 +175,7 @@ def add_plugin_commands(commands: Commands) -> None:
 def add_plugin_command(commands: Commands, name: str, targets: Sequence[str], help_line: str) -> Parser:
     """Add a parser for a command of entry points, and return it."""
     parser: Parser = commands.add_parser(name, help=help_line)
-    parser.set_defaults(outside=name)
+    parser.set_defaults(plugin=name)
     parser.declare = partial(_declare_plugin, name, targets)
     return parser
 

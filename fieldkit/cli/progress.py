@@ -25,7 +25,7 @@ _FULL: Final = "\N{BOX DRAWINGS HEAVY HORIZONTAL}"
 _EMPTY: Final = "\N{BOX DRAWINGS LIGHT HORIZONTAL}"
 
 
-def shortened(text: str, width: int) -> str:
+def abbreviate(text: str, width: int) -> str:
     """Return a text of at most `width` characters. A shortened text ends in `...`."""
     return text if len(text) <= width else f"{text[: max(width - len(_ELLIPSIS), 0)]}{_ELLIPSIS}"[:width]
 
@@ -39,18 +39,20 @@ class ProgressBar:
         self._trial = ""
         self._done, self._total, self._unit = 0.0, 0.0, ""
         self._end_s: float | None = None
-        self._is_asking = False
+        self._is_awaiting_input = False
 
     @property
     def is_needed(self) -> bool:
         """True if there is something to show and no input is expected. A redrawn line would overwrite typed input."""
-        return bool(self._phase.name) and not self._is_asking
+        return bool(self._phase.name) and not self._is_awaiting_input
 
     def update(self, event: Event) -> None:
         """Update the progress by an event."""
         # Other threads may send events while the operator types.
         is_question = isinstance(event, Request | Asked)
-        self._is_asking = is_question or (self._is_asking and not isinstance(event, Answered | Entered))
+        self._is_awaiting_input = is_question or (
+            self._is_awaiting_input and not isinstance(event, Answered | Entered)
+        )
         self._trial = event.part or self._trial
         match event:
             case PhaseStarted():
@@ -84,15 +86,19 @@ class ProgressBar:
         parts = [(self._trial, "bold"), (count, ""), (total_left, "dim"), (phase, "cyan"), (phase_time, "dim")]
         for omitted in (None, self._trial, total_left, phase_time, count):
             parts = [part for part in parts if part[0] and part[0] is not omitted]
-            free = width - len(_SEPARATOR.join(text for text, _ in parts))
-            if free >= 0:
+            free_width = width - len(_SEPARATOR.join(text for text, _ in parts))
+            if free_width >= 0:
                 break
-        bar = next(bar for min_width, bar in _BARS.items() if width >= min_width)
+        bar_width = next(bar_width for min_width, bar_width in _BARS.items() if width >= min_width)
         words: list[tuple[str, str]] = []
         for text, style in parts:
             words += [(_SEPARATOR, "")] * bool(words)
-            if text is count and bar + len(_SEPARATOR) <= free:
-                full = int(bar * self._done / self._total)
-                words += [(_FULL * full, "green"), (_EMPTY * (bar - full), "dim"), (_SEPARATOR, "")]
-            words.append((shortened(text, width), style))
+            if text is count and bar_width + len(_SEPARATOR) <= free_width:
+                filled_width = int(bar_width * self._done / self._total)
+                words += [
+                    (_FULL * filled_width, "green"),
+                    (_EMPTY * (bar_width - filled_width), "dim"),
+                    (_SEPARATOR, ""),
+                ]
+            words.append((abbreviate(text, width), style))
         return tuple(words)

@@ -10,7 +10,7 @@ from fieldkit.analysis import table_lines, wording
 from fieldkit.analysis.cells import Cell
 from fieldkit.analysis.table_lines import TableLine
 from fieldkit.cli.display import fits, print_folded, show_error, table
-from fieldkit.cli.hints import completed
+from fieldkit.cli.hints import add_options
 from fieldkit.core.columns import plain_name
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
 from fieldkit.core.text import print_text
@@ -41,32 +41,34 @@ def show_summary(cells: Sequence[Cell], *, show_all: bool = False, expected: Col
     for cell in cells:
         condition = tuple(cell.key[name] for name in ("procedure", "distance", "topology", "backend"))
         groups.setdefault(condition, []).append(cell)
-    left_out, names = set[str](), set[str]()
+    omitted_names, names = set[str](), set[str]()
     for condition, group in groups.items():
         title = ", ".join(str(part) for part in condition)
-        shown = (
+        shown_lines = (
             table_lines.lines(group)
             if show_all
             else table_lines.with_radio_loss(table_lines.operator_lines(group, expected), group)
         )
-        names |= (group_names := {quantity.name for line in shown for quantity in line.quantities})
-        left_out |= {quantity.name for quantity in wording.measured(group)} - group_names
+        names |= (group_names := {quantity.name for line in shown_lines for quantity in line.quantities})
+        omitted_names |= {quantity.name for quantity in wording.measured(group)} - group_names
         layouts: Sequence[tuple[list[_SummaryTable], Sequence[int]]] = (
-            ([_summary(group, shown)], ()),
-            ([_summary([cell], shown) for cell in group], ()),
-            ([_summary([cell], shown, separator="\n") for cell in group], (0,)),
+            ([_summary(group, shown_lines)], ()),
+            ([_summary([cell], shown_lines) for cell in group], ()),
+            ([_summary([cell], shown_lines, separator="\n") for cell in group], (0,)),
         )
         tables, fold = next((layout for layout in layouts if all(fits(*part) for part in layout[0])), layouts[-1])
         for head, rows in tables:
             table(head, rows, title=title, right=range(1, len(head)), fold=fold)
     for caution in wording.cautions(cells, names):
         print_folded(caution)
-    return len(left_out)
+    return len(omitted_names)
 
 
-def _summary(group: Sequence[Cell], shown: Sequence[TableLine], separator: str = " ") -> _SummaryTable:
+def _summary(group: Sequence[Cell], shown_lines: Sequence[TableLine], separator: str = " ") -> _SummaryTable:
     """Return the head and the rows of a table of one condition, with `separator` between the parts of a cell."""
-    figures = [(line.label, *(line.amount(cell, line.scale(group), separator) for cell in group)) for line in shown]
+    figures = [
+        (line.label, *(line.amount(cell, line.scale(group), separator) for cell in group)) for line in shown_lines
+    ]
     words = [
         (label, *(wording.tally(cell, name, f",{separator}") for cell in group))
         for name, label in wording.word_labels(group).items()
@@ -76,9 +78,9 @@ def _summary(group: Sequence[Cell], shown: Sequence[TableLine], separator: str =
     return ("[95 % interval]", *(str(cell.key["protocol"]).upper() for cell in group)), rows
 
 
-def more_rows_note(left_out: int) -> str:
+def more_rows_note(count: int) -> str:
     """Return the number of omitted quantities in words."""
-    return f"{left_out} more {'quantity' if left_out == 1 else 'quantities'}"
+    return f"{count} more {'quantity' if count == 1 else 'quantities'}"
 
 
 _LENGTH: Final = re.compile(r"(?P<number>[0-9]+(?:\.[0-9]+)?)(?P<unit>[a-z]+)")
@@ -92,13 +94,13 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
         arguments: The arguments of the command: `json` prints no table, `all` prints all quantities, and `junit` is a
             file that gets the results, too.
     """
-    ended, is_json = [outcome for outcome in outcomes if outcome is not None], arguments.json
-    left_out = 0
-    for outcome in ended:
+    outcomes_run, is_json = [outcome for outcome in outcomes if outcome is not None], arguments.json
+    omitted_count = 0
+    for outcome in outcomes_run:
         if not is_json:
             expected = {judgement.expectation.quantity for judgement in outcome.judgements}
-            left_out = max(left_out, show_summary(outcome.cells, show_all=arguments.all, expected=expected))
-            expectation_table(outcome.judgements)
+            omitted_count = max(omitted_count, show_summary(outcome.cells, show_all=arguments.all, expected=expected))
+            print_expectations(outcome.judgements)
         if outcome.failed:
             reasons = outcome.folder / store.TRIAL_CSV
             failed = format_count(outcome.failed, "repeat")
@@ -106,15 +108,17 @@ def report(outcomes: Sequence[Outcome | None], arguments: argparse.Namespace) ->
             remedy = f"remove the causes, then repeat them: {command}"
             show_error(f"{failed} failed; reasons in {reasons}\n  remedy: {remedy}")
     if not is_json:
-        _show_next(ended, left_out)
-    skipped = len(outcomes) - len(ended)
+        _show_next(outcomes_run, omitted_count)
+    skipped = len(outcomes) - len(outcomes_run)
     if skipped:
-        show_error(f"{skipped} of {len(outcomes)} skipped\n  remedy: run the command again for what was skipped")
-    write_junit(arguments, [outcome.folder for outcome in ended])
-    if any(outcome.failed for outcome in ended):
+        show_error(
+            f"{skipped} of {len(outcomes)} skipped\n  remedy: to run the skipped trials, run the command again"
+        )
+    write_junit(arguments, [outcome.folder for outcome in outcomes_run])
+    if any(outcome.failed for outcome in outcomes_run):
         return EvidenceError.exit_code
-    unmet = any(not judgement.holds for outcome in ended for judgement in outcome.judgements)
-    return FieldkitError.exit_code if skipped or unmet else 0
+    has_unmet = any(not judgement.holds for outcome in outcomes_run for judgement in outcome.judgements)
+    return FieldkitError.exit_code if skipped or has_unmet else 0
 
 
 def write_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
@@ -137,7 +141,7 @@ def write_junit(arguments: argparse.Namespace, folders: Sequence[Path]) -> None:
         ) from error
 
 
-def expectation_table(judgements: "Sequence[Judgement]") -> None:
+def print_expectations(judgements: "Sequence[Judgement]") -> None:
     """Print a row for each expectation with its judgement. Without expectations, print nothing."""
     if judgements:
         from fieldkit.analysis.judgement_words import judgement_texts  # noqa: PLC0415 (few procedures have expectations)
@@ -146,24 +150,24 @@ def expectation_table(judgements: "Sequence[Judgement]") -> None:
         table(("expected", "of", "measured", "[95 % interval]", ""), rows, fold=(0, 4))
 
 
-def _show_next(ended: Sequence[Outcome], left_out: int) -> None:
+def _show_next(outcomes_run: Sequence[Outcome], omitted_count: int) -> None:
     """Print likely next commands, unless all trials are without a valid repeat."""
-    if any(outcome.valid for outcome in ended):
-        for index, command in enumerate(_next_commands(ended, left_out)):
+    if any(outcome.valid for outcome in outcomes_run):
+        for index, command in enumerate(_next_commands(outcomes_run, omitted_count)):
             print_text(
-                f"{'      ' if index else 'next: '}{completed(command)}"
+                f"{'      ' if index else 'next: '}{add_options(command)}"
             )  # not folded, so that it can be copied
 
 
-def _next_commands(ended: Sequence[Outcome], left_out: int) -> Iterator[str]:
-    folders = [outcome.folder for outcome in ended]
+def _next_commands(outcomes_run: Sequence[Outcome], omitted_count: int) -> Iterator[str]:
+    folders = [outcome.folder for outcome in outcomes_run]
     yield shell_command("fieldkit", "report", *folders)
-    if left_out:
-        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {more_rows_note(left_out)}"
-    cells = [cell for outcome in ended for cell in outcome.cells[:1]]
-    farther = _next_distance([str(cell.key["distance"]) for cell in cells])
-    if farther and not any(_lost_all(cell) for outcome in ended for cell in outcome.cells):
-        yield f"{shell_command('fieldkit', 'trial', cells[-1].key['procedure'], farther)}  # another distance"
+    if omitted_count:
+        yield f"{shell_command('fieldkit', 'aggregate', *folders, '--all')}  # {more_rows_note(omitted_count)}"
+    cells = [cell for outcome in outcomes_run for cell in outcome.cells[:1]]
+    next_distance = _next_distance([str(cell.key["distance"]) for cell in cells])
+    if next_distance and not any(_lost_all(cell) for outcome in outcomes_run for cell in outcome.cells):
+        yield f"{shell_command('fieldkit', 'trial', cells[-1].key['procedure'], next_distance)}  # another distance"
 
 
 def _lost_all(cell: Cell) -> bool:
@@ -176,6 +180,12 @@ def _next_distance(distances: Sequence[str]) -> str:
     matches = [match for distance in distances[-2:] if (match := _LENGTH.fullmatch(distance))]
     if not matches:
         return ""
-    last = float(matches[-1]["number"])
-    before = float(matches[0]["number"]) if len(matches) > 1 and matches[0]["unit"] == matches[1]["unit"] else 0.0
-    return f"{last + abs(last - before):.9g}{matches[-1]['unit']}" if last != before else ""
+    last_value = float(matches[-1]["number"])
+    previous_value = (
+        float(matches[0]["number"]) if len(matches) > 1 and matches[0]["unit"] == matches[1]["unit"] else 0.0
+    )
+    return (
+        f"{last_value + abs(last_value - previous_value):.9g}{matches[-1]['unit']}"
+        if last_value != previous_value
+        else ""
+    )

@@ -181,10 +181,10 @@ def file_to_write(text: str) -> Path:
     return Path(text)
 
 
-def natural(text: str, least: int = 0) -> int:
+def natural(text: str, minimum: int = 0) -> int:
     """Return a whole number with at most 15 digits; argparse reports other texts, with the smallest number."""
     if not text.isascii() or not text.isdigit():
-        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number of at least {least}")
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a whole number of at least {minimum}")
     if len(text) > _MAX_DIGITS:
         raise argparse.ArgumentTypeError(f"a number of {len(text)} digits is too large")
     return int(text)
@@ -192,14 +192,14 @@ def natural(text: str, least: int = 0) -> int:
 
 def positive(text: str) -> int:
     """Return a whole number from 1; argparse reports other texts."""
-    if natural(text, least=1) < 1:
+    if natural(text, minimum=1) < 1:
         raise argparse.ArgumentTypeError("must be at least 1")
     return int(text)
 
 
 def repeats(text: str) -> int:
     """Return a number of repeats from 1; argparse reports other texts."""
-    if not 1 <= natural(text, least=1) <= MAX_REPEATS:
+    if not 1 <= natural(text, minimum=1) <= MAX_REPEATS:
         raise argparse.ArgumentTypeError(f"must be at least 1, and at most {MAX_REPEATS}")
     return int(text)
 

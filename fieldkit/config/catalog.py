@@ -40,6 +40,6 @@ def validate_named(document: schema.Document, model: type[Item], name: str) -> I
         raise ConfigurationError(
             f"name is {loaded.name!r}, but the file name is {name!r}",
             where=document.where(("name",)),
-            remedy="change one of them, so that they are equal",
+            remedy="change one of them, so that both are equal",
         )
     return loaded

@@ -22,8 +22,8 @@ class Page:
     """A page of the documentation.
 
     Attributes:
-        path: Its file.
-        anchor: The section in it; empty for the start of the page.
+        path: File of the page.
+        anchor: Identifier of a section; empty for the start of the page.
     """
 
     path: Path
@@ -60,7 +60,8 @@ def find(topic: str) -> Page:
     """Return the page of a topic; for a command, its section in the page of all commands.
 
     Raises:
-        ConfigurationError: There is no such topic (the nearest is given), or no documentation.
+        ConfigurationError: There is no such topic (the remedy contains the most similar one), or there is no
+            documentation.
     """
     pages = topics()
     if topic in pages:

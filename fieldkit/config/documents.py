@@ -1,4 +1,4 @@
-"""YAML documents: read with the line of each value, written, and edited one value at a time.
+"""Read YAML documents with the line of each value, write them, and edit single values.
 
 This is the only module that imports PyYAML.
 """
@@ -61,18 +61,18 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
         event = self.peek_event()  # type: ignore[no-untyped-call]
         # Aliases make a file hard to read, and nested aliases can expand without bound.
         if isinstance(event, yaml.events.AliasEvent):
-            raise _problem("aliases (*name) are not supported", event)
+            raise _marked_error("aliases (*name) are not supported", event)
         # A tag would make PyYAML convert the value by the rules of YAML 1.1.
         if getattr(event, "tag", None) is not None:
-            raise _problem("tags (!name) are not supported; put text that begins with ! in quotes", event)
+            raise _marked_error("tags (!name) are not supported; put text that begins with ! in quotes", event)
         # PyYAML recurses at each level.
         if self._depth >= _MAX_DEPTH:
-            raise _problem(f"nested more than {_MAX_DEPTH} deep", event)
+            raise _marked_error(f"nested more than {_MAX_DEPTH} deep", event)
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
         if isinstance(node, yaml.ScalarNode) and _INVALID_CHARACTERS.search(node.value):
-            raise _problem(
+            raise _marked_error(
                 "this text has a character that no file can contain (\\0, or half of a surrogate pair)", event
             )
         if isinstance(node, yaml.ScalarNode) and isinstance(parent, yaml.SequenceNode):
@@ -90,21 +90,21 @@ class _Loader(Reader, Scanner, Parser, Composer, SafeConstructor, Resolver):
     def checked_int(self, node: yaml.ScalarNode) -> int:
         """Return a whole number. Leading zeros have no effect."""
         if len(node.value) > _MAX_DIGITS or abs(number := int(node.value)) > _MAX_INT:
-            raise _problem(f"this number is beyond {_MAX_INT}", node)
+            raise _marked_error(f"this number is beyond {_MAX_INT}", node)
         return number
 
     def checked_float(self, node: yaml.ScalarNode) -> float:
         """Return a number with a fraction or an exponent."""
         if len(node.value) > _MAX_DIGITS or not math.isfinite(number := float(node.value)):
-            raise _problem("this number is too large, or has too many digits", node)
+            raise _marked_error("this number is too large, or has too many digits", node)
         return number
 
 
 class _JoinedItemError(yaml.YAMLError):
-    """An item of a list is indented more than the item before it, so YAML reads it as a part of that item's text.
+    """An item of a list is indented more than the previous item, so YAML reads it as a part of that item's text.
 
     Attributes:
-        line: Its line, from 1.
+        line: Line of the item, from 1.
     """
 
     def __init__(self, line: int) -> None:
@@ -112,7 +112,7 @@ class _JoinedItemError(yaml.YAMLError):
         self.line = line
 
 
-def _problem(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
+def _marked_error(text: str, place: yaml.Node | yaml.Event) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=text, problem_mark=place.start_mark)  # type: ignore[arg-type] # marks of the C parser have a line, too
 
 
@@ -313,7 +313,7 @@ def _to_plain(loader: _Loader, node: yaml.Node, place: Location, lines: dict[Loc
             elif key in mapping:
                 problem = f"duplicate key {key!r}"
             if problem:
-                raise _problem(problem, key_node)
+                raise _marked_error(problem, key_node)
             lines[(*place, key)] = key_node.start_mark.line + 1
             mapping[key] = _to_plain(loader, value_node, (*place, key), lines)
         return mapping

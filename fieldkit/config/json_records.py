@@ -45,5 +45,5 @@ class Codec(Generic[Record]):
             raise ValueError(f"{place}: {first['msg']}" if place else first["msg"]) from error
 
     def dump(self, record: Record) -> Any:  # noqa: ANN401 (any JSON value)
-        """Return the JSON value from which `parse` makes an equal record."""
+        """Return the JSON value that `parse` converts back to an equal record."""
         return self._adapter.dump_python(record, mode="json", by_alias=True)

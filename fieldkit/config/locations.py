@@ -54,7 +54,7 @@ def find(kind: Kind, name: str) -> Path:
     """Return the file of `name`.
 
     Raises:
-        ConfigurationError: There is no such file; the message gives the nearest name.
+        ConfigurationError: There is no such file; the remedy contains the most similar name.
     """
     paths = names(kind)
     if name in paths:

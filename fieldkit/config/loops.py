@@ -1,4 +1,4 @@
-"""`for:` in lists of steps: when a file is read, the steps of the loop are repeated for each value.
+"""Expansion of `for:` in lists of steps: when a file is read, the steps are repeated for each value.
 
     - for:
         each: {bytes: [502, 1400]}
@@ -37,12 +37,12 @@ def expand_loops(document: Document, key: str) -> Document:
         key: The key of its list of steps.
 
     Raises:
-        ConfigurationError: A `for:` is not valid, uses an unknown variable, or makes too many steps.
+        ConfigurationError: A `for:` is not valid, uses an unknown variable, or results in too many steps.
     """
     if not isinstance(document.data, dict) or not isinstance(document.data.get(key), list):
         return document  # validation reports the error
     expander = _Expander(document)
-    steps = expander.steps(document.data[key], (key,), (key,), {})
+    steps = expander.expand_steps(document.data[key], (key,), (key,), {})
     other_lines = {place: line for place, line in document.lines.items() if place[:1] != (key,) or place == (key,)}
     return replace(document, data={**document.data, key: steps}, lines={**other_lines, **expander.lines})
 
@@ -60,64 +60,73 @@ class _Expander:
     def __init__(self, document: Document) -> None:
         self.lines: dict[Location, int] = {}
         self._document = document
-        self._steps = 0
+        self._step_count = 0
 
-    def steps(self, items: list[Any], at: Location, to: Location, values: Values) -> list[Any]:
+    def expand_steps(self, items: list[Any], location: Location, new_location: Location, values: Values) -> list[Any]:
         """Return a list of steps with its loops expanded.
 
         Args:
             items: The list.
-            at: Its location in the document.
-            to: Its location in the result.
-            values: Values of the variables that apply.
+            location: Location of the list in the document.
+            new_location: Location of the list in the result.
+            values: Values of the variables of the enclosing loops.
         """
         result: list[Any] = []
-        self._copy_line(at, to)
-        self._append(result, items, at, to, values)
+        self._copy_line(location, new_location)
+        self._append(result, items, location, new_location, values)
         return result
 
-    def _append(self, result: list[Any], items: list[Any], at: Location, to: Location, values: Values) -> None:
+    def _append(
+        self, result: list[Any], items: list[Any], location: Location, new_location: Location, values: Values
+    ) -> None:
         for index, item in enumerate(items):
-            key_path = (*at, index)
+            key_path = (*location, index)
             if isinstance(item, dict) and LOOP in item:
                 if len(item) > 1:
                     raise self._problem(
                         "for: must be the only key of its entry", key_path, "start another entry with - for:"
                     )
-                self._append_loop(result, item[LOOP], (*key_path, LOOP), to, values)
+                self._append_loop(result, item[LOOP], (*key_path, LOOP), new_location, values)
                 continue
-            self._steps += 1
-            if self._steps > MAX_STEPS:
+            self._step_count += 1
+            if self._step_count > MAX_STEPS:
                 raise self._problem(
                     f"there are more than {MAX_STEPS} steps after for: is expanded", key_path, "give fewer values"
                 )
-            result.append(self._copy(item, key_path, (*to, len(result)), values))
+            result.append(self._copy(item, key_path, (*new_location, len(result)), values))
 
-    def _append_loop(self, result: list[Any], loop: Any, at: Location, to: Location, values: Values) -> None:  # noqa: ANN401 (any YAML)
+    def _append_loop(
+        self,
+        result: list[Any],
+        loop: Any,  # noqa: ANN401 (any YAML)
+        location: Location,
+        new_location: Location,
+        values: Values,
+    ) -> None:
         if not isinstance(loop, dict) or set(loop) != set(_KEYS):
             unknown = [key for key in loop if key not in _KEYS] if isinstance(loop, dict) else []
             what = f"unknown key {unknown[0]} in for:" if unknown else "for: needs each: and during:"
-            raise self._problem(what, (*at, *unknown[:1]), "for: {each: {bytes: [502, 1400]}, during: [...]}")
+            raise self._problem(what, (*location, *unknown[:1]), "for: {each: {bytes: [502, 1400]}, during: [...]}")
         if not isinstance(loop["during"], list) or not loop["during"]:
             raise self._problem(
-                "during: of for: is not a list of steps", (*at, "during"), "write the steps to repeat"
+                "during: of for: is not a list of steps", (*location, "during"), "write the steps to repeat"
             )
-        variables = self._variables(loop["each"], (*at, "each"), values)
+        variables = self._variables(loop["each"], (*location, "each"), values)
         if (count := math.prod(map(len, variables.values()))) > MAX_STEPS:
             raise self._problem(
-                f"for: has {count} combinations, more than {MAX_STEPS}", (*at, "each"), "give fewer values"
+                f"for: has {count} combinations, more than {MAX_STEPS}", (*location, "each"), "give fewer values"
             )
         for combination in itertools.product(*variables.values()):
             inner_values = {**values, **dict(zip(variables, combination, strict=True))}
-            self._append(result, loop["during"], (*at, "during"), to, inner_values)
+            self._append(result, loop["during"], (*location, "during"), new_location, inner_values)
 
-    def _variables(self, each: Any, at: Location, outer: Values) -> dict[str, list[Scalar]]:  # noqa: ANN401 (any YAML)
+    def _variables(self, each: Any, location: Location, outer: Values) -> dict[str, list[Scalar]]:  # noqa: ANN401 (any YAML)
         """Return the values of each variable of a loop."""
         if not isinstance(each, dict) or not each:
-            raise self._problem("each: of for: has no variable", at, "each: {bytes: [502, 1400]}")
+            raise self._problem("each: of for: has no variable", location, "each: {bytes: [502, 1400]}")
         values_by_name: dict[str, list[Scalar]] = {}
         for name, value_list in each.items():
-            key_path = (*at, name)
+            key_path = (*location, name)
             if not _VARIABLE.fullmatch(name):
                 raise self._problem(
                     f"{name!r} is not a valid variable", key_path, "use lower-case letters, digits and _"
@@ -137,32 +146,35 @@ class _Expander:
                     )
         return values_by_name
 
-    def _copy(self, value: Any, at: Location, to: Location, values: Values) -> Any:  # noqa: ANN401 (any YAML)
-        """Return a value with variables substituted, and store its lines."""
-        self._copy_line(at, to)
+    def _copy(self, value: Any, location: Location, new_location: Location, values: Values) -> Any:  # noqa: ANN401 (any YAML)
+        """Return a value with its variables substituted, and store the lines of its parts."""
+        self._copy_line(location, new_location)
         match value:
             case dict():
                 if unquoted := [key for key, item in value.items() if item is None and key in values]:
                     what = f"without quotes YAML reads {{{unquoted[0]}}} as a mapping"
-                    raise self._problem(what, at, f'put it in quotes: "{{{unquoted[0]}}}"')
+                    raise self._problem(what, location, f'put it in quotes: "{{{unquoted[0]}}}"')
                 return {
-                    key: (self.steps if key == "during" and isinstance(item, list) else self._copy)(
-                        item, (*at, key), (*to, key), values
+                    key: (self.expand_steps if key == "during" and isinstance(item, list) else self._copy)(
+                        item, (*location, key), (*new_location, key), values
                     )
                     for key, item in value.items()
                 }
             case list():
-                return [self._copy(item, (*at, index), (*to, index), values) for index, item in enumerate(value)]
+                return [
+                    self._copy(item, (*location, index), (*new_location, index), values)
+                    for index, item in enumerate(value)
+                ]
             case str() if values:
-                return self._substituted(value, at, values)
+                return self._substituted(value, location, values)
         return value
 
-    def _copy_line(self, at: Location, to: Location) -> None:
+    def _copy_line(self, location: Location, new_location: Location) -> None:
         """Store the line of a location in the document as the line of its location in the result."""
-        if at in self._document.lines:
-            self.lines[to] = self._document.lines[at]
+        if location in self._document.lines:
+            self.lines[new_location] = self._document.lines[location]
 
-    def _substituted(self, text: str, at: Location, values: Values) -> Scalar:
+    def _substituted(self, text: str, location: Location, values: Values) -> Scalar:
         """Return a text with variables substituted. A text that consists only of one variable becomes its value."""
 
         def value_of(match: re.Match[str]) -> Scalar:
@@ -171,15 +183,15 @@ class _Expander:
             if name not in values:
                 suggestion = did_you_mean(name, values, f"the variables are: {', '.join(values)}")
                 remedy = f"write {{{{{name}}}}} for the text {{{name}}}, or use a variable"
-                raise self._problem(f"there is no variable {name}; {suggestion}", at, remedy)
+                raise self._problem(f"there is no variable {name}; {suggestion}", location, remedy)
             return values[name]
 
         if (only_variable := _BRACES.fullmatch(text)) is not None:
             return value_of(only_variable)
         return _BRACES.sub(lambda match: _yaml_text(value_of(match)), text)
 
-    def _problem(self, what: str, at: Location, remedy: str) -> ConfigurationError:
-        return ConfigurationError(what, where=self._document.where(at), remedy=remedy)
+    def _problem(self, what: str, location: Location, remedy: str) -> ConfigurationError:
+        return ConfigurationError(what, where=self._document.where(location), remedy=remedy)
 
 
 def _yaml_text(value: Scalar) -> str:

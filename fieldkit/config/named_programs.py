@@ -1,7 +1,7 @@
 """Paths of programs in procedures, and the search for the files.
 
-When a procedure is read, a file that it names is searched first in the folder of the procedure file, then in the
-lab's folder (the current directory). `trial.yaml` stores its path and its hash.
+When a procedure is read, a file that it names is searched first in the folder of the procedure file, then in
+the lab's folder (the current directory). `trial.yaml` stores its path and its hash.
 """
 
 import hashlib
@@ -19,17 +19,17 @@ from fieldkit.core.units import format_bytes
 
 
 def _to_record(value: object) -> object:
-    """Return the record of the program with a given path; a record is returned unchanged."""
+    """Return the record of the program at a path. A value that is a record already is returned unchanged."""
     if isinstance(value, dict | LabProgram):
         return value
     if not isinstance(value, str):
-        raise schema.validation_error("the path of a file is needed here, tools/probe.py for example")
+        raise schema.validation_error("the path of a file is needed here, for example tools/probe.py")
     _require_valid_name(value)
-    searched = list(dict.fromkeys((schema.folder(), Path())))
-    for folder in searched:
+    search_folders = list(dict.fromkeys((schema.folder(), Path())))
+    for folder in search_folders:
         if os.path.lexists(path := folder / value):
             return _record(value, path, folder)
-    folders = " and ".join(f"{shell_command(folder.absolute())}" for folder in searched)
+    folders = " and ".join(f"{shell_command(folder.absolute())}" for folder in search_folders)
     raise schema.validation_error(f"there is no file {value!r}; searched in {folders}")
 
 
@@ -45,12 +45,14 @@ def _require_valid_name(name: str) -> None:
 
 def _record(name: str, path: Path, folder: Path) -> dict[str, object]:
     lab, folder = Path.cwd().resolve(), folder.resolve()
-    inside = lab if folder.is_relative_to(lab) else folder
+    allowed_folder = lab if folder.is_relative_to(lab) else folder
     try:
         target = resolve(path)
         status = target.stat()
-        if not target.is_relative_to(inside):
-            raise schema.validation_error(f"{name!r} is a link to a file outside of {inside}; copy the file there")
+        if not target.is_relative_to(allowed_folder):
+            raise schema.validation_error(
+                f"{name!r} is a link to a file outside of {allowed_folder}; copy the file there"
+            )
         if target.is_dir():
             raise schema.validation_error(f"{name!r} is a folder; name one file")
         if status.st_size > MAX_BYTES:

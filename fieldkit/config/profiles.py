@@ -104,7 +104,7 @@ class RecordCommand(Strict):
     )
 
 
-_Crossing = Annotated[
+_BridgedTopic = Annotated[
     str,
     pattern_field(
         r"^(/[A-Za-z]\w*)+:[a-z]\w*/(msg/)?[A-Z]\w*(:[a-z0-9_=,]+)?$",
@@ -126,8 +126,8 @@ class RobotBridge(Strict):
     """
 
     to: Annotated[str, Field(pattern="^(dds|zenoh)$")]
-    topics: tuple[_Crossing, ...] = ()
-    back: tuple[_Crossing, ...] = ()
+    topics: tuple[_BridgedTopic, ...] = ()
+    back: tuple[_BridgedTopic, ...] = ()
     domain: Annotated[Int, Field(ge=0, le=101)] = 0
     router: Annotated[str, Field(pattern=r"^[\w.-]+(:\d{1,5})?$")] | None = None
     program: str = "fieldkit"
@@ -203,8 +203,8 @@ class Ros(Strict):
     @property
     def middleware(self) -> str:
         """Middleware of its ROS 2: `zenoh`, or `dds` for any other RMW, since all of these use RTPS."""
-        named = self.environment.get("RMW_IMPLEMENTATION") or self.command.rmw
-        return "zenoh" if named.removeprefix("rmw_").startswith("zenoh") else "dds"
+        rmw = self.environment.get("RMW_IMPLEMENTATION") or self.command.rmw
+        return "zenoh" if rmw.removeprefix("rmw_").startswith("zenoh") else "dds"
 
     @property
     def command(self) -> RecordCommand:
@@ -213,7 +213,7 @@ class Ros(Strict):
 
 
 class Tools(Strict):
-    """Names of programs on the robot, and how captures get their privileges.
+    """Names of programs on the robot, and the privileges of captures.
 
     Attributes:
         netcat: Its netcat: traditional, OpenBSD, ncat or busybox. The variant is
@@ -292,13 +292,13 @@ class ProfileSection(Strict):
         permission: Permission (`fieldkit.core.permissions`) that steps need to move a real robot by means of this
             section; empty if they do not move it.
         placement: Instruction to the operator who places a robot that steps move by means of this section. `{robot}`
-            and `{other}`, the robot at the other end of its link, are filled in. Empty without an instruction.
+            and `{other}`, the robot at the other end of its link, are filled in. Empty if no instruction is needed.
     """
 
     permission: ClassVar[str] = ""
     placement: ClassVar[str] = ""
 
-    def contradiction(self, profile: "RobotProfile") -> str | None:  # noqa: ARG002 (most fit every profile)
+    def contradiction(self, profile: "RobotProfile") -> str | None:  # noqa: ARG002 (most sections fit every profile)
         """Return the reason why the section contradicts the rest of the profile; None if it does not."""
         return None
 
@@ -324,7 +324,7 @@ class RobotProfile(catalog.Named, Sectioned):
         links: Network interface by the name of a link, for a robot with [several links](links.md): `{wifi: wlan0,
             cell: wwan0}`. The link with the interface of `radio` is the default of steps.
         tools: Programs on the robot, each a name or a path.
-        ros: Its ROS settings; a robot without them records nothing.
+        ros: ROS settings of the robot; a robot without them records nothing.
         limits: Limits of the robot.
         unsupported: Reason why no trial can use a robot of this model; empty if trials can.
     """
@@ -343,7 +343,7 @@ class RobotProfile(catalog.Named, Sectioned):
 
     @property
     def topics(self) -> tuple[PublishedTopic, ...]:
-        """The topics that the robot publishes; none without ROS."""
+        """The topics that the robot publishes; empty without ROS."""
         return self.ros.topics if self.ros else ()
 
     @property
@@ -366,8 +366,8 @@ class RobotProfile(catalog.Named, Sectioned):
     @schema.model_validator(mode="after")
     def _has_consistent_sections(self) -> "RobotProfile":
         for section in self.sections.values():
-            if why := section.contradiction(self):
-                raise schema.validation_error(why)
+            if reason := section.contradiction(self):
+                raise schema.validation_error(reason)
         return self
 
 
@@ -375,6 +375,7 @@ def load_profile(name: str) -> RobotProfile:
     """Return the profile `name`; the lab's folder is searched first.
 
     Raises:
-        ConfigurationError: No such profile (the nearest name is given), or an error in its file.
+        ConfigurationError: There is no such profile (the remedy contains the most similar name), or its file has an
+            error.
     """
     return catalog.load("robots", name, RobotProfile)

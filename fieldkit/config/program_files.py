@@ -1,4 +1,4 @@
-"""Programs of a lab that a procedure copies to robots: the record of a file with its SHA-256 in `trial.yaml`."""
+"""Programs of a lab that a procedure copies to robots, and their records with SHA-256 in `trial.yaml`."""
 
 import hashlib
 import os
@@ -17,7 +17,7 @@ It is sent over the control connection before each attempt, perhaps over a slow 
 
 
 class LabProgram(Strict):
-    """A program of the lab, at the time when its procedure was read.
+    """The record of a program of the lab, made when its procedure was read.
 
     Attributes:
         file: Its path, written by fieldkit into `trial.yaml`.

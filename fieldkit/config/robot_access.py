@@ -1,7 +1,7 @@
-"""SSH access to the robots of a site file, read for `fieldkit stop` without pydantic, whose import takes 80 ms.
+"""Read the SSH access to the robots of a site file, for `fieldkit stop`. It does not import pydantic (80 ms).
 
-Only the keys for the connection are checked. An error elsewhere in the file, or in the entry of another robot, must
-not prevent a robot from being stopped.
+Only the keys that the connection needs are checked. An error elsewhere in the file, or in the entry of another robot,
+must not prevent a robot from being stopped.
 """
 
 from dataclasses import dataclass
@@ -39,8 +39,8 @@ def read_access(document: Document) -> dict[str, RobotAccess | ConfigurationErro
     return {name: _access(document, name, entry) for name, entry in robots.items()}
 
 
-def backend_of(document: Document) -> str:
-    """Return the backend in a site file, or the default."""
+def configured_backend(document: Document) -> str:
+    """Return the name of the backend in a site file, or the default."""
     name = document.data.get("backend", "field") if isinstance(document.data, dict) else None
     return name if isinstance(name, str) else "field"
 

@@ -1,4 +1,4 @@
-"""Strict YAML and JSON: load, validate, freeze. Errors in YAML have file, line and the nearest valid key.
+"""Load, validate and freeze YAML and JSON. Errors in YAML contain file, line and the most similar valid key.
 
 This is the only module that imports pydantic. Profiles, procedures, site files and back-end options are subclasses of
 `Strict`, loaded by `load`.
@@ -94,29 +94,29 @@ Quantity = TypeVar("Quantity")
 
 _ENCLOSING: ContextVar[tuple[type["Strict"], ...]] = ContextVar("_ENCLOSING", default=())
 """Models of the mapping that is being validated and of its enclosing mappings, the outermost first."""
-_SHAPES: Final[dict[str, str]] = {}
-"""Description of the texts that match a pattern, by pattern; see `pattern_field`."""
+_PATTERN_DESCRIPTIONS: Final[dict[str, str]] = {}
+"""Description of a valid text by pattern; see `pattern_field`."""
 _FOLDER: ContextVar[Path] = ContextVar("_FOLDER", default=Path())
 
 
 def validation_error(text: str, *at: str | int) -> Exception:
-    """Return the exception that a validator raises. The user gets `text` with file and line.
+    """Return the exception that a validator raises. The message to the user contains `text`, file and line.
 
     Args:
         text: Description of the error.
         at: Keys and indices from the validated value to the invalid part, for the line.
     """
-    return PydanticCustomError("complaint", "{text}", {"text": text, "at": at})
+    return PydanticCustomError("fieldkit_error", "{text}", {"text": text, "at": at})
 
 
-def pattern_field(pattern: str, words: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
+def pattern_field(pattern: str, description: str) -> Any:  # noqa: ANN401 (as pydantic's own `Field`)
     """Return the `Field` of a text that must match a pattern.
 
     Args:
         pattern: A regular expression for the whole text.
-        words: Description of a valid text for error messages: `a name in lower-case letters`.
+        description: Description of a valid text for error messages: `a name in lower-case letters`.
     """
-    _SHAPES[pattern] = words
+    _PATTERN_DESCRIPTIONS[pattern] = description
     return Field(pattern=pattern)
 
 
@@ -168,11 +168,11 @@ Names = Annotated[frozenset[str], PlainSerializer(sorted, return_type=list[str])
 Span = Annotated[
     Distance, _converter(units.parse_distance, "ft"), PlainSerializer(lambda value: value.label, return_type=str)
 ]
-"""A distance that keeps the operator's label."""
+"""A distance, written back with the operator's label."""
 
 
 class _UnvalidatedSection(NamedTuple):
-    """The value of a section of an installed package, which is validated together with the other keys."""
+    """The unvalidated value of a section of an installed package, with the model that validates it."""
 
     model: type[BaseModel]
     value: object
@@ -183,11 +183,11 @@ def _validated_section(section: object) -> object:
 
 
 SectionValue = Annotated[Any, BeforeValidator(_validated_section)]
-"""Type of the values of further keys in a mapping with sections."""
+"""Type of the values of additional keys in a mapping with sections."""
 
 
 class Strict(BaseModel):
-    """Base of everything read from YAML: frozen, no unknown keys.
+    """Base of all models that are read from YAML. They are frozen and reject unknown keys.
 
     Numbers and booleans are declared as `Int`, `Number` and `Bool`, which do not convert other types.
     """
@@ -211,7 +211,7 @@ class Strict(BaseModel):
 
     @classmethod
     def section_types(cls) -> Mapping[str, type[BaseModel]]:
-        """Return the models of further keys, which installed packages add; most mappings have none."""
+        """Return the models of additional keys, which installed packages define; most mappings have none."""
         return {}
 
     @classmethod
@@ -299,12 +299,12 @@ def by_kind(
 
     Args:
         kinds: Returns the models by key. It is called during validation, so that models can contain such mappings.
-        make: Makes the object for a mapping.
-        split: Returns key and value of such an object.
-        what: Noun for messages.
+        make: Returns the object for a key and a value.
+        split: Returns the key and the value of an object.
+        what: Noun for an item in messages.
     """
 
-    def validated(data: Any) -> Item:  # noqa: ANN401 (any YAML value, or an object that `make` returned)
+    def validate_item(data: Any) -> Item:  # noqa: ANN401 (any YAML value, or an object that `make` returned)
         if not isinstance(data, Mapping):
             return _require_item(data)
         models = kinds()
@@ -329,7 +329,7 @@ def by_kind(
         item: Item = data
         return item
 
-    def plain(item: Item, info: SerializationInfo) -> dict[str, Any]:
+    def serialize(item: Item, info: SerializationInfo) -> dict[str, Any]:
         kind, value = split(item)
         data = value.model_dump(
             mode=info.mode,
@@ -340,15 +340,15 @@ def by_kind(
         return {kind: data}
 
     return core_schema.no_info_plain_validator_function(
-        validated, serialization=core_schema.plain_serializer_function_ser_schema(plain, info_arg=True)
+        validate_item, serialization=core_schema.plain_serializer_function_ser_schema(serialize, info_arg=True)
     )
 
 
 def _validated_under(key: str, model: type[AnyModel], value: object) -> AnyModel:
     """Return the object of a value; the locations of its errors begin with `key`."""
     validator = core_schema.no_info_plain_validator_function(model.model_validate)
-    located = SchemaValidator(core_schema.typed_dict_schema({key: core_schema.typed_dict_field(validator)}))
-    validated: AnyModel = located.validate_python({key: value})[key]
+    nested_validator = SchemaValidator(core_schema.typed_dict_schema({key: core_schema.typed_dict_field(validator)}))
+    validated: AnyModel = nested_validator.validate_python({key: value})[key]
     return validated
 
 
@@ -362,7 +362,7 @@ def validate(document: Document, model: type[Model]) -> Model:
 
     Raises:
         ConfigurationError: The first problem in the file, with file, line, key path and, for an unknown key, the
-            nearest valid one.
+            most similar valid key.
     """
     document = model.expanded(document)
     token = _FOLDER.set(Path(document.source).parent)
@@ -371,7 +371,7 @@ def validate(document: Document, model: type[Model]) -> Model:
     except ValidationError as error:
         from fieldkit.config import yaml_errors  # noqa: PLC0415
 
-        raise yaml_errors.explain(error.errors(), document, _SHAPES) from error
+        raise yaml_errors.explain(error.errors(), document, _PATTERN_DESCRIPTIONS) from error
     finally:
         _FOLDER.reset(token)
 

@@ -65,8 +65,8 @@ def load_model(base: type, point: EntryPoint) -> type[BaseModel]:
     Raises:
         ConfigurationError: The entry point cannot be loaded, or its object does not derive from `base`.
     """
-    loaded, location = plugins.load(point), plugins.location(point)
-    if not (isinstance(loaded, type) and issubclass(loaded, base) and issubclass(loaded, BaseModel)):
+    model, location = plugins.load(point), plugins.location(point)
+    if not (isinstance(model, type) and issubclass(model, base) and issubclass(model, BaseModel)):
         name = base.__name__
         raise ConfigurationError(f"a section must be a subclass of {name}", where=location, remedy=plugins.REMEDY)
-    return loaded
+    return model

@@ -48,11 +48,11 @@ class SiteRobot(Strict):
         host: Name or address for SSH; required by the field backend.
         port: SSH port.
         user: SSH user; required by the field backend.
-        key: Path of the private key; without it, keys of the SSH agent are used.
+        key: Path of the private key; without this key, the keys of the SSH agent are used.
         password: Login by password instead of a key: `ask` requests the password at the terminal once per run,
             `keyring` reads it from the system's keyring. The password itself is never written into the file.
         host_key: Pinned host key, `ssh-ed25519 AAAA...`; required by the field backend. `fieldkit enroll` writes it.
-        address: Its IPv4 address on the radio under test; without it, `host`.
+        address: Its IPv4 address on the radio under test; the default is `host`.
         links: Its IPv4 address on each further link of its profile, by the name of the link.
     """
 
@@ -149,7 +149,7 @@ class Site(Strict):
 
 
 def load_site(path: Path) -> tuple[Site, schema.Document]:
-    """Return the site file and its document (each backend validates its own section).
+    """Return the site file and its document, from which each backend validates its section.
 
     Raises:
         ConfigurationError: As `schema.load`.

@@ -63,15 +63,15 @@ def pin_host_key(path: Path, robot: str, host_key: str) -> None:
 
 
 def _with_key(text: str, robot: str, host_key: str) -> str:
-    """Return the file with the key, or unchanged if it cannot be edited."""
+    """Return the text with the key, or unchanged if it cannot be edited."""
     try:
         return _with_value(text, ("robots", robot, _KEY), host_key)
     except ValueError:
         return text
 
 
-def _is_pinned(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (a plain tree)
-    """Return True if `text` has the values of `old` and the key."""
+def _is_pinned(text: str, old: Any, robot: str, host_key: str) -> bool:  # noqa: ANN401 (plain values of YAML)
+    """Return True if `text` has the values of `old`, and the host key."""
     expected = {**old, "robots": {**old["robots"], robot: {**old["robots"][robot], _KEY: host_key}}}
     try:
         return bool(documents.parse(text, source="").data == expected)

@@ -1,4 +1,4 @@
-"""Physical layer of a robot's Wi-Fi since 802.11n: the keys of `radio.phy`, and which combinations exist."""
+"""Physical layer of a robot's Wi-Fi since 802.11n: the keys of `radio.phy` and their valid combinations."""
 
 import re
 from typing import Annotated, Final, Literal, cast
@@ -78,12 +78,12 @@ class WifiPhy(Strict):
         valid = sorted({interval for intervals in _GUARD_INTERVALS_NS.values() for interval in intervals})
         if self.guard_interval_ns not in valid:
             raise schema.validation_error(
-                f"there is no guard interval of {self.guard_interval_ns} ns; write {_words(valid)}",
+                f"there is no guard interval of {self.guard_interval_ns} ns; write {_join_words(valid)}",
                 "guard_interval_ns",
             )
         return self
 
-    def standard_error(self, standard: str) -> str | None:
+    def incompatibility(self, standard: str) -> str | None:
         """Return the reason why a radio of a standard, `802.11ac 5 GHz`, cannot have this layer; None if it can."""
         match = _STANDARD.fullmatch(standard)
         if match is None:
@@ -93,17 +93,17 @@ class WifiPhy(Strict):
             return f"802.11{amendment} does not exist at {band}; it exists at {', '.join(_BANDS[amendment])}"
         widths_mhz = _widths_mhz(amendment, band)
         if self.width_mhz not in widths_mhz:
-            return f"{standard} has no width of {self.width_mhz} MHz; write phy.width_mhz: {_words(widths_mhz)}"
+            return f"{standard} has no width of {self.width_mhz} MHz; write phy.width_mhz: {_join_words(widths_mhz)}"
         intervals_ns = _GUARD_INTERVALS_NS[amendment]
         if self.guard_interval_ns not in intervals_ns:
             return (
                 f"802.11{amendment} has no guard interval of {self.guard_interval_ns} ns; "
-                f"write phy.guard_interval_ns: {_words(intervals_ns)}"
+                f"write phy.guard_interval_ns: {_join_words(intervals_ns)}"
             )
         return None
 
     def split_standard(self, standard: str) -> tuple[WifiAmendment, WifiBand]:
-        """Return amendment and band of a standard for which `standard_error` returns None."""
+        """Return amendment and band of a standard for which `incompatibility` returns None."""
         match = _STANDARD.fullmatch(standard)
         assert match is not None
         return cast("tuple[WifiAmendment, WifiBand]", match.groups())
@@ -111,7 +111,7 @@ class WifiPhy(Strict):
 
 def check_standard(standard: str, phy: WifiPhy | None) -> None:
     """Raise the validation error of a radio whose standard cannot have this physical layer."""
-    if phy is not None and (reason := phy.standard_error(standard)) is not None:
+    if phy is not None and (reason := phy.incompatibility(standard)) is not None:
         raise schema.validation_error(reason, "standard")
 
 
@@ -119,6 +119,6 @@ def _widths_mhz(amendment: WifiAmendment, band: WifiBand) -> tuple[int, ...]:
     return (20, 40) if amendment == "n" or band == "2.4 GHz" else _MODELLED_WIDTHS_MHZ
 
 
-def _words(values: tuple[int, ...] | list[int]) -> str:
+def _join_words(values: tuple[int, ...] | list[int]) -> str:
     *first, last = map(str, values)
     return f"{', '.join(first)} or {last}"

@@ -1,4 +1,4 @@
-"""Describe errors in YAML files for users who know YAML but not the classes, with hints about wrong indentation."""
+"""Describe errors in YAML files, with hints about wrong indentation, for users who do not know the classes."""
 
 import difflib
 import re
@@ -11,7 +11,7 @@ from fieldkit.core.errors import ConfigurationError, did_you_mean
 from fieldkit.core.units import format_count
 
 Fields = Mapping[str, Any]
-"""Types by key of a mapping, from its model."""
+"""Type of the value by key of a mapping, from its model."""
 
 _MIN_SIMILARITY: Final = 0.8
 """Minimum similarity (`difflib`) at which a name counts as a misspelling of another."""
@@ -75,13 +75,13 @@ _NO_KEYS_HINT: Final = ", and there are none; indent the keys that belong to thi
 _MESSAGES: Final = MappingProxyType({"tuple_type": "a list is needed here", "missing": "this list needs more values"})
 
 
-def explain(problems: Sequence[Any], document: Document, shapes: Mapping[str, str]) -> ConfigurationError:
-    """Return the first problem in a document, with file, line and key path.
+def explain(problems: Sequence[Any], document: Document, descriptions: Mapping[str, str]) -> ConfigurationError:
+    """Return the error for the first problem in a document, with file, line and key path.
 
     Args:
         problems: All problems, as `ErrorDetails` of pydantic.
         document: The document.
-        shapes: Description of the texts that match a pattern, by pattern.
+        descriptions: Description of a valid text by pattern.
     """
 
     def line(problem: Any) -> int:  # noqa: ANN401 (as in `explain`)
@@ -95,16 +95,18 @@ def explain(problems: Sequence[Any], document: Document, shapes: Mapping[str, st
     if missing:
         message = f"required key {missing!r} is missing"
     elif place and place[-1] == "[key]":
-        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_message(first, shapes)}"
+        place, message = place[:-2], f"{place[-2]!r} cannot be a key here: {_message(first, descriptions)}"
     elif first.get("ctx", {}).get("outer"):
-        message = _misindented(first, document)
+        message = _indentation_message(first, document)
     else:
-        message = _message(first, shapes)
+        message = _message(first, descriptions)
     path = ".".join(str(part) for part in (*document.place, *document.existing_part(place)))
     remedy = f"add {missing}: to it" if missing else "correct this line"
     # A value with several valid forms has one problem per form at the same location.
-    others = len({(document.existing_part(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
-    more = f" (and {format_count(others, 'more problem')})" if others else ""
+    other_count = (
+        len({(document.existing_part(_location(problem)), _missing_key(problem)) for problem in problems}) - 1
+    )
+    more = f" (and {format_count(other_count, 'more problem')})" if other_count else ""
     return ConfigurationError(
         f"{f'in {path}: ' if path else ''}{message}{more}",
         where=document.where(location),
@@ -112,7 +114,7 @@ def explain(problems: Sequence[Any], document: Document, shapes: Mapping[str, st
     )
 
 
-def _misindented(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
+def _indentation_message(problem: Any, document: Document) -> str:  # noqa: ANN401 (as in `explain`)
     """Return the message for a key of an enclosing mapping, with the indentation of that mapping's keys."""
     place, context = problem["loc"], problem["ctx"]
     key, outer = context["key"], context["outer"]
@@ -129,7 +131,7 @@ def _missing_key(problem: Any) -> str:  # noqa: ANN401 (as in `explain`)
 
 
 def _without_cascading_errors(problems: Sequence[Any]) -> list[Any]:
-    """Return the problems, except about lists that are too short only because of an error in their items."""
+    """Return the problems, except about lists that are too short only because of errors in their items."""
 
     def is_cascading(problem: Any) -> bool:  # noqa: ANN401 (as in `explain`)
         depth = len(problem["loc"])
@@ -147,7 +149,7 @@ def _location(problem: Any) -> Location:  # noqa: ANN401 (as in `explain`)
     return (*location, *context.get("at", ()), *(() if key is None else (key,)))
 
 
-def _message(problem: Mapping[str, Any], shapes: Mapping[str, str]) -> str:
+def _message(problem: Mapping[str, Any], descriptions: Mapping[str, str]) -> str:
     message = _MESSAGES.get(problem["type"], problem["msg"])
     value, context = problem["input"], problem.get("ctx", {})
     match problem["type"]:
@@ -159,12 +161,14 @@ def _message(problem: Mapping[str, Any], shapes: Mapping[str, str]) -> str:
             message = f"required key {context['discriminator']} is missing"
         case "union_tag_invalid":
             kinds = re.findall(r"'([^']+)'", context["expected_tags"])
-            message = f"there is no kind {context['tag']!r}; {did_you_mean(context['tag'], kinds, _kinds(kinds))}"
+            message = (
+                f"there is no kind {context['tag']!r}; {did_you_mean(context['tag'], kinds, _kinds_hint(kinds))}"
+            )
         case "string_pattern_mismatch":
-            message = _pattern_message(str(value), context["pattern"], shapes)
+            message = _pattern_message(str(value), context["pattern"], descriptions)
         case "too_short":
-            least, short = context["min_length"], context["actual_length"]
-            message = f"at least {format_count(least, 'item')} are needed here, not {short}"
+            min_length, actual_length = context["min_length"], context["actual_length"]
+            message = f"at least {format_count(min_length, 'item')} are needed here, not {actual_length}"
         case "literal_error" | "enum" if isinstance(value, str) and "'" in context["expected"]:
             message = _choice_message(value, re.findall(r"'([^']*)'", context["expected"]))
         case kind:
@@ -194,16 +198,16 @@ def _type_message(kind: str, message: str, value: object) -> str:
     return message
 
 
-def _kinds(names: Sequence[str]) -> str:
+def _kinds_hint(names: Sequence[str]) -> str:
     return f"kinds: {', '.join(names)}"
 
 
-def _pattern_message(text: str, pattern: str, shapes: Mapping[str, str]) -> str:
+def _pattern_message(text: str, pattern: str, descriptions: Mapping[str, str]) -> str:
     """Return the message about a text that does not match a pattern."""
     if words := _WORDS.fullmatch(pattern):
         return _choice_message(text, words[1].split("|"))
-    if pattern in shapes:
-        return f"{_quoted(text)} is not {shapes[pattern]}"
+    if pattern in descriptions:
+        return f"{_quoted(text)} is not {descriptions[pattern]}"
     return f"{_quoted(text)} should match pattern {pattern!r}"
 
 

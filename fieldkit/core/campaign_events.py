@@ -13,12 +13,12 @@ class CampaignPlanned(Event):
     """The remaining work of a campaign.
 
     Attributes:
-        name: Its name.
-        trials: The remaining trials, in order.
+        name: Name of the campaign.
+        trials: Names of the remaining trials, in order.
         done: Number of finished trials.
         total: Number of all trials.
         walk_m: Distance over which robots must be carried, in metres.
-        left_s: Estimated time.
+        left_s: Estimated duration of the remaining trials.
         needed_bytes: Disk space on this machine that the evidence may need.
         free_bytes: Free disk space on this machine.
         left_most_s: Upper estimate of `left_s`. It does not include repeats that must be run again.
@@ -37,15 +37,15 @@ class CampaignPlanned(Event):
     @property
     @override
     def words(self) -> Words:
-        done = _done_text(self.done, self.total)
+        done_text = _done_text(self.done, self.total)
         if not self.trials:
-            return ((done, ""),)
+            return ((done_text, ""),)
         names = (f"\n{number:5d}  {name}" for number, name in enumerate(self.trials, start=self.done + 1))
         disk = f"{format_bytes(self.needed_bytes)} of disk ({format_bytes(self.free_bytes)} free)"
         duration = TimeEstimate(self.left_s, self.left_most_s)
-        failed_links = " if links fail" if not duration.is_certain else ""
-        cost = f"{self.walk_m:.0f} m to walk with robots, about {duration}{failed_links}; at most {disk}"
-        return ((f"{done}; {cost}{''.join(names)}", ""),)
+        condition = " if links fail" if not duration.is_certain else ""
+        cost = f"{self.walk_m:.0f} m to walk with robots, about {duration}{condition}; at most {disk}"
+        return ((f"{done_text}; {cost}{''.join(names)}", ""),)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class CampaignTrial(Event):
 
     Attributes:
         trial: Name of the trial.
-        number: Its number among the trials that are run, from 1.
+        number: Its number in the order of execution, from 1.
         total: Number of all trials.
     """
 
@@ -94,8 +94,8 @@ class CampaignWent(Event):
     @property
     @override
     def words(self) -> Words:
-        left = f", about {TimeEstimate(self.left_s, self.left_most_s)} left" if self.done < self.total else ""
-        return ((f"{_done_text(self.done, self.total)}{left}", ""),)
+        left_text = f", about {TimeEstimate(self.left_s, self.left_most_s)} left" if self.done < self.total else ""
+        return ((f"{_done_text(self.done, self.total)}{left_text}", ""),)
 
 
 @dataclass(frozen=True)

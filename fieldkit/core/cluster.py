@@ -20,7 +20,7 @@ except ImportError as error:
         f"a Dask cluster needs the package distributed: {error}", remedy='pip install "fieldkit[cluster]"'
     ) from error
 
-# Its warnings about lost workers are suppressed, because `tasks` reports lost workers.
+# Warnings of distributed about lost workers are suppressed, because `tasks` reports lost workers.
 logging.getLogger("distributed").setLevel(logging.ERROR)
 
 Parameters = ParamSpec("Parameters")
@@ -47,17 +47,17 @@ class ClusterExecutor(WorkerExecutor):
             raise ConfigurationError(
                 "there is no scheduler file", where=address, remedy=f"dask scheduler --scheduler-file {address}"
             )
-        where = {"scheduler_file": address} if address.endswith(".json") else {"address": address}
+        connection = {"scheduler_file": address} if address.endswith(".json") else {"address": address}
         try:
             client: Any = Client  # Client has no type annotations
-            self._client = client(**where, timeout=_CONNECT_S, set_as_default=False)
+            self._client = client(**connection, timeout=_CONNECT_S, set_as_default=False)
         except (OSError, TimeoutError, ValueError) as error:
             raise LinkError(
                 f"no Dask scheduler answers at {address}",
                 remedy="start one with `dask scheduler`, and give the address that it prints",
             ) from error
         self._executor = self._client.get_executor(pure=False)
-        self._capacity, self._read_s = 0, -_REFRESH_S
+        self._capacity, self._capacity_read_s = 0, -_REFRESH_S
 
     @override
     def submit(
@@ -68,12 +68,12 @@ class ClusterExecutor(WorkerExecutor):
 
     @override
     def capacity(self) -> int:
-        if time.monotonic() - self._read_s >= _REFRESH_S:
+        if time.monotonic() - self._capacity_read_s >= _REFRESH_S:
             try:
                 self._capacity = sum(self._client.nthreads().values())
             except (OSError, TimeoutError):  # the futures report the lost connection
                 self._capacity = 0
-            self._read_s = time.monotonic()
+            self._capacity_read_s = time.monotonic()
         return self._capacity
 
     @override
@@ -82,7 +82,7 @@ class ClusterExecutor(WorkerExecutor):
 
     @override
     def is_broken(self) -> bool:
-        return False  # the scheduler moves the tasks of a worker that died to another one
+        return False  # the scheduler moves the tasks of a dead worker to another worker
 
     @override
     def stop(self) -> None:

@@ -75,7 +75,7 @@ class Kind(StrEnum):
     WORDS = "words"
 
 
-FIRST_OF_OTHERS: Final = 100
+FIRST_EXTERNAL_RANK: Final = 100
 """Lowest rank of a figure that another package declares."""
 BACKGROUND: Final = 1000
 """Lowest rank of fieldkit's background figures, which every trial has; they are listed last."""
@@ -90,8 +90,8 @@ class Figure:
         kind: Kind of aggregation.
         arrived: Column with the number of received items; None unless the kind is `counted`.
         sent: Column with the number of sent items; None unless the kind is `counted`.
-        rank: Sort key among the figures of a table; equal ranks keep the order of columns. The ranks of fieldkit's
-            figures are below `FIRST_OF_OTHERS`, or `BACKGROUND` and above.
+        rank: Sort key among the figures of a table; figures of equal rank keep the order of columns. The ranks of
+            fieldkit's figures are below `FIRST_EXTERNAL_RANK`, or `BACKGROUND` and above.
         at_least: Column with the observed duration if the event had not ended (a right-censored value). It has a
             value only in repeats in which the figure's column is empty for this reason. Only for medians; it has the
             same unit and no figure.
@@ -104,7 +104,7 @@ class Figure:
     kind: Kind
     arrived: str | None = None
     sent: str | None = None
-    rank: int = FIRST_OF_OTHERS
+    rank: int = FIRST_EXTERNAL_RANK
     at_least: str | None = None
     of_sent: str | None = None
 
@@ -117,8 +117,8 @@ class Column:
         name: Column name.
         unit: Unit, or the kind of value if it has no unit.
         meaning: What the value is, and when it is empty.
-        rank: Sort key among the columns of trial.csv, from the left; equal ranks keep the order of declaration.
-            Columns of schema versions 1 and 2 have ranks below 100, so that their order never changes.
+        rank: Sort key among the columns of trial.csv, from the left; columns of equal rank keep the order of
+            declaration. Columns of schema versions 1 and 2 have ranks below 100, so that their order never changes.
         bounds: Smallest and largest possible value, if narrower than the bounds of the unit.
         figure: How the repeats are aggregated; None if they are not.
     """
@@ -190,20 +190,22 @@ class Column:
 
 def columns(
     rank: int,
-    *declared: tuple[str, str, str] | tuple[str, str, str, Figure | Bounds] | tuple[str, str, str, Figure, Bounds],
+    *column_parts: tuple[str, str, str]
+    | tuple[str, str, str, Figure | Bounds]
+    | tuple[str, str, str, Figure, Bounds],
 ) -> tuple[Column, ...]:
-    """Return columns of one rank.
+    """Return columns that have the same rank.
 
     Args:
         rank: `Column.rank`.
-        declared: Name, unit and meaning of each column, then optionally its figure and its bounds.
+        column_parts: Name, unit and meaning of each column, then optionally its figure and its bounds.
 
     Raises:
         TypeError: `rank` is not a number.
     """
     if not isinstance(rank, int):  # otherwise a call without a rank would lose its first column silently
         raise TypeError("the first argument of columns is the rank, for example 100")
-    return tuple(_make_column(rank, *parts) for parts in declared)
+    return tuple(_make_column(rank, *parts) for parts in column_parts)
 
 
 def _make_column(rank: int, name: str, unit: str, meaning: str, *optional: Figure | Bounds) -> Column:
@@ -264,9 +266,9 @@ class Measured:
         )
 
     @classmethod
-    def all_missing(cls, declared: Iterable[Column], reason: str) -> Self:
+    def all_missing(cls, declared_columns: Iterable[Column], reason: str) -> Self:
         """Return a result in which all of these columns are missing for `reason`."""
-        return cls(missing={column.name: reason for column in declared})
+        return cls(missing={column.name: reason for column in declared_columns})
 
     def with_step_name(self, name: str) -> Self:
         """Return a copy whose columns have the name of a step as prefix (see `step_prefixed`)."""
@@ -277,7 +279,7 @@ class Measured:
         """Return a copy in which some columns are missing.
 
         Args:
-            reasons: Reason by column that becomes missing.
+            reasons: Reason by name of each column that becomes missing.
         """
         values = {name: value for name, value in self.values.items() if name not in reasons}
         return type(self)(values, {**self.missing, **reasons})

@@ -46,16 +46,16 @@ class Deadline:
         """Return the later of this deadline and `seconds` from now."""
         return Deadline(max(self.at_s, time.monotonic() + seconds))
 
-    def extended_by_suspension(self, began_s: float, wait_s: float) -> "Deadline":
+    def extended_by_suspension(self, start_s: float, wait_s: float) -> "Deadline":
         """Return the deadline, extended by the time for which this process was suspended during a wait.
 
-        A suspension does not show that the awaited program failed: its answer may have arrived already.
+        The awaited program has not necessarily failed: its answer may have arrived during the suspension.
 
         Args:
-            began_s: Start of the wait, in seconds of `time.monotonic`.
+            start_s: Start of the wait, in seconds of `time.monotonic`.
             wait_s: Time-out of the wait.
         """
-        suspended_s = time.monotonic() - began_s - wait_s
+        suspended_s = time.monotonic() - start_s - wait_s
         return Deadline(self.at_s + suspended_s) if suspended_s > _MIN_SUSPENDED_S else self
 
 
@@ -65,23 +65,23 @@ class ExpiredError(TimeoutError):
     The operating system raises a plain `TimeoutError` if a connection times out.
 
     Args:
-        what: What did not happen in time, for messages: `start`.
+        what: The action that did not happen in time, for messages: `start`.
     """
 
 
 def call_with_deadline(
-    call: Callable[[], T], deadline: Deadline, ended: threading.Event, *, what: str = "answer"
+    call: Callable[[], T], deadline: Deadline, cancelled: threading.Event, *, what: str = "answer"
 ) -> T:
     """Call a function that has no time-out parameter, such as a name look-up; return its result or raise its error.
 
     Args:
         call: The function. It runs in a daemon thread, which continues if the deadline passes.
         deadline: When to stop waiting.
-        ended: Another thread sets this event to stop the wait earlier, within 0.1 s.
-        what: What did not happen, for the error.
+        cancelled: Another thread sets this event to stop the wait earlier, within 0.1 s.
+        what: The awaited action, for the error.
 
     Raises:
-        ExpiredError: The deadline passed, or `ended` was set.
+        ExpiredError: The deadline passed, or `cancelled` was set.
     """
     results: list[T] = []
     errors: list[BaseException] = []
@@ -95,10 +95,10 @@ def call_with_deadline(
         done.set()
 
     threading.Thread(target=work, daemon=True).start()
-    while not ended.is_set() and not deadline.expired:
-        began_s, wait_s = time.monotonic(), min(_POLL_INTERVAL_S, deadline.remaining_s)
+    while not cancelled.is_set() and not deadline.expired:
+        start_s, wait_s = time.monotonic(), min(_POLL_INTERVAL_S, deadline.remaining_s)
         is_done = done.wait(wait_s)
-        deadline = deadline.extended_by_suspension(began_s, wait_s)
+        deadline = deadline.extended_by_suspension(start_s, wait_s)
         if is_done:
             for error in errors:
                 raise error

@@ -109,8 +109,10 @@ def describe_exception(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:
         return text
-    others = [frame for frame in frames if not any(map(Path(frame.filename).is_relative_to, _PACKAGES))]
-    place = next((frame for frame in reversed(others) if frame.filename == others[0].filename), frames[-1])
+    outside_frames = [frame for frame in frames if not any(map(Path(frame.filename).is_relative_to, _PACKAGES))]
+    place = next(
+        (frame for frame in reversed(outside_frames) if frame.filename == outside_frames[0].filename), frames[-1]
+    )
     return f"{text} ({Path(place.filename).name}, line {place.lineno})"
 
 

@@ -14,16 +14,16 @@ Words = tuple[tuple[str, str], ...]
 class Event:
     """Something that happened during a command.
 
-    The display has the texts of a trial's events. Events of other commands define their own texts, so that a trial
-    need not import them.
+    `cli.event_words` has the texts of a trial's events. The events of other commands define their texts themselves,
+    so that a trial does not import them.
     """
 
     ends_progress: ClassVar[bool] = False
-    """Whether the work has ended whose progress is shown."""
+    """Whether this event ends the work whose progress is shown."""
 
     @property
     def words(self) -> Words:
-        """Displayed texts of an event that does not belong to a trial; empty if it is not displayed."""
+        """Displayed texts of an event that does not belong to a trial; empty if the event is not displayed."""
         return ()
 
     @property
@@ -61,7 +61,7 @@ class Answered(Event):
     """The operator answered the last request.
 
     Attributes:
-        skip: Whether it is postponed.
+        skip: Whether the request is postponed.
         note: Note of the operator; empty if none.
     """
 
@@ -98,7 +98,7 @@ class Placed(Event):
     """The robots are at their positions of the trial, or the operator postponed placing them.
 
     Attributes:
-        skipped: Whether it was postponed.
+        skipped: Whether the placement was postponed.
         note: Note of the operator; empty if none.
         took_s: Duration of the placement.
     """
@@ -113,7 +113,7 @@ class PhaseStarted(Event):
     """A phase of work started.
 
     Attributes:
-        name: For example `record`, `transfer`, `start robots`.
+        name: Name of the phase, for example `record`, `transfer`, `start robots`.
         repeat: The repeat to which it belongs, or empty.
         expected_s: Expected duration; None if unknown.
     """
@@ -196,7 +196,7 @@ class RepeatEnded(Event):
         repeat: For example `udp-07`.
         attempt: Number of the attempt, from 1.
         status: Valid, void or failed.
-        reason: Why it is not valid; empty if it is.
+        reason: Reason why the repeat is not valid; empty if it is valid.
         summary: Summary of the measured values.
         done: Number of repeats that are finished and not run again.
         total: Number of planned repeats.
@@ -296,3 +296,4 @@ class TrialStopped(Event):
 
 
 Sink = Callable[[Event], None]
+"""A function that receives events."""

@@ -1,6 +1,6 @@
-"""Where many tasks run: processes of this machine, or the workers of a Dask cluster.
+"""Choose where tasks run: in processes of this machine, or on the workers of a Dask cluster.
 
-Both are a `concurrent.futures.Executor`. `tasks` submits to it.
+Both are a `concurrent.futures.Executor`, to which `tasks` submits the tasks.
 """
 
 import os
@@ -9,6 +9,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from fieldkit.core.processes import WorkerExecutor
+
+
+def usable_processors() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class Workers:
 
     def processes(self, tasks: int) -> int:
         """Return the number of processes on this machine for a number of tasks; 0 if a cluster runs them."""
-        return 0 if self.cluster else min(self.jobs or len(os.sched_getaffinity(0)), tasks)
+        return 0 if self.cluster else min(self.jobs or usable_processors(), tasks)
 
     def open(self, tasks: int) -> "WorkerExecutor":
         """Return an executor for a number of tasks.
@@ -40,9 +45,9 @@ class Workers:
             LinkError: The scheduler of the cluster does not answer.
         """
         if self.cluster:
-            from fieldkit.core.cluster import ClusterExecutor  # noqa: PLC0415 (a second, and an optional package)
+            from fieldkit.core.cluster import ClusterExecutor  # noqa: PLC0415 (takes 1 s, and needs an optional package)
 
             return ClusterExecutor(self.cluster)
-        from fieldkit.core.processes import LocalProcesses  # noqa: PLC0415 (with multiprocessing, 20 ms)
+        from fieldkit.core.processes import LocalProcesses  # noqa: PLC0415 (imports multiprocessing, 20 ms)
 
         return LocalProcesses(self.processes(tasks))

@@ -21,7 +21,7 @@ _HARD_LINK_REASON: Final = "it has a second hard link, and writing would change 
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Open a file that atomically replaces `path` at the end of the body; a crash leaves the old or the new file.
 
-    The mode of an existing file is kept, and the file is unchanged if the body raises. An existing symbolic link is
+    An existing file keeps its mode, and is unchanged if the body raises an exception. An existing symbolic link is
     replaced, and its target is not changed. A device (such as /dev/null), a pipe or a socket is not replaced.
 
     If several processes replace a file at the same time, each of them writes complete content, and the last one
@@ -70,7 +70,7 @@ def _create_temporary(path: Path) -> tuple[Path, int]:
     _remove_unlocked(temporary)
     with suppress(FileExistsError):
         descriptor = _create(temporary)
-        with suppress(OSError):  # there are no locks here, or another process is removing the file
+        with suppress(OSError):  # the file system has no locks, or another process is removing the file
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if os.fstat(descriptor).st_nlink:
             return temporary, descriptor
@@ -128,8 +128,8 @@ def open_plain(path: Path, flags: int = os.O_RDONLY) -> int:
             raise OSError(error.errno, reason, str(path)) from error
         raise
     status = os.fstat(descriptor)
-    writes = flags & (os.O_WRONLY | os.O_RDWR)
-    if stat.S_ISREG(status.st_mode) and not (writes and status.st_nlink > 1):
+    is_writable = flags & (os.O_WRONLY | os.O_RDWR)
+    if stat.S_ISREG(status.st_mode) and not (is_writable and status.st_nlink > 1):
         return descriptor
     os.close(descriptor)
     raise OSError(errno.EINVAL, special_file_type(status.st_mode) or _HARD_LINK_REASON, str(path))
@@ -167,7 +167,7 @@ def unexpected_type(path: Path) -> str:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the names in a folder to disk."""
+    """Sync the list of names in a folder to disk."""
     _sync(folder, os.O_RDONLY | os.O_DIRECTORY)
 
 
@@ -177,7 +177,7 @@ def sync(paths: Collection[Path]) -> None:
     The calls run in parallel, so that one commit of the file system's journal contains many files: on ext4, 14 small
     files took 1.3 ms, compared with 34 ms in sequence.
     """
-    from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415 (with logging, 5 ms)
+    from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415 (imports logging, 5 ms)
 
     with ThreadPoolExecutor(_SYNC_THREADS) as pool:
         for _ in pool.map(_sync, paths):

@@ -40,12 +40,12 @@ def heading_rad(role: Role, facing: str) -> float:
         role: The robot's role.
         facing: `away`, `towards`, `left` or `right`, relative to the direction away from the other end of its link.
     """
-    turned_rad = {"away": 0.0, "left": math.pi / 2, "towards": math.pi, "right": -math.pi / 2}[facing]
-    return turned_rad + (math.pi if role == Role.SENDER else 0.0)
+    turn_rad = {"away": 0.0, "left": math.pi / 2, "towards": math.pi, "right": -math.pi / 2}[facing]
+    return turn_rad + (math.pi if role == Role.SENDER else 0.0)
 
 
 def other_end(role: Role, topology: Topology) -> Role:
-    """Return the robot at the other end of a robot's link. The relay has two links; its other end is the sender."""
+    """Return the role at the other end of a robot's link. For the relay, which has two links, this is the sender."""
     if role == Role.RELAY:
         return Role.SENDER
     if topology is Topology.MASTER:
@@ -56,7 +56,7 @@ def other_end(role: Role, topology: Topology) -> Role:
 def path_corners_m(move: Move) -> tuple[tuple[float, float], ...]:
     """Return the corners of a path; the first is the robot's initial position, (0, 0).
 
-    Each is given in metres along the line from sender to receiver, and metres to its left.
+    The coordinates are metres along the line from sender to receiver, and metres to its left.
     """
     steps = (_leg_vector_m(move.role, leg) for leg in move.legs)
     return tuple(
@@ -71,7 +71,7 @@ def clip_path(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
         legs: The path.
         radius_m: Radius of the circle.
     """
-    kept: list[Leg] = []
+    legs_inside: list[Leg] = []
     x, y = 0.0, 0.0
     for leg in legs:
         dx, dy = leg.away_m, leg.left_m
@@ -79,10 +79,10 @@ def clip_path(legs: Sequence[Leg], radius_m: float) -> tuple[Leg, ...]:
             # Solve |(x, y) + share (dx, dy)| = radius. (x, y) is inside, so the larger solution is the positive one.
             dot, squared_length = x * dx + y * dy, dx**2 + dy**2
             share = (math.sqrt(dot**2 + squared_length * (radius_m**2 - x**2 - y**2)) - dot) / squared_length
-            return (*kept, Leg(share * dx, share * dy)) if share > 0 else tuple(kept)
-        kept.append(leg)
+            return (*legs_inside, Leg(share * dx, share * dy)) if share > 0 else tuple(legs_inside)
+        legs_inside.append(leg)
         x, y = x + dx, y + dy
-    return tuple(kept)
+    return tuple(legs_inside)
 
 
 def farthest_m(legs: Sequence[Leg]) -> float:

@@ -1,4 +1,7 @@
-"""Append-only file of JSON lines: `append` waits until its lines are on disk; `read` omits an incomplete last one."""
+"""Append-only files of JSON lines.
+
+`append` waits until its lines are on disk. `read` omits an incomplete last line.
+"""
 
 import errno
 import fcntl
@@ -18,7 +21,7 @@ Parse = Callable[[Any], Entry]
 """Converts a JSON value to an entry; raises ValueError, KeyError or TypeError for any other value."""
 
 _LIMIT_BYTES: Final = 1 << 28
-"""Size limit. A line of a journal has about 120 bytes, so no trial reaches it."""
+"""Size limit of a file. A line of a journal has about 120 bytes, so no trial reaches it."""
 
 
 @contextmanager
@@ -45,7 +48,7 @@ def locked(path: Path, what: str) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise ConfigurationError(
-                f"another fieldkit runs this {what}",
+                f"another fieldkit process runs this {what}",
                 where=str(path.parent),
                 remedy="wait until it has exited, or stop it",
             ) from error

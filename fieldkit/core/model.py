@@ -96,7 +96,8 @@ class Control(StrEnum):
 class Status(StrEnum):
     """Status of a repeat.
 
-    `measured`: its steps are done and its evidence is still on the robots; `void`: its evidence is incomplete.
+    `measured`: the steps of the repeat are done and its evidence is still on the robots; `void`: its evidence is
+    incomplete.
     """
 
     PLANNED = "planned"
@@ -108,7 +109,7 @@ class Status(StrEnum):
 
 
 MAX_REPEATS: Final = 100_000
-"""Maximum number of repeats per protocol of one trial. This number of repeats would take weeks."""
+"""Maximum number of repeats per protocol of one trial. So many repeats would take weeks."""
 
 LOOP: Final = "for"
 """Key of a loop in a list of steps."""
@@ -175,7 +176,7 @@ class Fault:
         kind: Kind of the fault.
         role: Role of the affected robot.
         duration_s: Duration in seconds; 0 for a reboot or a kill, whose duration is not controlled.
-        process: Name of the process that is killed; empty for the other kinds.
+        process: Name of the process that is killed; empty for other kinds.
         link: Name of the link that is down; empty for the radio under test and the other kinds.
     """
 
@@ -188,7 +189,7 @@ class Fault:
 
 @dataclass(frozen=True)
 class Leg:
-    """A straight segment of a path, relative to the end of the previous segment.
+    """A straight segment of a path, as a vector from the end of the previous segment.
 
     Attributes:
         away_m: Metres away from the robot at the other end of the link; negative towards it.

@@ -1,6 +1,6 @@
 """Permissions that installed packages define, and that the operator gives by options `--allow-NAME`.
 
-An entry point of the group `fieldkit.permissions` has the name of the permission, and names a `Permission`.
+An entry point of the group `fieldkit.permissions` has the name of the permission, and its object is a `Permission`.
 """
 
 import argparse
@@ -16,7 +16,7 @@ class Permission:
 
     Attributes:
         help_line: What it allows, for the help of commands.
-        is_repeated: Whether commands in remedies repeat the option, because a resumed trial needs it again.
+        is_repeated: Whether the commands in remedies contain the option, because a resumed trial needs it again.
     """
 
     help_line: str

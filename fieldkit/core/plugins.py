@@ -15,7 +15,8 @@ BACKENDS: Final = "fieldkit.backends"
 STEPS: Final = "fieldkit.steps"
 """Entry point group of step kinds: `NAME = "package.module:Class"`, a `Step`."""
 MOTION: Final = "fieldkit.motion"
-"""Entry point group of the package that moves robots: `control`; see `fieldkit.trial.running.motion_control`."""
+"""Entry point group of the package that moves robots. Its only entry point is `control`; see
+`fieldkit.trial.running.motion_control`."""
 RECORDINGS: Final = "fieldkit.recordings"
 """Entry point group of readers of recordings: `SUFFIX = "package.module:function"`, without the dot; see
 `fieldkit.measure.evidence.recordings`."""
@@ -48,7 +49,7 @@ PROCEDURE_SECTIONS: Final = "fieldkit.procedure_sections"
 PERMISSIONS: Final = "fieldkit.permissions"
 """Entry point group of permissions: `NAME = "package.module:OBJECT"`, a `fieldkit.core.permissions.Permission`."""
 
-_OF_MOTION: Final = MappingProxyType({PROFILE_SECTIONS: {"drive", "mavlink"}, PROCEDURE_SECTIONS: {"on_abort"}})
+_MOTION_SECTIONS: Final = MappingProxyType({PROFILE_SECTIONS: {"drive", "mavlink"}, PROCEDURE_SECTIONS: {"on_abort"}})
 """Sections of `fieldkit.motion` by group, for the error message in a distribution without this package."""
 
 REMEDY: Final = "fix or uninstall its package"
@@ -64,8 +65,8 @@ def entry_points(group: str) -> list[EntryPoint]:
 
 
 def owner(group: str, section: str) -> str:
-    """Return the package of fieldkit that has a section, even if it is not installed; empty if it is unknown."""
-    return "fieldkit.motion" if section in _OF_MOTION.get(group, ()) else ""
+    """Return the package of fieldkit that defines a section, even if it is not installed; empty if there is none."""
+    return "fieldkit.motion" if section in _MOTION_SECTIONS.get(group, ()) else ""
 
 
 def versions() -> dict[str, str]:
@@ -84,7 +85,7 @@ def version(package: str) -> str:
 
 
 def load(point: EntryPoint) -> Any:  # noqa: ANN401 (any object of another package)
-    """Return the object that an entry point names.
+    """Return the object of an entry point.
 
     Raises:
         ConfigurationError: The import raised any exception.

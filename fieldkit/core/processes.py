@@ -36,7 +36,7 @@ class WorkerExecutor(Executor):
 
     @abstractmethod
     def is_broken(self) -> bool:
-        """Return True if it accepts no more tasks because a worker died."""
+        """Return True if the executor accepts no more tasks because a worker died."""
 
     @abstractmethod
     def stop(self) -> None:
@@ -44,7 +44,7 @@ class WorkerExecutor(Executor):
 
 
 class LocalProcesses(ProcessPoolExecutor, WorkerExecutor):
-    """Processes on this machine, which ignore Ctrl-C and exit with the process that started them.
+    """Processes on this machine. They ignore Ctrl-C, and exit when the process that started them exits.
 
     Args:
         count: Number of processes.

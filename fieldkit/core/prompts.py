@@ -1,4 +1,7 @@
-"""Questions to the operator, and the operator with `--yes`; `fieldkit.cli.operators` has those that read answers."""
+"""Questions to the operator, and the substitute for the operator with `--yes`.
+
+The operators that read answers are in `fieldkit.cli.operators`.
+"""
 
 import math
 from dataclasses import dataclass
@@ -70,9 +73,9 @@ class Question:
             words = ", ".join(f"{number} {choice}" for number, choice in enumerate(self.choices, start=1))
         else:
             low, high = self.bounds
-            least = f" from {low:g}" if math.isfinite(low) else ""
-            most = f" to {high:g}" if math.isfinite(high) else ""
-            words = f"a number{f' in {self.unit}' if self.unit else ''}{least}{most}"
+            low_text = f" from {low:g}" if math.isfinite(low) else ""
+            high_text = f" to {high:g}" if math.isfinite(high) else ""
+            words = f"a number{f' in {self.unit}' if self.unit else ''}{low_text}{high_text}"
         return f"{words}; {UNKNOWN} if unknown{f'; Enter for {self.usual}' if self.usual else ''}"
 
 
@@ -80,7 +83,7 @@ class Operator(Protocol):
     """The person who places the robots and answers questions, or a substitute."""
 
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:
-        """Show a request and return the answer when it is done or postponed.
+        """Show a request, wait until it is done or postponed, and return the answer.
 
         Args:
             request: What to do, in the imperative, without a full stop: `put turtlebot-1 ...`.

@@ -58,7 +58,7 @@ class EstimateRow:
     events: int | None = _column(
         "count", "Items that were lost, repeats that are true or have the word; empty for means and medians."
     )
-    trials: int | None = _column("count", "Number of items or repeats that `events` is a part of.")
+    trials: int | None = _column("count", "Number of items or repeats among which `events` are counted.")
     mean: float | None = _column("unit", "Mean over repeats.")
     median: float | None = _column("unit", "Median over repeats.")
     p95: float | None = _column("unit", "95th percentile over repeats.")
@@ -79,7 +79,7 @@ class DifferenceRow:
     Computed by `analysis.compare`.
     """
 
-    missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have.")
+    missing_in: str | None = _column("text", "A or B if that run has no such condition; empty if both have it.")
     quantity: str | None = _column("text", "Column of trial.csv that was compared.")
     unit: str | None = _column("text", "Unit of all numbers except counts: s, bit/s, share, or that of the column.")
     estimate: str | None = _column("text", "Kind of a and b: counted, mean, median, or flag (share of the repeats).")

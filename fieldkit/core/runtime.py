@@ -1,7 +1,7 @@
 """Named locks between the processes of one user: lock files in a folder to which no other user can write.
 
 A lock is a `flock`, which the kernel releases when its process exits, even after kill -9. A file that was left behind
-is therefore not locked, and the next process that takes any lock removes it.
+is therefore not locked, and the next process that acquires any lock removes it.
 """
 
 import fcntl
@@ -19,7 +19,7 @@ from typing import Final, NoReturn
 from fieldkit.core.errors import ConfigurationError, shell_command
 
 _MAX_BASE_BYTES: Final = 60
-"""Maximum length of the base folder's path, because the path of a Unix socket has at most 107 bytes (unix(7))."""
+"""Maximum length of the base folder's path. The path of a Unix socket can have at most 107 bytes (unix(7))."""
 
 _SUFFIX: Final = ".lock"
 
@@ -91,7 +91,7 @@ def hold_lock(name: str) -> Iterator[None]:
     """Hold a named lock while the body runs; its file is removed afterwards.
 
     Args:
-        name: A file name of letters, digits and `._@-`, at most 200 bytes.
+        name: A file name of letters, digits and `._@-`, of at most 200 bytes.
 
     Raises:
         NameHeldError: Another process holds the lock.

@@ -1,4 +1,4 @@
-"""Many tasks on an executor: a bounded number is submitted, results are returned as they complete.
+"""Run many tasks on an executor. A bounded number is submitted, and results are returned as they complete.
 
 A task whose worker died is run again. If a process of this machine dies, all submitted tasks are lost, and it is
 unknown which of them is the cause; a task that was lost repeatedly is therefore run alone.
@@ -25,7 +25,7 @@ ALONE_AFTER: Final = 2
 _PER_WORKER: Final = 2
 """Submitted tasks per worker: one that runs and one that waits, so that no worker is idle."""
 _POLL_S: Final = 1.0
-"""Interval in which the number of workers of a cluster is read."""
+"""Interval at which the number of workers of a cluster is read."""
 
 
 class WorkerDiedError(FieldkitError):
@@ -48,7 +48,7 @@ class TaskEnd(Generic[Result]):
 
 
 def ignore(_: str) -> None:
-    """Show no notes."""
+    """Discard a note."""
 
 
 def completed(
@@ -60,10 +60,10 @@ def completed(
     """Yield the end of each task, in the order of completion. Closing the generator early stops all tasks.
 
     Args:
-        work: Called in another process, unless there is only one process on this machine; it, the tasks and the
-            results must be picklable.
+        work: The function that runs a task. It is called in another process, unless `workers` is a single process on
+            this machine. The function, the tasks and the results must be picklable.
         tasks: The tasks.
-        workers: Where they run.
+        workers: The workers on which they run.
         note: Receives a sentence when a worker died or when no worker is connected.
 
     Raises:
@@ -92,8 +92,8 @@ class _Submission(Generic[Task, Result]):
         self._deaths: Counter[int] = Counter()
         self._submitted: dict[Future[Result], int] = {}
         self._executor = workers.open(len(tasks))
-        self._is_without_worker = False
-        self._lost = 0
+        self._has_no_worker = False
+        self._lost_count = 0
 
     def ends(self) -> Iterator[TaskEnd[Result]]:
         try:
@@ -101,25 +101,25 @@ class _Submission(Generic[Task, Result]):
                 self._submit()
                 done, _ = wait(self._submitted, _POLL_S, FIRST_COMPLETED)
                 for future in done:
-                    if (end := self._end(future)) is not None:
+                    if (end := self._finish(future)) is not None:
                         yield end
                 if self._executor.is_broken():
                     if self._submitted:
                         continue  # all futures of a broken executor end soon; wait for them first
                     self._executor.stop()
                     self._executor = self._workers.open(len(self._tasks))
-                if self._lost:
-                    self._note(f"a worker died; {format_count(self._lost, 'task')} will be run again")
-                    self._lost = 0
+                if self._lost_count:
+                    self._note(f"a worker died; {format_count(self._lost_count, 'task')} will be run again")
+                    self._lost_count = 0
         finally:
             self._executor.stop()
 
     def _submit(self) -> None:
         """Submit tasks up to the limit; a task that is run alone waits for all others."""
         capacity = self._executor.capacity()
-        if not capacity and not self._is_without_worker:
+        if not capacity and not self._has_no_worker:
             self._note(f"no worker is connected to {self._workers.cluster} yet; waiting for one")
-        self._is_without_worker = not capacity
+        self._has_no_worker = not capacity
         limit = max(_PER_WORKER * capacity, self._executor.MIN_SUBMITTED)
         while not self._executor.is_broken():
             if self._run_alone:
@@ -138,8 +138,8 @@ class _Submission(Generic[Task, Result]):
             if tasks is self._run_alone:
                 return
 
-    def _end(self, future: Future[Result]) -> TaskEnd[Result] | None:
-        """Return the end of a task, or None if it is run again."""
+    def _finish(self, future: Future[Result]) -> TaskEnd[Result] | None:
+        """Return the end of the task of a finished future, or None if the task is run again."""
         number = self._submitted.pop(future)
         try:
             return TaskEnd(number, future.result())
@@ -157,5 +157,5 @@ class _Submission(Generic[Task, Result]):
             what = f"its worker died {format_count(MAX_DEATHS, 'time')}"
             return TaskEnd(number, error=WorkerDiedError(what, remedy=remedy))
         (self._run_alone if self._deaths[number] >= ALONE_AFTER else self._waiting).appendleft(number)
-        self._lost += 1
+        self._lost_count += 1
         return None

@@ -1,4 +1,4 @@
-"""Plain text: sanitizing of text of unknown origin, printing, and the exceptions of reading untrusted JSON."""
+"""Plain text: sanitize text of unknown origin, print it, and list the exceptions of reading untrusted JSON."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Concurrent calls in one thread each, and a signal that ends their waits."""
+"""Concurrent calls, each in a separate thread, and a signal that ends their waits."""
 
 from collections.abc import Callable, Collection
 from threading import Event, Thread
@@ -60,26 +60,30 @@ def run_parallel(
         call: The function.
         items: Its arguments, one per thread.
         on_interrupt: Ends the waits of the calls after Ctrl-C, for example by closing connections. The threads then
-            have 10 s to return, so that they no longer write to files. Without it, Ctrl-C does not wait for them.
+            have 10 s to return, so that they no longer write to files. Without this function, Ctrl-C does not wait
+            for the threads.
         end_others: Ends the waits of all calls after one has failed. It is called repeatedly until all threads have
             returned. Their `FieldkitError`s are consequences and are ignored. Another exception is a mistake in the
-            code of a call, and is raised instead of the first error. Without it, all calls run to their end.
+            code of a call, and is raised instead of the first error. Without this function, all calls run to their
+            end.
     """
     from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (logging, 5 ms)
 
     # All futures exist before the first thread starts, so that Ctrl-C while a thread starts does not lose its future.
     futures: list[Future[T]] = [Future() for _ in items]
-    failed: Future[T] | None = None
+    failed_future: Future[T] | None = None
     try:
         for future, item in zip(futures, items, strict=True):
             Thread(target=_run_call, args=(future, call, item), daemon=True).start()
         # Python handles a Ctrl-C that arrived just before a blocking wait only when the wait returns.
         while wait(
-            futures, _POLL_INTERVAL_S, ALL_COMPLETED if end_others is None or failed else FIRST_EXCEPTION
+            futures, _POLL_INTERVAL_S, ALL_COMPLETED if end_others is None or failed_future else FIRST_EXCEPTION
         ).not_done:
             if end_others is not None:
-                failed = failed or next((future for future in futures if future.done() and future.exception()), None)
-                if failed is not None:
+                failed_future = failed_future or next(
+                    (future for future in futures if future.done() and future.exception()), None
+                )
+                if failed_future is not None:
                     end_others()
     except BaseException:
         if on_interrupt is not None:
@@ -87,13 +91,13 @@ def run_parallel(
             on_interrupt()
             wait(running, _INTERRUPT_WAIT_S)
         raise
-    if failed is not None:
-        failed = next((future for future in futures if is_mistake(future.exception())), failed)
-    return [future.result() for future in ([failed] if failed else futures)]
+    if failed_future is not None:
+        failed_future = next((future for future in futures if is_mistake(future.exception())), failed_future)
+    return [future.result() for future in ([failed_future] if failed_future else futures)]
 
 
 def is_mistake(error: BaseException | None) -> bool:
-    """Return True for an exception that no code of a step expects, so that it must not be hidden by another error."""
+    """Return True for an exception that is a mistake in code. Another error must not hide it."""
     return isinstance(error, Exception) and not isinstance(error, FieldkitError)
 
 

@@ -34,7 +34,7 @@ def parse_quantity(text: str, units: dict[str, float], what: str) -> float:
 
     Args:
         text: For example `15s`, `0.2 s`, `30ft`.
-        units: Factor per unit symbol; the shortest decimal text of a factor is used as its exact value.
+        units: Factor by unit symbol; the shortest decimal text of a factor is used as its exact value.
         what: The kind of quantity, or the command-line option, for the message.
 
     Raises:
@@ -133,8 +133,8 @@ class TimeEstimate:
 
     def __str__(self) -> str:
         """Return the duration as text: `4 min 00 s`, followed by `, up to 19 min 00 s` if that is clearly more."""
-        most = "" if self.is_certain else f", up to {format_duration(self.most_s)}"
-        return f"{format_duration(self.likely_s)}{most}"
+        upper_text = "" if self.is_certain else f", up to {format_duration(self.most_s)}"
+        return f"{format_duration(self.likely_s)}{upper_text}"
 
 
 def format_bytes(size_bytes: float) -> str:

@@ -71,7 +71,7 @@ def _repeat_cases(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.El
     of_repeat = defaultdict[RepeatId, list[JournalEntry]](list)
     for entry in entries:
         of_repeat[entry.repeat].append(entry)
-    for repeat in plan.order():
+    for repeat in plan.repeats_in_order():
         took_s, reasons = 0.0, list[str]()
         started_ns, last = 0, Status.PLANNED
         for entry in of_repeat[repeat]:

@@ -67,7 +67,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
         EvidenceError: No attempt has ended, or the journal is damaged.
     """
     entries = journal.history(folder, plan)
-    attempts = journal.ended(entries)
+    attempts = journal.ended_attempts(entries)
     if not attempts:
         raise EvidenceError(
             "no repeat has ended yet", where=str(folder), remedy=shell_command("fieldkit", "resume", folder)
@@ -91,7 +91,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
 
 def _laptop(plan: Plan, evidence: _Evidence, entries: list[JournalEntry], *, planned: bool) -> Iterator[Message]:
     """Yield the journal's entries, the planned places at the start of an attempt, and its numbers at its end."""
-    ended = iter(journal.ended(entries))
+    ended = iter(journal.ended_attempts(entries))
     for line, entry in enumerate(entries, start=1):
         if entry.status is Status.PLANNED:
             continue
@@ -150,7 +150,7 @@ def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
     meaning = "The measurements of each attempt, at its end."
     channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, meaning)
-    row = rows.measured(plan, attempt, evidence)
+    row = rows.measure_row(plan, attempt, evidence)
     return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row, plan.table))
 
 

@@ -18,54 +18,53 @@ T = TypeVar("T")
 class AttemptEvidence:
     """Evidence of one attempt. Gates, measurements, reports and exports read the files through it.
 
-    Errors are cached as well: each further read of a missing, unreadable or damaged file raises the same error.
+    Errors are cached as well: every later read of a missing, unreadable or damaged file raises the same error.
 
     Args:
         folder: The attempt's folder.
 
     Attributes:
         folder: The attempt's folder.
-        unexpected_errors: Name of each file whose reader raised another exception than its documented ones, and this
-            exception.
+        unexpected_errors: File names, each with an exception that the reader of the file does not document.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.unexpected_errors: list[tuple[str, Exception]] = []
-        self._read: dict[Hashable, Any] = {}
-        self._failed: dict[Hashable, EvidenceError] = {}
-        self._cached: dict[Hashable, Any] = {}
+        self._contents: dict[Hashable, Any] = {}
+        self._errors: dict[Hashable, EvidenceError] = {}
+        self._results: dict[Hashable, Any] = {}
 
     def read(self, parse: Callable[Concatenate[Path, P], T], name: str, *options: P.args, **keywords: P.kwargs) -> T:
         """Return the parsed content of a file.
 
         Args:
-            parse: Reads the file; called once for each combination of file and options.
+            parse: Function that reads the file. It is called once for each combination of file and options.
             name: The file's name; empty if `parse` reads several files of the folder.
             options: Passed to `parse` after the path.
-            keywords: Must be empty, because only the positional options are part of the cache key.
+            keywords: Must be empty: only the positional options are part of the cache key.
 
         Raises:
             EvidenceError: The file is missing or invalid.
             MemoryError: This machine has too little memory.
         """
         key = parse, name, options
-        if key in self._failed:
-            raise self._failed[key]
-        if key not in self._read:
+        if key in self._errors:
+            raise self._errors[key]
+        if key not in self._contents:
             try:
-                self._read[key] = parse(self.folder / name, *options, **keywords)
+                self._contents[key] = parse(self.folder / name, *options, **keywords)
             except EvidenceError as error:
-                self._failed[key] = error
+                self._errors[key] = error
                 raise
             except MemoryError:  # not cached, because it is not caused by the file
                 raise
             except Exception as error:  # a reader's unexpected error is caused by the file's content
                 self.unexpected_errors.append((name or "its files", error))
                 reason = f"cannot be read: {type(error).__name__}: {error}"
-                self._failed[key] = EvidenceError(reason, where=str(self.folder / name))
-                raise self._failed[key] from error
-        content: T = self._read[key]
+                self._errors[key] = EvidenceError(reason, where=str(self.folder / name))
+                raise self._errors[key] from error
+        content: T = self._contents[key]
         return content
 
     def read_or_none(
@@ -80,14 +79,14 @@ class AttemptEvidence:
     def cached(
         self, compute: "Callable[Concatenate[AttemptEvidence, P], T]", *options: P.args, **keywords: P.kwargs
     ) -> T:
-        """Return the result of `compute` for this evidence and the options; it is called once for each combination.
+        """Return the result of `compute` for this evidence and the options.
 
-        Its exceptions are not cached.
+        `compute` is called once for each combination of options. Its exceptions are not cached.
         """
         key = compute, options
-        if key not in self._cached:
-            self._cached[key] = compute(self, *options, **keywords)
-        result: T = self._cached[key]
+        if key not in self._results:
+            self._results[key] = compute(self, *options, **keywords)
+        result: T = self._results[key]
         return result
 
     def has(self, name: str) -> bool:
@@ -95,16 +94,16 @@ class AttemptEvidence:
         return (self.folder / name).is_file()
 
     def links(self, role: Role) -> Sequence[LinkSample]:
-        """Return link samples of a robot in order of time, from the testbed or, if it has none, from the robot."""
-        modelled = self.read_or_none(link_samples.read, link_samples.FILE) or {}
-        if samples := modelled.get(role):
+        """Return link samples of a robot in order of time: the testbed's or, if there are none, the robot's."""
+        testbed_samples = self.read_or_none(link_samples.read, link_samples.FILE) or {}
+        if samples := testbed_samples.get(role):
             return samples
-        from fieldkit.measure.evidence import robot_link_samples  # noqa: PLC0415 (modelled radios need no parser of iw)
+        from fieldkit.measure.evidence import robot_link_samples  # noqa: PLC0415 (testbed_samples radios need no parser of iw)
 
         return self.read_or_none(robot_link_samples.read, "", role) or ()
 
     def counters(self, role: Role) -> Counters:
-        """Return the increments of a robot's kernel counters during the attempt; an unknown increment is None."""
+        """Return the increments of a robot's kernel counters during the attempt; None for an unknown increment."""
         before, after = (self.read_or_none(host.read, file(role)) for file in (host.before_file, host.after_file))
         return host.difference(before or Counters(None, None), after or Counters(None, None))
 
@@ -114,8 +113,8 @@ class AttemptEvidence:
         before, after = (self.read_or_none(host.received_bytes, file, interface) for file in files)
         return None if before is None or after is None or after < before else after - before
 
-    def whole_capture(self, name: str | None) -> Capture | None:
-        """Return a capture, or None if there is no file name, or the file is missing or damaged.
+    def undamaged_capture(self, name: str | None) -> Capture | None:
+        """Return a capture, or None if `name` is None, or the file is missing or damaged.
 
         A damaged capture would give wrong counts.
         """

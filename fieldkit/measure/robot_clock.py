@@ -1,4 +1,4 @@
-"""The clock of a robot: its offset from the laptop's clock with the maximum error, and times of the ends of jobs."""
+"""The clock of a robot: its offset from the laptop's clock, the maximum error of the offset, end times of jobs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,13 +10,13 @@ from fieldkit.measure.evidence import clock, host
 
 @dataclass(frozen=True)
 class Exchange:
-    """One exchange of timestamps as in RFC 5905, section 8, with no processing time on the robot.
+    """One exchange of timestamps as in RFC 5905, section 8, without a processing time on the robot.
 
     Attributes:
-        request_ns: The laptop's clock before the request, nanoseconds since 1970 UTC.
-        robot_ns: The robot's clock at some time between request and response.
-        response_ns: The laptop's clock after the response arrived.
-        resolution_ns: Resolution of `robot_ns`: the robot's clock was at most this much later. 0 if it is exact.
+        request_ns: Laptop's clock before the request was sent, nanoseconds since 1970 UTC.
+        robot_ns: Robot's clock at a time between request and response.
+        response_ns: Laptop's clock after the response arrived.
+        resolution_ns: Resolution of `robot_ns`: the exact time is later by at most this value. 0 if it is exact.
     """
 
     request_ns: int
@@ -32,11 +32,11 @@ class Exchange:
 
 @dataclass(frozen=True)
 class Offset:
-    """Offset of a robot's clock from the laptop's.
+    """Offset of a robot's clock from the laptop's clock.
 
     Attributes:
-        offset_s: Best estimate in seconds; positive if the robot's clock is ahead.
-        error_s: Maximum error of the estimate for any delays of request and answer.
+        offset_s: Estimate in seconds; positive if the robot's clock is ahead.
+        error_s: Maximum error of the estimate in seconds, whatever the delays of request and response were.
     """
 
     offset_s: float
@@ -44,23 +44,25 @@ class Offset:
 
 
 def offset(exchanges: Sequence[Exchange]) -> Offset:
-    """Return the offset from the exchange with the narrowest interval: its midpoint, and half its width as the error.
+    """Return the offset, computed from the exchange with the narrowest interval.
 
-    The robot read its clock at some time between request and answer, so its offset is between
-    `robot - response` and `robot + resolution - request`.
+    The robot read its clock at a time between request and response, so its offset is between `robot - response` and
+    `robot + resolution - request`. The estimate is the midpoint of this interval, and its error is half the width.
 
     Raises:
         ValueError: There is no exchange.
     """
-    best = min(exchanges, key=lambda exchange: exchange.width_ns)
-    middle_ns = best.robot_ns + best.resolution_ns / 2 - best.request_ns - (best.response_ns - best.request_ns) / 2
-    return Offset(offset_s=middle_ns / 1e9, error_s=best.width_ns / 2e9)
+    narrowest = min(exchanges, key=lambda exchange: exchange.width_ns)
+    robot_ns = narrowest.robot_ns + narrowest.resolution_ns / 2
+    midpoint_ns = robot_ns - narrowest.request_ns - (narrowest.response_ns - narrowest.request_ns) / 2
+    return Offset(offset_s=midpoint_ns / 1e9, error_s=narrowest.width_ns / 2e9)
 
 
 def parse_date(text: str) -> tuple[int, int] | None:
-    """Return the time printed by `date -u +%s.%N` and its resolution, in nanoseconds since 1970, or None if invalid.
+    """Return the time that `date -u +%s.%N` printed, in nanoseconds since 1970, and its resolution in nanoseconds.
 
-    busybox does not support `%N` and prints it literally or omits it; the resolution is then one second.
+    Return None if the text is invalid. busybox does not support `%N` and prints it literally or omits it; the
+    resolution is then one second.
     """
     seconds, _, fraction = text.strip().partition(".")
     if not (seconds.isascii() and seconds.isdigit() and len(seconds) <= 11):
@@ -71,9 +73,9 @@ def parse_date(text: str) -> tuple[int, int] | None:
 
 
 def job_end_ns(evidence: AttemptEvidence, role: Role, job: str) -> int | None:
-    """Return the time at which a job ended, in nanoseconds since 1970 UTC by the robot's clock, to about 20 ms.
+    """Return the end time of a job by the robot's clock, in nanoseconds since 1970 UTC, accurate to about 20 ms.
 
-    Return None if the robot did not record it or rebooted, or if its clock was set during the attempt.
+    Return None if the robot did not record it, if the robot rebooted, or if its clock was set during the attempt.
 
     Args:
         evidence: The attempt.

@@ -24,7 +24,7 @@ class OnAbort(StrEnum):
 
 
 class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
-    """What a drone does when a repeat is aborted, by role: `land` where it is, or `return`.
+    """Action of each drone when a repeat is aborted, by role: `land` at its current position, or `return`.
 
     See [MAVLink](mavlink.md#when-a-trial-is-cut-short).
     """
@@ -40,8 +40,8 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
         """Yield a refusal for each robot that cannot be landed, because its profile has no `mavlink`."""
         for role in self.root:
             if mavlink_of(plan.cast[role].profile) is None:
-                why = "on_abort must bring it down, but its profile has no mavlink"
-                yield Refusal(role, why, f"leave {role} out of on_abort, or use a drone")
+                reason = "on_abort must bring it down, but its profile has no mavlink"
+                yield Refusal(role, reason, f"leave {role} out of on_abort, or use a drone")
 
     @override
     def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:
@@ -55,14 +55,14 @@ class AbortActions(ProcedureSection, RootModel[dict[Role, OnAbort]]):
 
     @override
     def around_steps(self, plan: TrialOutline, scene: Scene, shells: Shells) -> AbstractContextManager[None]:
-        from fieldkit.motion.running.guards import guarded  # noqa: PLC0415 (it imports the code that flies drones)
+        from fieldkit.motion.running.guards import guard_drones  # noqa: PLC0415 (it imports the code that flies drones)
 
         actions = {role: self.root[role].value for role in self.guarded_roles(plan)}
-        return guarded(actions, plan, scene, shells)
+        return guard_drones(actions, plan, scene, shells)
 
     def guarded_roles(self, plan: TrialOutline) -> tuple[Role, ...]:
-        """Return the roles of drones that no step flies; guards must watch these drones."""
-        moved = plan.procedure.moved()
+        """Return the roles of drones that no step flies, so that guards must monitor them."""
+        moved = plan.procedure.moved_roles()
         return tuple(role for role in self.root if role not in moved)
 
 

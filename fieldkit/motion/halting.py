@@ -16,7 +16,7 @@ _LINE: Final = re.compile(r"(?P<program>\S+/\.jobs/\S+) (?P<state>[a-z]+)")
 
 
 @dataclass(frozen=True)
-class Halted:
+class HaltResult:
     """Result of `halt` on a robot.
 
     Attributes:
@@ -34,7 +34,7 @@ class Halted:
         return max(states, key=BY_SEVERITY.index, default=MotionState.NOTHING)
 
 
-def halt(shell: Shell, operator: str, deadline: Deadline) -> Halted:
+def halt(shell: Shell, operator: str, deadline: Deadline) -> HaltResult:
     """Stop all programs that move a robot, from any trial, and the trial that has locked the robot.
 
     The job script is not installed for this, because a full disk must not prevent a stop (as in `jobs.abort`).
@@ -48,32 +48,35 @@ def halt(shell: Shell, operator: str, deadline: Deadline) -> Halted:
         LinkError: The robot did not answer.
     """
     argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "halt_motion", word(operator))
-    done = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
+    completed = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
     error = None
     try:
-        require_success(shell, done)
+        require_success(shell, completed)
     except FieldkitError as script_error:
         error = script_error
-    return Halted(_states(done.stdout), error)
+    return HaltResult(_states(completed.stdout), error)
 
 
-def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -> Halted:
+def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -> HaltResult:
     """Stop all programs that move a robot for the attempt with this folder; the job script must be installed.
 
     Raises:
         LinkError: The robot did not answer.
         RobotError: The script failed.
     """
-    return Halted(_states(call(shell, "halt_motion", word(operator), folder, deadline=deadline)))
+    return HaltResult(_states(call(shell, "halt_motion", word(operator), folder, deadline=deadline)))
 
 
-def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Halted:
-    """Return the present state of programs that `halt_attempt` returned; raises as `halt_attempt`."""
-    return Halted(_states(call(shell, "motion_states", *programs, deadline=deadline)))
+def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> HaltResult:
+    """Return the current state of programs that `halt_attempt` returned; raises the errors of `halt_attempt`."""
+    return HaltResult(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 
 def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
-    """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime; raises as `halt_attempt`."""
+    """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime.
+
+    Raises the errors of `halt_attempt`.
+    """
     return call(shell, "life_signs", file, deadline=deadline)
 
 
@@ -81,8 +84,8 @@ def halt_all(
     robots: Mapping[str, Shell | FieldkitError],
     operator: str,
     within_s: float,
-    report: Callable[[str, Halted], None] = lambda _name, _halted: None,
-) -> Mapping[str, Halted]:
+    report: Callable[[str, HaltResult], None] = lambda _name, _result: None,
+) -> Mapping[str, HaltResult]:
     """Stop all programs that move robots, on all robots in parallel; return the result of each.
 
     Args:
@@ -92,18 +95,18 @@ def halt_all(
         report: Called with each result as soon as it is known, in any thread.
     """
 
-    def stop(name: str) -> Halted:
+    def stop(name: str) -> HaltResult:
         robot = robots[name]
         try:
-            halted = (
-                Halted(error=robot)
+            result = (
+                HaltResult(error=robot)
                 if isinstance(robot, FieldkitError)
                 else halt(robot, operator, Deadline.after(within_s))
             )
         except FieldkitError as error:
-            halted = Halted(error=error)
-        report(name, halted)
-        return halted
+            result = HaltResult(error=error)
+        report(name, result)
+        return result
 
     return dict(zip(robots, run_parallel(stop, list(robots)), strict=True))
 

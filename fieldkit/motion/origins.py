@@ -1,4 +1,4 @@
-"""Interface for steps: the origins of robots that drive or fly automatically, and the record of their motions."""
+"""Interface for steps: origins of robots that drive or fly automatically, and records of their motions."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -15,8 +15,8 @@ class MotionOrigin:
 
     Attributes:
         frame: Frame of the coordinates: `odometry`, or `local` for MAVLink's LOCAL_POSITION_NED.
-        frame_id: Identifies one instance of that frame, for example by the boot ID of the robot. A frame that was
-            lost and created again has another one.
+        frame_id: Identifies one instance of that frame, for example by the boot ID of the robot. It changes if the
+            frame is lost and created again.
         x_m: x of `nav_msgs/Odometry`, or metres north.
         y_m: y of `nav_msgs/Odometry`, or metres east.
         heading_rad: Heading from x towards y: counterclockwise in `odometry`, clockwise in `local`.
@@ -46,7 +46,7 @@ class RobotMotion:
         self.is_over = False
 
     def mark_ended(self, at: MotionOrigin | None = None) -> None:
-        """Record that the motion ended as planned; for `at`, see the attribute."""
+        """Record that the motion ended as planned, and at which pose the robot stopped."""
         self.at, self.is_over = at, True
 
 
@@ -85,7 +85,7 @@ class Origins(Protocol):
         """
         ...
 
-    def refuse(self, role: Role, why: str) -> None:
+    def refuse(self, role: Role, reason: str) -> None:
         """Record that a robot refused to start because it is not at its start position.
 
         Then no robot moves until a person confirms.
@@ -109,7 +109,7 @@ class Origins(Protocol):
 
 
 class MemoryOrigins:
-    """Origins of the robots of a lab that puts them back to their places; kept in memory, without confirmations."""
+    """Origins in memory, for a lab that puts robots back to their places; no confirmations are needed."""
 
     robots_stay = False
     may_return = False
@@ -121,7 +121,7 @@ class MemoryOrigins:
         """Return the origin of a robot; None before its first start at this place."""
         return self._origins.get(role)
 
-    def last(self, role: Role) -> MotionOrigin | None:  # noqa: ARG002 (the lab has moved the robot since)
+    def last(self, role: Role) -> MotionOrigin | None:  # noqa: ARG002 (the lab has moved the robot back)
         """Return None: the lab has put the robot back to its place."""
         return None
 
@@ -129,7 +129,7 @@ class MemoryOrigins:
         """Record the origin of a robot in memory."""
         self._origins[role] = origin
 
-    def refuse(self, role: Role, why: str) -> None:
+    def refuse(self, role: Role, reason: str) -> None:
         """Do nothing: no confirmation is needed in a lab."""
 
     @contextmanager
@@ -139,5 +139,5 @@ class MemoryOrigins:
 
 
 def origins_of(scene: Scene) -> Origins:
-    """Return the origins of the robots of an attempt; there are none without an attempt, as in a dry run."""
+    """Return the origins of the robots of an attempt; without an attempt, as in a dry run, there are no origins."""
     return MemoryOrigins() if scene.origins is None else cast("Origins", scene.origins)

@@ -14,7 +14,7 @@ DRIVE: Final = "drive"
 MAVLINK: Final = "mavlink"
 
 MIN_CHARGE: Final = 0.2
-"""No drone starts a flight below this charge. Battery makers recommend keeping 20 %."""
+"""Default minimum charge for the start of a flight. Battery manufacturers recommend a reserve of 20 %."""
 
 _CONNECTION: Final = r"^((udpout|udpin|tcp):[0-9A-Za-z.-]+:[0-9]{1,5}|/dev/[0-9A-Za-z/_.-]+:[0-9]{3,7})$"
 
@@ -58,7 +58,7 @@ class Mavlink(ProfileSection):
 
 
 class Drive(ProfileSection):
-    """How a ground robot is [driven](motion.md); without it, a person moves the robot.
+    """Settings for [driving](motion.md) a ground robot automatically; without them, a person moves the robot.
 
     Attributes:
         topic: Topic of velocities (`geometry_msgs/Twist`) that its base subscribes to.
@@ -112,11 +112,11 @@ def mavlink_of(profile: RobotProfile) -> Mavlink | None:
     return profile.section(MAVLINK, Mavlink)
 
 
-def drives(robot: Robot) -> bool:
-    """Return True if steps that move the robot drive it by the velocity topic of its profile."""
+def can_drive(robot: Robot) -> bool:
+    """Return True if steps that move the robot may drive it by the velocity topic of its profile."""
     return DRIVE in robot.abilities
 
 
-def flies(robot: Robot) -> bool:
+def can_fly(robot: Robot) -> bool:
     """Return True if a step may fly the robot."""
     return MAVLINK in robot.abilities

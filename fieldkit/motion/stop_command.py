@@ -23,7 +23,7 @@ from fieldkit.core.runtime import user_at_host
 from fieldkit.core.text import print_text
 from fieldkit.lab import folder
 from fieldkit.motion import halting
-from fieldkit.motion.halting import Halted
+from fieldkit.motion.halting import HaltResult
 from fieldkit.remote.motion_states import STATE_TEXTS, MotionState
 from fieldkit.remote.shell import Shell
 
@@ -38,14 +38,14 @@ def add(parser: Parser) -> None:
         "has not confirmed; the other robots are stopped nevertheless."
     )
     shared.add_site(parser)
-    which = parser.add_mutually_exclusive_group(required=True)
-    which.add_argument("robots", nargs="*", default=[], metavar="ROBOT", help="a robot of the site file")
-    which.add_argument("--all", action="store_true", help="all robots of the site file")
+    selection = parser.add_mutually_exclusive_group(required=True)
+    selection.add_argument("robots", nargs="*", default=[], metavar="ROBOT", help="a robot of the site file")
+    selection.add_argument("--all", action="store_true", help="all robots of the site file")
     parser.set_defaults(run=f"{__name__}:run")
 
 
 _WITHIN_S: Final = 10.0
-"""Time limit for each robot; a robot that is up answers within a second."""
+"""Time limit for each robot; a reachable robot answers within a second."""
 _FIELD: Final = "field"
 _EMULATED: Final = (
     "emulated robots of a trial belong to the fieldkit process of that trial: stop that process by Ctrl-C"
@@ -57,10 +57,10 @@ Robots = Mapping[str, Shell | FieldkitError]
 
 def run(arguments: argparse.Namespace) -> int:
     """Stop the robots, print the state of each, and return 3 if one was not reached or has not confirmed."""
-    printing = threading.Lock()
+    print_lock = threading.Lock()
 
-    def report(name: str, result: Halted) -> None:
-        with printing:
+    def report(name: str, result: HaltResult) -> None:
+        with print_lock:
             print_text(f"{name}: {_state_text(result)}", flush=True)
 
     with _robots(arguments) as robots:
@@ -71,24 +71,24 @@ def run(arguments: argparse.Namespace) -> int:
                 raise ConfigurationError(
                     f"there is no robot {name!r}", remedy=did_you_mean(name, robots, ", ".join(robots))
                 )
-        chosen = {name: shell for name, shell in robots.items() if arguments.all or name in arguments.robots}
-        halted = halting.halt_all(chosen, user_at_host(), _WITHIN_S, report)
-    return RobotError.exit_code if any(map(_failed, halted.values())) else 0
+        selected_robots = {name: shell for name, shell in robots.items() if arguments.all or name in arguments.robots}
+        results = halting.halt_all(selected_robots, user_at_host(), _WITHIN_S, report)
+    return RobotError.exit_code if any(map(_has_failed, results.values())) else 0
 
 
 @contextmanager
 def _robots(arguments: argparse.Namespace) -> Iterator[Robots]:
-    """Yield the robots that the options or the site file choose: of the field, of another backend, or of a lab."""
+    """Yield the robots that the options or the site file select: of the field, of another backend, or of a lab."""
     path: Path | None = arguments.site
     if path is None and Path(SITE_FILE).is_file():
         path = Path(SITE_FILE)
     document = None if path is None else documents.read(path)
-    backend = arguments.backend or (None if document is None else robot_access.backend_of(document))
+    backend = arguments.backend or (None if document is None else robot_access.configured_backend(document))
     with ExitStack() as stack:
         if backend == _FIELD and document is not None:
             yield stack.enter_context(_field_robots(robot_access.read_access(document)))
             return
-        robots: Robots = stack.enter_context(lab_shells.opened(folder.of_directory(Path.cwd())))
+        robots: Robots = stack.enter_context(lab_shells.open_shells(folder.of_directory(Path.cwd())))
         yield robots or stack.enter_context(_other_robots(backend, path))
 
 
@@ -110,7 +110,7 @@ def _field_robots(accesses: Mapping[str, RobotAccess | ConfigurationError]) -> I
 
 @contextmanager
 def _other_robots(backend: str | None, path: Path | None) -> Iterator[Robots]:
-    """Yield the robots of any backend; it needs the whole site file."""
+    """Yield the robots of any backend; this reads the complete site file."""
     from fieldkit.backends.registry import load_backend
     from fieldkit.cli.sites import DEFAULT_BACKEND
     from fieldkit.config.site import load_site
@@ -120,15 +120,15 @@ def _other_robots(backend: str | None, path: Path | None) -> Iterator[Robots]:
         yield robots
 
 
-def _failed(result: Halted) -> bool:
+def _has_failed(result: HaltResult) -> bool:
     return result.error is not None or result.state in {MotionState.SILENT, MotionState.ALARM}
 
 
-def _state_text(result: Halted) -> str:
+def _state_text(result: HaltResult) -> str:
     """Return the state of a robot after the order to stop, in one line."""
     if result.error is None:
         return STATE_TEXTS[result.state]
     if isinstance(result.error, LinkError):
         return f"NOT REACHED: stop it by hand ({result.error.what})"
-    done = STATE_TEXTS[result.state] if result.programs else "NOT CONFIRMED: stop it by hand"
-    return f"{done}; {result.error.what}"
+    state_text = STATE_TEXTS[result.state] if result.programs else "NOT CONFIRMED: stop it by hand"
+    return f"{state_text}; {result.error.what}"

@@ -78,7 +78,7 @@ class TrialRunner:
             record=record,
         )
         request = command_line.request(arguments, parse_distance(distance), seed=self._lab.options.seed, notes=notes)
-        testbed = self._lab.open(request.chosen_topology)
+        testbed = self._lab.open(request.effective_topology)
         plan = make_plan(
             request,
             backend=self._lab.backend_name,

@@ -87,6 +87,11 @@ nap() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds onl
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
 }
 
+nap_before_poll() { # sleep before poll number $polls + 1: 2 ms, then 20 ms, because polling uses the processor
+    polls=$((polls + 1))
+    if [ "$polls" -le 10 ]; then nap 0.002; else nap 0.02; fi
+}
+
 lasting() { # flush files and folders $@ to the disk
     # Old versions of sync accept no names, and flush everything.
     sync "$@" 2>/dev/null || sync

@@ -17,9 +17,11 @@ state() { # print the state of the host; $1 interface
         echo "==> ethtool -k <==" && ethtool -k "$interface"
     fi
     if command -v iw >/dev/null; then
-        echo "==> iw info <==" && iw dev "$interface" info
-        echo "==> iw station dump <==" && iw dev "$interface" station dump
-        echo "==> iw power save <==" && iw dev "$interface" get power_save
+        echo "==> iw info <==" && timeout -s KILL "$SOURCE_S" iw dev "$interface" info
+        if [ "$?" != "$KILLED" ]; then # a driver that does not answer would delay the attempt
+            echo "==> iw station dump <==" && iw dev "$interface" station dump
+            echo "==> iw power save <==" && iw dev "$interface" get power_save
+        fi
     fi
     echo "==> end <==" # missing if the disk is full
 }
@@ -77,7 +79,7 @@ unwritten() { # fail with the reason why file $1 cannot be written
 }
 
 reported() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
-    [ -e "$1" ] || snapshot ".sources-$$" "$2" >"$1" 2>/dev/null || unwritten "$1"
+    [ -e "$1" ] || snapshot ".sources-$$" "$2" ../.hung-sources >"$1" 2>/dev/null || unwritten "$1"
 }
 
 begin() {
@@ -148,4 +150,5 @@ tidy() { # delete the folders in $1 except those named by the other arguments
         for kept do [ "${dir##*/}" != "$kept" ] || continue 2; done
         remove "$dir"
     done
+    rm -f -- "$trial/.hung-sources"
 }

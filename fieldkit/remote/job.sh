@@ -88,10 +88,9 @@ detach() {
 
 rise() { # wait until the job in $meta is ready
     [ "$how" != run ] || ready=-
-    # The first pause is longer for a job with a condition: it needs that time at least, and polling uses the processor.
-    [ "$ready" = - ] && pause=0.002 || pause=0.01
     clock
-    until_s=$((now + within))
+    until_s=$((now + within)) polls=0
+    [ "$ready" = - ] || nap 0.01 # a job with a condition needs at least this time
     until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
         if ended "$meta"; then
             [ -s "$meta/exit" ] || [ ! -e .ended ] || late
@@ -108,8 +107,7 @@ $(tail -n 3 "$log" 2>/dev/null)"
             fail "job $name was not up in $within s
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
-        nap "$pause"
-        pause=0.002
+        nap_before_poll
     done
     [ -s "$meta/exit" ] || [ ! -e .ended ] || late
 }
@@ -172,11 +170,11 @@ stop() {
 
 reports_end() { # true if $log contains $end_text within $1 seconds, which shows that the job in $meta has finished its work
     clock
-    until_s=$((now + $1))
+    until_s=$((now + $1)) polls=0
     until holds "$log" "$end_text"; do
         clock
         [ "$now" -le "$until_s" ] && alive "$meta" || return 1
-        nap 0.002
+        nap_before_poll
     done
     printf '' >"$meta/leaves"
 }
@@ -257,7 +255,7 @@ main() {
     [ $# -gt 0 ] && shift
     case $verb in
         sample | health | poll) "$verb" "$@" ;;
-        snapshot) snapshot "$base/.sources-$$" - ;;
+        snapshot) snapshot "$base/.sources-$$" - - ;;
         start | run | serve) launch "$verb" "$@" ;;
         wait) await "$1/.jobs/$2" "$3" || exit 124; result "$1/.jobs/$2" ;;
         end) [ ! -d "$1" ] || end "$1" ;;

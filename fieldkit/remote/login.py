@@ -40,7 +40,7 @@ def log_in(
     return link
 
 
-def offered_key(address: Address, connect: Connect, *, deadline: Deadline, kind: str = "ssh-ed25519") -> HostKey:
+def read_host_key(address: Address, connect: Connect, *, deadline: Deadline, kind: str = "ssh-ed25519") -> HostKey:
     """Return the host key of a server without a login, of type `kind` if it has one.
 
     Raises:

@@ -1,16 +1,21 @@
 # Snapshot of what the programs of a robot report on its state, before and after an attempt.
 #
 # All sources run at the same time, each with a time limit, so a program that hangs delays an attempt by SOURCE_S seconds
-# at most. They use local sockets only and send no packet over a network: chronyc without names (-n), pmc without
+# at most, and is not started again in the same trial. The sources use local sockets only and send no packet over a network: chronyc without names (-n), pmc without
 # boundary hops (-b 0), a passive scan. The output has a line `==> NAME <==` per source, then its lines, each after a blank, so that no
 # output can contain such a line; the last one is `code CODE`.
 
 SOURCE_S=2
+KILLED=137 # exit code after SIGKILL
 SOURCE_BLOCKS=64 # limit of the output of a source, in blocks of 512 or 1,024 bytes
 
 source_of() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
     [ -d "$folder" ] || mkdir "$folder" || return
     name=$folder/$1
+    if has_hung "$1"; then
+        printf '\ncode %s\n' "$KILLED" >"$name" # as if it had been killed again
+        return
+    fi
     shift
     {
         # In another folder, because the timeout of busybox may run a second longer, and this folder is deleted.
@@ -21,6 +26,10 @@ source_of() { # NAME COMMAND...: start a source; it writes the file NAME in $fol
         echo
         echo "code $code"
     } </dev/null >"$name" 2>/dev/null &
+}
+
+has_hung() { # true if source $1 did not answer in time in an earlier snapshot
+    case $hung_sources in *":$1:"*) ;; *) return 1 ;; esac
 }
 
 clock_sources() {
@@ -55,8 +64,15 @@ health() { # print values of the computer, one a line
 }
 
 radio_sources() { # $1 interface
-    command -v iw >/dev/null && info=$(timeout -s KILL "$SOURCE_S" iw dev "$1" info 2>/dev/null) || return 0
+    command -v iw >/dev/null || return 0
     source_of iw-info iw dev "$1" info
+    has_hung iw-info || wait "$!"
+    info=$(cat "$folder/iw-info")
+    case ${info##*"code "} in
+        0) ;;
+        "$KILLED") return 0 ;;
+        *) rm -f -- "$folder/iw-info" && return 0 ;; # it has no such interface
+    esac
     source_of iw-reg iw reg get
     # The channel is read twice while the robots send nothing for an attempt, in which the scan only receives.
     source_of iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
@@ -68,8 +84,10 @@ radio_sources() { # $1 interface
     source_of iw-scan "$@"
 }
 
-snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -: print the outputs of all sources
-    folder=$1
+snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -, $3 file with the names of sources that
+    # hung, to which further ones are added, or -: print the outputs of all sources
+    folder=$1 hung_sources=:
+    [ ! -s "$3" ] || while read -r name; do hung_sources=$hung_sources$name:; done <"$3"
     (
         PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
         export LC_ALL=C
@@ -78,6 +96,9 @@ snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, o
         source_of health sh "$self" health
         ! command -v vcgencmd >/dev/null || source_of vcgencmd vcgencmd get_throttled
         wait
+        [ "$3" = - ] || for source in "$folder"/*; do
+            [ "$(tail -n 1 "$source")" != "code $KILLED" ] || has_hung "${source##*/}" || echo "${source##*/}" >>"$3"
+        done
         cd "$folder" && awk 'FNR == 1 { print "==> " FILENAME " <==" } { print " " $0 }' *
         rm -rf -- "../${folder##*/}" "/tmp/fieldkit-pmc-$$"
     )

@@ -30,13 +30,13 @@ unwatch() { # $1 role: stop it, and the sources of the profile
 
 end_sampler() { # stop the sampler in $meta
     clock
-    until_s=$((now + 2))
+    until_s=$((now + 2)) polls=0
     # A job that was just started may not have written its pid yet.
-    while [ ! -s "$meta/pid" ] && clock && [ "$now" -le "$until_s" ]; do nap 0.002; done
+    while [ ! -s "$meta/pid" ] && clock && [ "$now" -le "$until_s" ]; do nap_before_poll; done
     if alive "$meta"; then
         ask
         signal TERM
-        while alive "$meta" && clock && [ "$now" -le "$until_s" ]; do nap 0.002; done
+        while alive "$meta" && clock && [ "$now" -le "$until_s" ]; do nap_before_poll; done
         ! alive "$meta" || signal KILL
     fi
 }

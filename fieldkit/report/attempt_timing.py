@@ -222,7 +222,7 @@ def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Ite
         kind = what.removeprefix("fault-").removesuffix(_HEALS_SUFFIX)
         if what.startswith("fault-") and what.endswith(_HEALS_SUFFIX) and kind in {str(fault) for fault in FaultKind}:
             note = step_prefixed(step, outage.note_file(FaultKind(kind)))
-            lasted_s = evidence.read_or_none(outage.cause_lasted_s, note) or 0.0
+            lasted_s = evidence.read_or_none(outage.cause_duration_s, note) or 0.0
             yield Activity(f"fault {_step_label(kind, step)}", heals_ns - round(lasted_s * 1e9), heals_ns, "lost")
             yield from _outage(times, evidence, role, FaultKind(kind), step)
 
@@ -303,7 +303,7 @@ def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: AttemptTimes, 
     for role, style in zip((Role.SENDER, Role.RECEIVER), _ENDS, strict=True):
         test = evidence.read_or_none(iperf3.read, step.prefixed_name(iperf3.json_file(role)))
         if test and test.intervals:
-            at_s = start_s + np.cumsum([0.0, *(interval.lasted_s for interval in test.intervals)])
+            at_s = start_s + np.cumsum([0.0, *(interval.duration_s for interval in test.intervals)])
             rates = [interval.bit_s / 1e6 for interval in test.intervals]
             series.append(Series(role, style, at_s, [*rates, rates[-1]], join="steps"))
             words.append(f"{role} {min(rates):.2f} to {max(rates):.2f}")

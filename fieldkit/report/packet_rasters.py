@@ -90,7 +90,7 @@ def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tupl
             continue
         for transfer in planned_evidence.transfers(plan, Protocol(evidence.repeats.texts["protocol"][row])):
             if (packets := fates.read(attempt, transfer)) is not None:
-                masks.setdefault((transfer.name, transfer.protocol), []).append(packets.marked)
+                masks.setdefault((transfer.name, transfer.protocol), []).append(packets.lost_or_repeated)
         if max(map(len, masks.values()), default=0) == max_lines:
             break
     return masks

@@ -135,9 +135,9 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
     first_sent_ns = int(fates.sent_ns.min())
     marked_text = _MARKED[transfer.protocol]
     kinds = (
-        ("sent", _SENT, fates.sent_ns[~fates.marked], fates.sent_bytes[~fates.marked]),
+        ("sent", _SENT, fates.sent_ns[~fates.lost_or_repeated], fates.sent_bytes[~fates.lost_or_repeated]),
         ("received", _RECEIVED, fates.received_ns, fates.received_bytes),
-        (marked_text, _MARK, fates.sent_ns[fates.marked], fates.sent_bytes[fates.marked]),
+        (marked_text, _MARK, fates.sent_ns[fates.lost_or_repeated], fates.sent_bytes[fates.lost_or_repeated]),
     )
     series = []
     for label, style, at_ns, at_bytes in kinds:
@@ -148,7 +148,7 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
         x_label=f"time [ms] after {(first_sent_ns - zero_ns) / 1e9:.3f} s",
         y_label="offset in the payload [kB]",
         series=series,
-        words=f"{len(fates.sent_ns)} packets sent, {fates.marked.sum()} of them {marked_text}, "
+        words=f"{len(fates.sent_ns)} packets sent, {fates.lost_or_repeated.sum()} of them {marked_text}, "
         f"{len(fates.received_ns)} received",
     )
 

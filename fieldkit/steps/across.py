@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class SendsFlow(Protocol):
-    """A step that sends payload, with evidence of when the payload arrived.
+    """A step that sends payload, with evidence of its times of arrival.
 
     Attributes:
         flow_kind: Prefix of its columns.
@@ -74,7 +74,7 @@ class _Pair:
         return tuple(step.prefix for step in (self.flow, self.fault) if step is not nest)
 
 
-def declared(nest: Nest) -> tuple[Column, ...]:
+def recovery_columns(nest: Nest) -> tuple[Column, ...]:
     """Return the columns of the recoveries of a step, without the prefix of its name."""
     from fieldkit.measure.transfers import recoveries  # noqa: PLC0415 (numpy, which most commands do not need)
 
@@ -89,15 +89,15 @@ def declared(nest: Nest) -> tuple[Column, ...]:
 
 
 def measure(nest: Nest, view: View) -> Measured:
-    """Return the values of the columns of `declared`."""
+    """Return the values of `recovery_columns`."""
     from fieldkit.measure.transfers import recoveries  # noqa: PLC0415 (as above)
 
     measured = Measured()
     for pair in _pairs(nest):
         if isinstance(pair.flow, SendsFlow) and isinstance(pair.fault, CausesFault):
-            inside = View(view.scene, view.evidence, (*view.within, *pair.within))
+            inner_view = View(view.scene, view.evidence, (*view.within, *pair.within))
             kind, times = pair.fault.cause.kind, pair.fault.times(view.evidence)
-            deliveries = partial(pair.flow.deliveries, inside)
+            deliveries = partial(pair.flow.deliveries, inner_view)
             recovery = recoveries.measure(pair.flow.flow_kind, kind, deliveries, times, pair.flow.destination)
             for prefix in pair.prefixes(nest):
                 recovery = recovery.with_step_name(prefix)
@@ -107,11 +107,11 @@ def measure(nest: Nest, view: View) -> Measured:
 
 def _pairs(nest: Nest) -> Iterator[_Pair]:
     """Yield the pairs of a fault and a flow. One of them is `nest`, and the other is inside it."""
-    inside = [step_within for entry in nest.during for step_within in _walk(entry.step, (nest,))]
+    inner_steps = [step_within for entry in nest.during for step_within in _walk(entry.step, (nest,))]
     if isinstance(nest, CausesFault):
-        yield from (_Pair(nest, step, within) for step, within in inside if isinstance(step, SendsFlow))
+        yield from (_Pair(nest, step, within) for step, within in inner_steps if isinstance(step, SendsFlow))
     if isinstance(nest, SendsFlow):
-        yield from (_Pair(step, nest, ()) for step, _ in inside if isinstance(step, CausesFault))
+        yield from (_Pair(step, nest, ()) for step, _ in inner_steps if isinstance(step, CausesFault))
 
 
 def _walk(step: Step, within: tuple[Nest, ...]) -> Iterator[tuple[Step, tuple[Nest, ...]]]:

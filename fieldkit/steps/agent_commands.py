@@ -10,7 +10,7 @@ from fieldkit.remote.command import with_environment
 
 
 def compact(value: Any) -> str:  # noqa: ANN401 (any JSON value)
-    """Return a value as JSON without blanks."""
+    """Return a value as JSON without whitespace."""
     return json.dumps(value, separators=(",", ":"))
 
 

@@ -1,7 +1,7 @@
 """Variables in the arguments of a program: `{address.ROLE}`, `{distance}`, `{repeat}` and `{put}`.
 
 Programs such as awk, jq and Go templates also use braces. Therefore only these names are replaced. `{{distance}}`
-becomes the text `{distance}`. All other braces are unchanged, including `${distance}`, a variable of a shell. A name
+becomes the text `{distance}`. All other braces are unchanged, including shell variables such as `${distance}`. A name
 that resembles one of these variables is refused, because it is most likely a typing error.
 """
 
@@ -27,7 +27,7 @@ _BRACES: Final = re.compile(
 def fill_in(word: str, values: Mapping[str, str], address: Callable[[str], str]) -> str:
     """Return an argument in which the variables are replaced by their values.
 
-    The result is one argument, also if a value contains blanks.
+    The result is one argument, even if a value contains whitespace.
 
     Args:
         word: The argument.
@@ -50,7 +50,7 @@ def fill_in(word: str, values: Mapping[str, str], address: Callable[[str], str])
 
 
 def names(word: str) -> list[str]:
-    """Return the texts in single braces in an argument that have the form of a variable, in order."""
+    """Return the texts in single braces in an argument that have the form of a variable, in their order."""
     return [name for match in _BRACES.finditer(word) if (name := match["name"]) is not None]
 
 

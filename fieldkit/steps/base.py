@@ -41,8 +41,8 @@ FileName = Annotated[
 class Step(Strict, ABC):
     """One action of a procedure.
 
-    Its fields are its YAML keys. Plans, preflight checks, gates, rows and reports call the methods below and contain
-    no name of a kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that
+    Its fields are its YAML keys. Plans, preflight checks, gates, rows and reports call the methods below; they do not
+    depend on the kind. A kind usually defines `jobs`, `check` and `measure`; every method has a default. A kind that
     runs one program is a `fieldkit.steps.program.ProgramStep`, which needs two methods. Methods that few kinds need
     are in `fieldkit.steps.capabilities`.
 
@@ -58,7 +58,7 @@ class Step(Strict, ABC):
         needs_complete_capture: Whether packets that a capture dropped make the step's figures wrong. If not, the step
             withholds the columns that depend on captures.
         name: Letters, digits and `_`, a lower-case letter first; distinguishes the step from others of its kind.
-            Names of its jobs, files and columns begin with it.
+            The names of its jobs, files and columns start with it.
     """
 
     columns: ClassVar[tuple[Column, ...]] = ()
@@ -74,9 +74,9 @@ class Step(Strict, ABC):
         """Prefix of the names of its jobs, files and columns; empty if they have none."""
         return self.name
 
-    def prefixed_name(self, what: str) -> str:
+    def prefixed_name(self, base_name: str) -> str:
         """Return the name of a job or file of the step: `up.recv.bag`, or `recv.bag` for a step without a name."""
-        return step_prefixed(self.prefix, what)
+        return step_prefixed(self.prefix, base_name)
 
     @classmethod
     def kind_name(cls) -> str:
@@ -84,11 +84,11 @@ class Step(Strict, ABC):
         return cls.__name__.removesuffix("Step").lower()
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:  # noqa: ARG002 (some steps need no robot)
-        """Yield every job in the order in which it starts."""
+        """Yield the jobs in the order in which they start."""
         return iter(())
 
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        """Carry out the step. By default each job starts when the previous one has exited with code 0.
+        """Run the step. By default each job starts when the previous one has exited with code 0.
 
         Raises:
             LinkError: A robot did not answer.
@@ -111,7 +111,7 @@ class Step(Strict, ABC):
         return 0.0
 
     def exclusive_resources(self) -> tuple[str, ...]:
-        """Return the resources that no other step with the same `name` may use in a repeat, as text: `a ping`."""
+        """Return the resources that no other step with the same `name` may use in a repeat, for example `a ping`."""
         kind = self.kind_name()
         return (f"{'an' if kind[0] in 'aeiou' else 'a'} {kind}",)
 
@@ -131,7 +131,7 @@ class Step(Strict, ABC):
         """Return the columns that the step measures."""
         return self.columns
 
-    def measure(self, view: View) -> Measured:  # noqa: ARG002 (some measure nothing)
+    def measure(self, view: View) -> Measured:  # noqa: ARG002 (some steps measure nothing)
         """Return a value for each of `output_columns`, or the reason why it is missing."""
         return Measured()
 
@@ -162,8 +162,8 @@ def _load(point: EntryPoint) -> type[Step]:
         missing = ", ".join(sorted(loaded.__abstractmethods__))
         raise ConfigurationError(f"the kind of step lacks {missing}", where=location, remedy=remedy)
     if missing := ", ".join(capabilities.missing_methods(loaded)):
-        why = f"the kind of step has only a part of a capability: it lacks {missing}"
-        raise ConfigurationError(why, where=location, remedy=remedy)
+        reason = f"the kind of step has only a part of a capability: it lacks {missing}"
+        raise ConfigurationError(reason, where=location, remedy=remedy)
     return loaded
 
 
@@ -172,7 +172,7 @@ def step_types() -> LazyMapping[type[Step]]:
     """Return the class of every kind of step by name, built-in kinds first.
 
     Raises:
-        ConfigurationError: As `kinds.find`.
+        ConfigurationError: See `kinds.find`.
     """
     return LazyMapping(kinds.find(), _load)
 

@@ -1,8 +1,9 @@
-"""Capabilities that a step may have in addition to the contract of `Step`, and where they are queried.
+"""Optional capabilities of a step, in addition to the contract of `Step`.
 
-Each capability is a class of one method, or of several that belong together. The harness queries it by `isinstance`;
-a step without the capability contributes nothing. A kind that ships with fieldkit derives from its capabilities, so
-that mypy checks the signatures of its methods. For a kind of another package it is enough to define the methods.
+Each capability is a class with one method, or with several that belong together. The harness queries it by
+`isinstance`; a step without the capability contributes nothing. A kind that ships with fieldkit derives from its
+capabilities, so that mypy checks the signatures of its methods. For a kind of another package it is enough to define
+the methods.
 """
 
 from abc import ABC, abstractmethod
@@ -65,7 +66,7 @@ class Moves(Capability):
 
     @abstractmethod
     def abort_notes(self, scene: Scene) -> Iterator[str]:
-        """Yield a sentence for each of these robots: what it does if the attempt is stopped immediately."""
+        """Yield a sentence for each of these robots about its behaviour if the attempt is stopped immediately."""
 
 
 class Roams(Capability):
@@ -103,7 +104,7 @@ class DependsOnCast(Capability):
 
     @abstractmethod
     def resolved(self, cast: Cast, path_s: float | None = None) -> Self:
-        """Return this step with each of these settings filled in. A plan has resolved steps only.
+        """Return this step with the values of these settings. A plan contains only resolved steps.
 
         Args:
             cast: The robot in each role.
@@ -160,7 +161,7 @@ class Subscribes(Capability):
 
 
 class UsesSpace(Capability):
-    """A step that leaves more than small text files on robots."""
+    """A step that writes more than small text files on robots."""
 
     @abstractmethod
     def stored_bytes(self, scene: Scene, role: Role) -> float:
@@ -219,12 +220,12 @@ class Records(Capability):
     """A step that records files, which other steps may send."""
 
     @abstractmethod
-    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+    def recordings(self, cast: Cast) -> Iterator[RecordedFile]:
         """Yield the recordings of the step."""
 
     @abstractmethod
     def records_on(self) -> frozenset[Role]:
-        """Return the roles of `recorded`, which do not depend on the cast."""
+        """Return the roles of `recordings`, which do not depend on the cast."""
 
     @abstractmethod
     def with_record(self, duration_s: float) -> Self:

@@ -7,7 +7,7 @@ from fieldkit.measure.robot_clock import Exchange, parse_date
 from fieldkit.remote.shell import Shell
 
 EXCHANGES = 5
-"""Number of requests; the exchange with the shortest round trip is used."""
+"""Number of requests; the exchange with the shortest round-trip time is used."""
 
 
 def exchanges(shell: Shell, within_s: float) -> list[Exchange]:
@@ -18,7 +18,7 @@ def exchanges(shell: Shell, within_s: float) -> list[Exchange]:
         within_s: Timeout of each query in seconds.
 
     Raises:
-        LinkError: It did not answer.
+        LinkError: The robot did not answer.
     """
     results = []
     for _ in range(EXCHANGES):

@@ -28,7 +28,7 @@ class PathLeg(Strict):
     right: _Distance = None
 
     @schema.model_validator(mode="after")
-    def _one_direction(self) -> "PathLeg":
+    def _has_one_direction(self) -> "PathLeg":
         for key, opposite in (("away", "towards"), ("left", "right")):
             if getattr(self, key) is not None and getattr(self, opposite) is not None:
                 raise schema.validation_error(
@@ -51,5 +51,5 @@ class PathLeg(Strict):
 
     @property
     def leg(self) -> model.Leg:
-        """The segment, as passed to the testbed."""
+        """The segment in the form for the testbed."""
         return model.Leg((self.away or 0.0) - (self.towards or 0.0), (self.left or 0.0) - (self.right or 0.0))

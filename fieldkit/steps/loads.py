@@ -50,7 +50,7 @@ class LoadOptions(OverLink):
             raise schema.validation_error(f"{self.sender} cannot send to itself; name another robot", "to")
         return self
 
-    def carried_by(self, protocol: Protocol) -> Protocol:
+    def transport_protocol(self, protocol: Protocol) -> Protocol:
         """Return the transport protocol of the load in repeats of `protocol`."""
         return self.protocol or protocol
 
@@ -60,12 +60,12 @@ class LoadOptions(OverLink):
 
     def client(self, scene: Scene, *options: str) -> tuple[str, ...]:
         """Return the command of the client, which sends the load."""
-        udp = self.carried_by(scene.protocol) is Protocol.UDP
-        rate = self.rate or (DEFAULT_UDP_BIT_S if udp else None)
+        is_udp = self.transport_protocol(scene.protocol) is Protocol.UDP
+        rate = self.rate or (DEFAULT_UDP_BIT_S if is_udp else None)
         return (
             *(PROGRAM, "-c", scene.link(self.receiver, self.over).address, "-p", str(self.port)),
-            *(("-u", "-l", str(self.payload_bytes)) if udp else ()),
-            *(() if udp or not rate else ("-l", str(_BLOCK_BYTES))),
+            *(("-u", "-l", str(self.payload_bytes)) if is_udp else ()),
+            *(() if is_udp or not rate else ("-l", str(_BLOCK_BYTES))),
             *(("-b", str(round(rate))) if rate else ()),
             *(("-P", str(self.streams)) if self.streams > 1 else ()),
             *options,
@@ -73,10 +73,10 @@ class LoadOptions(OverLink):
 
     def interval_s(self, protocol: Protocol) -> float:
         """Return the time between two blocks or datagrams of a stream; 0 without a rate limit."""
-        udp = self.carried_by(protocol) is Protocol.UDP
-        if self.rate is None and not udp:
+        is_udp = self.transport_protocol(protocol) is Protocol.UDP
+        if self.rate is None and not is_udp:
             return 0.0
-        return 8 * (self.payload_bytes if udp else _BLOCK_BYTES) / (self.rate or DEFAULT_UDP_BIT_S)
+        return 8 * (self.payload_bytes if is_udp else _BLOCK_BYTES) / (self.rate or DEFAULT_UDP_BIT_S)
 
     def data_streams(
         self,
@@ -84,8 +84,8 @@ class LoadOptions(OverLink):
         *,
         reverse: bool = False,
         ports: tuple[tuple[int, int], ...] = (),
-        lasts_s: float | None = None,
-        until_ns: int | None = None,
+        duration_s: float | None = None,
+        receiver_end_ns: int | None = None,
     ) -> LoadStreams:
         """Return the packet filter of the load's data streams in captures.
 
@@ -93,14 +93,14 @@ class LoadOptions(OverLink):
             scene: The attempt.
             reverse: Whether the server sends.
             ports: As `LoadStreams.ports`.
-            lasts_s: As `FlowSchedule.lasts_s`.
-            until_ns: As `FlowSchedule.until_ns`.
+            duration_s: As `FlowSchedule.duration_s`.
+            receiver_end_ns: As `FlowSchedule.receiver_end_ns`.
         """
         ends = [scene.link(role, self.over).address for role in (self.sender, self.receiver)]
         source, destination = reversed(ends) if reverse else ends
-        carrier = self.carried_by(scene.protocol)
+        transport = self.transport_protocol(scene.protocol)
         return LoadStreams(
-            protocol=carrier,
+            protocol=transport,
             source_address=source,
             destination_address=destination,
             port=self.port,
@@ -110,20 +110,20 @@ class LoadOptions(OverLink):
             ports=ports,
             expected=FlowSchedule(
                 interval_s=self.interval_s(scene.protocol),
-                head_bytes=0 if reverse or carrier is Protocol.UDP else COOKIE_BYTES,
-                lasts_s=lasts_s,
-                until_ns=until_ns,
+                head_bytes=0 if reverse or transport is Protocol.UDP else COOKIE_BYTES,
+                duration_s=duration_s,
+                receiver_end_ns=receiver_end_ns,
             ),
         )
 
     def expected_bit_s(self, protocol: Protocol) -> float:
         """Return the approximate rate of the load in repeats of a protocol, in bits per second."""
-        if self.rate is None and self.carried_by(protocol) is Protocol.TCP:
+        if self.rate is None and self.transport_protocol(protocol) is Protocol.TCP:
             return GOOD_BIT_S
         return self.streams * (self.rate or DEFAULT_UDP_BIT_S)
 
     def flow(self, protocol: Protocol, size_bytes: float) -> Flow:
         """Return the traffic of `size_bytes` of the load on the radio, in repeats of a protocol."""
-        carrier = self.carried_by(protocol)
-        frame_count = frames(carrier, size_bytes, self.payload_bytes)
-        return Flow(self.sender, self.receiver, self.port, frame_count, carrier, link=self.over)
+        transport = self.transport_protocol(protocol)
+        frame_count = frames(transport, size_bytes, self.payload_bytes)
+        return Flow(self.sender, self.receiver, self.port, frame_count, transport, link=self.over)

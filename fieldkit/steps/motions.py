@@ -10,10 +10,8 @@ from contextlib import contextmanager
 from typing import Final, Protocol
 
 STOPPED: Final = "stopped by the operator"
-"""Reason that is stored after the order to stop.
-
-The repeat is void for this reason, and no robot may move until a person permits it.
-"""
+"""Reason that is stored after the order to stop. The repeat is void for this reason, and no robot may move until a
+person permits it."""
 
 _SIGNAL_S: Final = 0.5
 
@@ -29,12 +27,12 @@ class Mover(Protocol):
         """Name of the robot."""
         ...
 
-    def stop(self, report: Report, abandoned: threading.Event) -> None:
+    def stop(self, report: Report, cancel_event: threading.Event) -> None:
         """Stop the robot, and wait until it is stationary or on the ground; errors are reported, not raised.
 
         Args:
             report: Receives a line for each change of state of the robot.
-            abandoned: Set if the operator cancels the wait.
+            cancel_event: Set if the operator cancels the wait.
         """
         ...
 
@@ -43,18 +41,18 @@ class Motions:
     """The moving robots, and the order to stop. After the order no robot starts to move.
 
     Attributes:
-        stop_notes: While steps run in which robots move automatically, a line for each robot about what it does when
+        stop_notes: While steps run in which robots move automatically, a line for each robot about its behaviour when
             it is stopped; empty at other times.
-        is_ordered: Whether the order was given; it cannot be withdrawn.
+        is_ordered: Whether the order to stop was given; it cannot be withdrawn.
     """
 
     def __init__(self) -> None:
         self.stop_notes: tuple[str, ...] = ()
         self.is_ordered = False
         self._movers: list[Mover] = []
-        self._first = threading.Lock()  # acquired once, by the first order
-        self._abandoned = threading.Event()
-        self._done = threading.Event()
+        self._first_order_lock = threading.Lock()  # acquired once, by the first order
+        self._cancel_event = threading.Event()
+        self._done_event = threading.Event()
 
     @contextmanager
     def moving(self, mover: Mover) -> Iterator[None]:
@@ -63,16 +61,17 @@ class Motions:
         Raises:
             KeyboardInterrupt: The order was given before; the robot must not start to move.
         """
-        self._movers.append(
-            mover
-        )  # added before `is_ordered` is read, because `order_stop` sets `is_ordered` before it reads the list
+        # The robot is added before `is_ordered` is read, because `order_stop` sets `is_ordered` before it reads the
+        # list.
+        self._movers.append(mover)
         try:
             if self.is_ordered:
                 raise KeyboardInterrupt
             yield
         finally:
-            while self.is_ordered and not self._done.wait(_SIGNAL_S):
-                pass  # Python handles a signal that arrived just before the wait only after the wait
+            while self.is_ordered and not self._done_event.wait(_SIGNAL_S):
+                # Python handles a signal that arrived just before a wait only after the wait.
+                pass
             self._movers.remove(mover)
 
     def order_stop(self, report: Report) -> bool:
@@ -84,21 +83,21 @@ class Motions:
         if not (self._movers or self.stop_notes):
             return False
         self.is_ordered = True
-        if self._first.acquire(blocking=False):
+        if self._first_order_lock.acquire(blocking=False):
             movers = {mover.robot: mover for mover in reversed(self._movers)}
             threading.Thread(
                 target=self._stop, args=(tuple(movers.values()), report), name="stop", daemon=True
             ).start()
         return True
 
-    def abandon(self) -> None:
+    def cancel_wait(self) -> None:
         """Stop waiting for confirmations; the order to stop remains in force."""
-        self._abandoned.set()
-        self._done.set()
+        self._cancel_event.set()
+        self._done_event.set()
 
     def _stop(self, movers: tuple[Mover, ...], report: Report) -> None:
         threads = [
-            threading.Thread(target=mover.stop, args=(report, self._abandoned), daemon=True) for mover in movers
+            threading.Thread(target=mover.stop, args=(report, self._cancel_event), daemon=True) for mover in movers
         ]
         for thread in threads:
             thread.start()
@@ -108,4 +107,4 @@ class Motions:
             report("stopping: no robot moves; stopping the programs on the robots")
         for thread in threads:
             thread.join()
-        self._done.set()
+        self._done_event.set()

@@ -8,8 +8,8 @@ Tested manually with each pair of sender and receiver and a receiver that reads 
   close it, so they get an input that never ends.
 - A sender must exit at the end of its input: `-q 0` or `--send-only`. OpenBSD's `-N` has the same effect, but its
   version in Ubuntu 16.04 does not support it.
-- A UDP listener exits after an idle time: `-w`, or `-i` for ncat, which then exits with code 2. The traditional one
-  also counts the time before the first datagram; the others wait until the limit of the job.
+- A UDP listener exits after an idle time: `-w`, or `-i` for ncat, which then exits with code 2. In the traditional
+  netcat, the time before the first datagram counts too; the others wait until the limit of the job.
 """
 
 import re
@@ -26,8 +26,7 @@ _READ_BYTES: Final = {Netcat.TRADITIONAL: 8192, Netcat.OPENBSD: 16384, Netcat.NC
 _OLD_NCAT_READ_BYTES: Final = 131072
 _NCAT_CHANGED: Final = (7, 94)
 """Since this version (Debian 13 has 7.95) a listening ncat reads UDP into its TCP buffer of 8192 bytes (commit
-4e6c8feb1 of nmap). The rest of a longer datagram is lost.
-"""
+4e6c8feb1 of nmap), so that longer datagrams are truncated."""
 _NCAT_VERSION: Final = re.compile(r"Ncat\D*(\d+)\.(\d\d)")
 
 # A FIFO that is open for reading and writing neither blocks on open nor reports an end of file.
@@ -36,24 +35,31 @@ _ENDLESS_INPUT: Final = ("sh", "-c", 'mkfifo .endless && exec <>.endless && rm .
 
 def listen(netcat: Netcat, program: str, protocol: Protocol, port: int, idle_s: int) -> tuple[str, ...]:
     """Return the command that writes the data received on `port` to its standard output."""
-    udp = protocol is Protocol.UDP
+    is_udp = protocol is Protocol.UDP
     match netcat:
         case Netcat.OPENBSD:
-            return (program, *(("-u", "-w", str(idle_s)) if udp else ()), "-l", str(port))
-        case Netcat.NCAT if udp:
+            return (program, *(("-u", "-w", str(idle_s)) if is_udp else ()), "-l", str(port))
+        case Netcat.NCAT if is_udp:
             return (program, "-u", "--recv-only", "-i", str(idle_s), "-l", str(port))
         case Netcat.NCAT:
             return (*_ENDLESS_INPUT, program, "--recv-only", "-l", str(port))
         case Netcat.BUSYBOX:
-            return (*_ENDLESS_INPUT, program, *(("-u",) if udp else ()), "-l", "-p", str(port))
+            return (*_ENDLESS_INPUT, program, *(("-u",) if is_udp else ()), "-l", "-p", str(port))
         case Netcat.TRADITIONAL:
-            return (program, *(("-u",) if udp else ()), "-l", "-p", str(port), *(("-w", str(idle_s)) if udp else ()))
+            return (
+                program,
+                *(("-u",) if is_udp else ()),
+                "-l",
+                "-p",
+                str(port),
+                *(("-w", str(idle_s)) if is_udp else ()),
+            )
 
 
 def send(netcat: Netcat, program: str, protocol: Protocol, address: str, port: int) -> tuple[str, ...]:
     """Return the command that sends its standard input to `address` and `port`."""
-    leave = {Netcat.NCAT: ("--send-only",), Netcat.BUSYBOX: ()}.get(netcat, ("-q", "0"))
-    return (program, *(("-u",) if protocol is Protocol.UDP else ()), *leave, address, str(port))
+    exit_options = {Netcat.NCAT: ("--send-only",), Netcat.BUSYBOX: ()}.get(netcat, ("-q", "0"))
+    return (program, *(("-u",) if protocol is Protocol.UDP else ()), *exit_options, address, str(port))
 
 
 def sender_was_killed(code: int | None, log: str | None) -> bool:
@@ -68,9 +74,9 @@ def sender_was_killed(code: int | None, log: str | None) -> bool:
 def listener_failed(code: int | None, log: str | None) -> bool:
     """Return True if a listener was terminated by a signal (see `sender_was_killed`) or could not write.
 
-    On a full disk (tested manually) the traditional one exits with code 1 without a message, busybox and ncat write
-    a message, and the OpenBSD one exits as after a complete transfer. After an idle time (`-w`, `-i`) a listener
-    writes a message and exits with code 1, or 2 for ncat.
+    On a full disk (tested manually), the traditional netcat exits with code 1 without a message, busybox and ncat
+    write a message, and the OpenBSD netcat exits as after a complete transfer. After an idle time (`-w`, `-i`) a
+    listener writes a message and exits with code 1, or 2 for ncat.
     """
     return code in {1, 2} and log is not None and (not log.strip() or "write" in log)
 
@@ -88,7 +94,7 @@ def truncates_datagrams(sender: Netcat, receiver: Netcat, receiver_version: str 
 
 
 def _read_bytes(netcat: Netcat, version: str) -> int:
-    """Return the number of bytes that a listener reads of a datagram."""
+    """Return the maximum number of bytes that a listener reads from a datagram."""
     numbers = _NCAT_VERSION.search(version)
     if netcat is Netcat.NCAT and numbers and (int(numbers[1]), int(numbers[2])) < _NCAT_CHANGED:
         return _OLD_NCAT_READ_BYTES

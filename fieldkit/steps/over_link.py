@@ -13,13 +13,13 @@ from fieldkit.core.model import Role, Verdict
 from fieldkit.steps.scene import CommandResult, Need, Scene
 
 LOOPBACK: Final = "lo"
-"""Interface of a link whose address is reached over any other link of a robot, by the decision of its routes."""
+"""Interface of a link whose address is reached over any link of the robot that its routes select."""
 
 _DEVICE: Final = re.compile(r"\bdev (?P<interface>\S{1,30})", re.ASCII)
 
 
 class OverLink(Strict):
-    """Base of steps that have a link.
+    """Base class of steps that can use a link other than the radio under test.
 
     Attributes:
         over: Link over which it sends, by its name in [the profiles of the robots](links.md); without it, the radio
@@ -31,20 +31,26 @@ class OverLink(Strict):
     def route_need(self, scene: Scene, source: Role, destination: Role) -> Iterator[Need]:
         """Yield the check that the route from a robot to another uses this link.
 
-        There is none for the radio under test, and for a link that may use any interface.
+        There is no check for the radio under test, and for a link that may use any interface.
         """
-        here, there = scene.link(source, self.over), scene.link(destination, self.over)
-        if self.over and here.interface != LOOPBACK:
-            argv = ("ip", "-o", "route", "get", there.address)
-            yield Need(source, f"route over {self.over}", argv, partial(judge_route, here, there))
+        source_link, destination_link = scene.link(source, self.over), scene.link(destination, self.over)
+        if self.over and source_link.interface != LOOPBACK:
+            argv = ("ip", "-o", "route", "get", destination_link.address)
+            yield Need(source, f"route over {self.over}", argv, partial(judge_route, source_link, destination_link))
 
 
-def judge_route(here: RobotLink, there: RobotLink, result: CommandResult) -> tuple[Verdict, str, str]:
+def judge_route(
+    source_link: RobotLink, destination_link: RobotLink, result: CommandResult
+) -> tuple[Verdict, str, str]:
     """Return verdict, detail and remedy from the output of `ip route get`."""
     match = _DEVICE.search(result.text) if result.ok else None
-    remedy = f"sudo ip route replace {there.address} dev {here.interface}"
+    remedy = f"sudo ip route replace {destination_link.address} dev {source_link.interface}"
     if match is None:
-        return Verdict.FAIL, f"no route to {there.address}: {result.text}", remedy
-    if match["interface"] != here.interface:
-        return Verdict.FAIL, f"packets to {there.address} leave by {match['interface']}, not {here.interface}", remedy
-    return Verdict.OK, f"{there.address} by {here.interface}", ""
+        return Verdict.FAIL, f"no route to {destination_link.address}: {result.text}", remedy
+    if match["interface"] != source_link.interface:
+        return (
+            Verdict.FAIL,
+            f"packets to {destination_link.address} leave by {match['interface']}, not {source_link.interface}",
+            remedy,
+        )
+    return Verdict.OK, f"{destination_link.address} by {source_link.interface}", ""

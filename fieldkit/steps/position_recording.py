@@ -24,7 +24,7 @@ from fieldkit.steps.surroundings import EnclosingStep
 from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
-"""Time limit of a recording beyond the limits of the steps inside."""
+"""Time limit of a recording in addition to the limits of the steps inside."""
 CLOSE_S: Final = 10.0
 _QUERY_S: Final = 15.0
 _ROUNDING_M: Final = 1e-3
@@ -79,13 +79,13 @@ def run_while_recording(
     try:
         run_parallel(lambda planned: jobs.start(testbed.shells[planned.role], planned.job), recordings)
         run_parallel(query_clock, list(exchanges))
-        began_utc_ns = time.time_ns()
+        start_utc_ns = time.time_ns()
         for entry in nest.during:
             entry.step.run(scene, testbed, announce)
         run_parallel(query_clock, list(exchanges))
         run_parallel(wait, recordings)
     except FieldkitError:
-        # The recordings are kept with the failed attempt. The first error is the reason of the failure.
+        # The recordings are kept with the failed attempt. The first error is the cause of the failure.
         with suppress(FieldkitError):
             _stop(testbed, recordings)
         raise
@@ -94,9 +94,9 @@ def run_while_recording(
         offsets = {role: offset(results) for role, results in exchanges.items() if results}
         path = scene.laptop_folder / position_sources.FILE
         # Steps inside may have written the sources for other robots.
-        earlier = position_sources.read(path) if path.exists() else PositionSources()
-        merge = position_sources.merge(earlier, make_sources(began_utc_ns, offsets))
-        path.write_text(position_sources.text(merge), encoding="utf-8")
+        inner_sources = position_sources.read(path) if path.exists() else PositionSources()
+        sources = position_sources.merge(inner_sources, make_sources(start_utc_ns, offsets))
+        path.write_text(position_sources.text(sources), encoding="utf-8")
     return list(zip(recordings, codes, strict=True))
 
 
@@ -108,7 +108,7 @@ def _stop(testbed: Testbed, recordings: Sequence[Planned]) -> Sequence[int]:
 
 
 def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]:
-    """Return the fixed positions of the robots that stay where they were placed while the steps inside run."""
+    """Return the fixed positions of the robots that do not move while the steps inside run."""
     movers = (step for step in steps_inside(nest) if isinstance(step, Nest) and step.has_path)
     moving = frozenset[Role]().union(*(step.moves() for step in movers if isinstance(step, Moves)))
     places_m = {role: place_m for role, place_m in scene.places_m.items() if role not in moving}
@@ -116,7 +116,12 @@ def stationary_robots(nest: Nest, scene: Scene) -> Mapping[Role, PositionSource]
 
 
 def placement_error(what: str, within: Sequence[EnclosingStep]) -> str | None:
-    """Return the reason why the step `what`, which records positions, must not be inside `within`; None if it may."""
+    """Return the reason why a step that records positions must not be inside other steps; None if it may.
+
+    Args:
+        what: The step, for the message.
+        within: The steps around it.
+    """
     if any(nest.has_path for nest in within):
         return f"a {what} starts where robots were placed: put the move into the {what}"
     if any(nest.disturbs or nest.parallel for nest in within):
@@ -152,7 +157,7 @@ def _place_problems(view: View, sources: PositionSources) -> Iterator[str]:
             continue
         deviation_m = math.dist(planned_m, [metres or 0.0 for metres in recorded_m])
         if deviation_m > _ROUNDING_M:
-            yield f"{position_sources.FILE} has the {role} {deviation_m:.1f} m from where it was placed"
+            yield f"{position_sources.FILE} has the {role} {deviation_m:.1f} m from its placement"
 
 
 def measure(view: View) -> Measured:

@@ -1,4 +1,4 @@
-"""Preflight check that each of the robots that forward packets for each other runs a routing protocol."""
+"""Preflight check that every robot runs a routing protocol, if robots forward packets for each other."""
 
 from collections.abc import Iterator
 from typing import Final
@@ -24,14 +24,14 @@ true
 
 
 def needs(scene: Scene) -> Iterator[Need]:
-    """Yield the check for a routing protocol for each robot of the scene, also for robots without a step."""
+    """Yield the check for a routing protocol on each robot of the scene, including robots without a step."""
     for role, robot in scene.cast.items():
         script = f"interface=$1; shift{_SEARCH}"
         yield Need(role, "routing", ("sh", "-c", script, "sh", robot.profile.radio.interface, *DAEMONS), judge)
 
 
 def judge(answer: CommandResult) -> tuple[Verdict, str, str]:
-    """Return verdict, detail and remedy from the names of the routing protocols found on a robot."""
+    """Return verdict, detail and remedy from the names of the routing protocols on a robot."""
     protocols = list(dict.fromkeys(answer.text.split()))
     if answer.ok and protocols:
         return Verdict.OK, ", ".join(protocols), ""

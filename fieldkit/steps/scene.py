@@ -67,10 +67,10 @@ class Scene:
         protocol: The transport protocol under test.
         cast: The robot in each role.
         folder: The attempt's folder on every robot.
-        recorded: The files that the procedure records on each robot, in the order of recording.
+        recordings: The files that the procedure records on each robot, in the order of recording.
         variants: The detected tools of the robots; empty before the detection.
         laptop_folder: The attempt's folder on the laptop, for data that no robot has; None if no attempt is made.
-        placement: The placement of the robots; None if they were not placed.
+        placement: The placement of the robots; None if the robots were not placed.
         repeat: Number of the repeat of its protocol, from 1; None if the scene is valid for all repeats.
         flows: The traffic of all steps of the procedure on the radio.
         sections: The sections of the procedure that installed packages added, by key.
@@ -83,7 +83,7 @@ class Scene:
     protocol: Protocol
     cast: Cast
     folder: str
-    recorded: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
+    recordings: Mapping[Role, tuple[RecordedFile, ...]] = field(default_factory=lambda: MappingProxyType({}))
     variants: Mapping[Role, Variants] = field(default_factory=lambda: MappingProxyType({}))
     laptop_folder: Path | None = None
     placement: Placement | None = None
@@ -99,7 +99,7 @@ class Scene:
         return self.cast[role]
 
     def link(self, role: Role, name: str = "") -> RobotLink:
-        """Return the robot's end of a link, of the radio under test if the name is empty.
+        """Return the robot's end of a link; an empty name means the radio under test.
 
         Raises:
             ConfigurationError: The robot has no such link.
@@ -298,7 +298,7 @@ class ListeningPort:
     by: str = "port"
     shared: bool = False
 
-    def looks_like(self, other: "ListeningPort") -> bool:
+    def is_ambiguous_with(self, other: "ListeningPort") -> bool:
         """Return True if the packets of both ports cannot be distinguished in a capture."""
         is_same = (self.role, self.port, self.peer) == (other.role, other.port, other.peer)
         is_opposite = None not in {self.source, other.source} and self.source != other.source

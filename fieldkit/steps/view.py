@@ -1,4 +1,4 @@
-"""The view of one attempt from which a step checks and measures its evidence."""
+"""One attempt with its evidence, from which a step computes its checks and measurements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from fieldkit.steps.surroundings import EnclosingStep
 
 @dataclass(frozen=True)
 class View:
-    """One attempt with its evidence, from the position of one step.
+    """One attempt with its evidence, for one step of the attempt.
 
     Attributes:
         scene: The attempt.
@@ -28,18 +28,21 @@ class View:
     def capture(self, role: Role) -> Capture | None:
         """Return the capture of a robot around the step; None if there is none or it is incomplete."""
         name = capture_around(self.within, role)
-        return None if name is None or self.dropped(role) else self.evidence.whole_capture(name)
+        return None if name is None or self.dropped_packets(role) else self.evidence.undamaged_capture(name)
 
-    def dropped(self, role: Role) -> int:
+    def dropped_packets(self, role: Role) -> int:
         """Return the number of packets that a robot's kernel and interface dropped before tcpdump.
 
-        It is 0 without a capture around the step, and without counters of tcpdump, which other checks report.
+        It is 0 without a capture around the step, and without counters of tcpdump; another check reports missing
+        counters.
         """
         name = capture_around(self.within, role)
-        log = None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_of(name))
+        log = (
+            None if name is None else self.evidence.read_or_none(tcpdump_log.read, tcpdump_log.capture_log_file(name))
+        )
         return 0 if log is None else (log.dropped_by_kernel or 0) + (log.dropped_by_interface or 0)
 
-    def captured(self, *roles: Role) -> bool:
+    def has_captures(self, *roles: Role) -> bool:
         """Return True if all of these robots captured while the step ran."""
         return all(capture_around(self.within, role) is not None for role in roles)
 

@@ -1,4 +1,4 @@
-"""The columns of trial.csv: some identify an attempt, and the others are declared by steps and the testbed."""
+"""The columns of trial.csv. Some columns identify an attempt; steps and the testbed declare the others."""
 
 from collections.abc import Collection, Iterable, Mapping
 from functools import cache
@@ -14,7 +14,7 @@ from fieldkit.steps.base import Step, step_types
 
 IDENTITY: Final = columns.columns(
     0,
-    ("schema_version", "count", "Version of the columns in the fieldkit that measured the row."),
+    ("schema_version", "count", "Version of the columns in the version of fieldkit that measured the row."),
     ("trial", "text", "Name of the trial's folder."),
     ("procedure", "text", "Name of the procedure."),
     ("scenario", "text", "los (line of sight) or nlos (no line of sight)."),
@@ -22,12 +22,12 @@ IDENTITY: Final = columns.columns(
     (
         "backend",
         "text",
-        "Backend that provided the robots; on a co-simulation with physics, network and sync policy in brackets.",
+        "Backend that provided the robots; for a co-simulation, physics, network and sync policy follow in brackets.",
     ),
     ("distance_m", "m", "Planned distance."),
-    ("distance", "text", "Distance as the operator wrote it."),
+    ("distance", "text", "Planned distance as written by the operator."),
     ("protocol", "text", "Transport protocol: tcp or udp."),
-    ("repeat", "count", "Number of the repeat, from 1, per protocol."),
+    ("repeat", "count", "Number of the repeat of this protocol, from 1."),
     (
         "attempt",
         "count",
@@ -39,110 +39,110 @@ IDENTITY: Final = columns.columns(
     ("seed", "count", "The trial's seed."),
     ("sender", "text", "Robot in the role sender."),
     ("receiver", "text", "Robot in the role receiver."),
-    ("relay", "text", "Robot whose access point relays; empty if masterless."),
-    ("profiles_sha256", "hash", "First 16 digits of the hash over the robots' profiles and roles."),
+    ("relay", "text", "Robot whose access point relays the packets; empty if masterless."),
+    ("profiles_sha256", "hash", "First 16 digits of the hash of the robots' profiles and roles."),
     ("procedure_sha256", "hash", "First 16 digits of the hash of the procedure: its file and --record."),
-    ("code_sha256", "hash", "First 16 digits of the hash over fieldkit's source."),
+    ("code_sha256", "hash", "First 16 digits of the hash of fieldkit's source."),
 )
-"""Columns that identify an attempt; the columns that its evidence fills follow."""
+"""Columns that identify an attempt. The columns of measured values follow them."""
 
 OTHERS: Final = Column("others", "text", "Robots in further roles of the procedure: ROLE=ROBOT, separated by spaces.")
-"""The column is present only if a procedure has such roles."""
+"""Column that is in a table only if the procedure has such roles."""
 
 ALWAYS: Final = (*oracle_delays.LATENESS_COLUMNS, *link.COLUMNS, *oracle_delays.WINDOW_COLUMNS)
-"""Columns that are measured in every trial, whatever its steps are."""
+"""Columns that are measured in every trial, independent of its steps."""
 
 _KINDS_WITH_COLUMNS: Final = ("capture", "transfer", "ping")
-"""Kinds of step whose columns are in every trial, in addition to `outage_columns.COLUMNS` of faults.
+"""Kinds of step whose columns are in every trial, in addition to the columns of faults (`outage_columns.COLUMNS`).
 
-Columns of all other kinds are only in trials with such steps, so that a trial imports no kind that it does not use.
+Columns of other kinds are only in trials with such steps, so that a trial does not import kinds that it does not use.
 """
 
 Row = Mapping[str, Value]
-"""Values of one attempt by column; missing values have no entry."""
+"""Values of one attempt by column name; missing values have no entry."""
 
 
 @cache
-def measures() -> tuple[Column, ...]:
-    """Return the columns that evidence fills in every trial: columns of the testbed and of fieldkit's step kinds."""
-    of_kinds = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
-    filled = dict.fromkeys((*ALWAYS, *of_kinds, *outage_columns.COLUMNS))
-    return tuple(sorted(filled, key=lambda column: column.rank))
+def measured_columns() -> tuple[Column, ...]:
+    """Return the columns of measured values in every trial: those of the testbed and of `_KINDS_WITH_COLUMNS`."""
+    kind_columns = (column for kind in _KINDS_WITH_COLUMNS for column in step_types()[kind].columns)
+    unique_columns = dict.fromkeys((*ALWAYS, *kind_columns, *outage_columns.COLUMNS))
+    return tuple(sorted(unique_columns, key=lambda column: column.rank))
 
 
 def trial_columns(additional: Iterable[Column] = ()) -> tuple[Column, ...]:
-    """Return the columns of a trial.csv in order: columns of every trial, then others that its steps fill.
+    """Return the columns of a trial.csv in order: the columns of every trial, then additional ones.
 
     Args:
         additional: Columns that not every trial has, as in the trial's plan.
     """
-    everywhere = _common_columns()
-    return (*everywhere.values(), *(column for column in additional if column.name not in everywhere))
+    common = _common_columns()
+    return (*common.values(), *(column for column in additional if column.name not in common))
 
 
 @cache
 def _common_columns() -> Mapping[str, Column]:
-    return {column.name: column for column in (*IDENTITY, *measures())}
+    return {column.name: column for column in (*IDENTITY, *measured_columns())}
 
 
-def of_step(step: Step) -> tuple[Column, ...]:
-    """Return the columns that a step fills, with the prefix of the step."""
+def columns_of_step(step: Step) -> tuple[Column, ...]:
+    """Return the columns of a step, with the prefix of the step."""
     return tuple(with_step_name(step.prefix, column) for column in step.output_columns())
 
 
-def of_steps(steps: Iterable[Step]) -> tuple[Column, ...]:
+def additional_columns(steps: Iterable[Step]) -> tuple[Column, ...]:
     """Return the columns of steps that are not in every trial, in the order of the steps.
 
-    These are columns of named steps, additional columns that a step declares, and columns of other packages' kinds.
+    These are columns of named steps, further columns that a step declares, and columns of kinds of other packages.
     """
-    return tuple(column for step in steps for column in of_step(step) if column.name not in _common_columns())
+    return tuple(column for step in steps for column in columns_of_step(step) if column.name not in _common_columns())
 
 
-def of_robots(roles: Iterable[Role]) -> tuple[Column, ...]:
-    """Return the columns of the reports of robots on their clocks and computers, and of the marks that they cause."""
-    of_roles = (column for role in sort_roles(roles) for column in state_columns.declare_columns(role))
-    return (*state_columns.MARK_COLUMNS, *of_roles)
+def robot_columns(roles: Iterable[Role]) -> tuple[Column, ...]:
+    """Return the columns of the robots' states (clocks, computers, radios) and of the marks that these cause."""
+    role_columns = (column for role in sort_roles(roles) for column in state_columns.declare_columns(role))
+    return (*state_columns.MARK_COLUMNS, *role_columns)
 
 
-def filled_by(steps: Iterable[Step]) -> tuple[Column, ...]:
-    """Return the columns of a trial.csv that these steps, the testbed or the plan fill, in order."""
-    step_columns = [column for step in steps for column in of_step(step)]
+def filled_columns(steps: Iterable[Step]) -> tuple[Column, ...]:
+    """Return the columns of a trial.csv in which these steps, the testbed or the plan enter values, in order."""
+    step_columns = [column for step in steps for column in columns_of_step(step)]
     names = {column.name for column in (*IDENTITY, *ALWAYS, *step_columns)}
     return tuple(column for column in trial_columns(step_columns) if column.name in names)
 
 
-def column_conflict(column: Column, filled: Collection[str]) -> str | None:
-    """Return the reason why a step cannot fill a column, or None if it can.
+def column_conflict(column: Column, names: Collection[str]) -> str | None:
+    """Return the reason why a step cannot have a column, or None if it can.
 
     Args:
         column: The column.
-        filled: Names of the columns that other steps fill.
+        names: Names of the columns of other steps.
     """
     if declaration_error := column.declaration_error():
         return f"a column {column.name!r}: {declaration_error}"
     if _common_columns().get(column.name, column) != column:
-        return f"a column {column.name!r} is one of fieldkit's; give the step a name, or rename the column"
-    if column.name in filled:
-        return f"a column {column.name!r} is filled by two steps; give the step a name"
+        return f"fieldkit has another column {column.name!r}; give the step a name, or rename the column"
+    if column.name in names:
+        return f"two steps have a column {column.name!r}; give the step a name"
     return None
 
 
 @cache
-def installed() -> tuple[Column, ...]:
+def installed_columns() -> tuple[Column, ...]:
     """Return the columns of every trial, of robots in fixed roles, and of step kinds of other packages.
 
     Raises:
-        ConfigurationError: As for `step_types`, or a kind declares an invalid column, or one that exists already.
+        ConfigurationError: As for `step_types`, or a kind declares an invalid column or a column that exists already.
     """
-    by_name = {**_common_columns(), **{column.name: column for column in of_robots(FIXED_ROLES)}}
+    columns_by_name = {**_common_columns(), **{column.name: column for column in robot_columns(FIXED_ROLES)}}
     for kind, step in step_types().items():
         for column in step.columns:
             declaration_error = column.declaration_error()
-            if declaration_error or by_name.setdefault(column.name, column) != column:
+            if declaration_error or columns_by_name.setdefault(column.name, column) != column:
                 raise ConfigurationError(
                     f"the kind of step {kind!r} declares a column {column.name!r}, "
                     + (f"but {declaration_error}" if declaration_error else "which exists already"),
                     where=f"{step.__module__}:{step.__name__}",
                     remedy="rename it there, or uninstall its package",
                 )
-    return tuple(by_name.values())
+    return tuple(columns_by_name.values())

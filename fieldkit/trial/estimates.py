@@ -1,4 +1,4 @@
-"""Estimates of the duration of repeats: from the procedure for a good link, then from finished repeats."""
+"""Estimates of the duration of repeats, from the procedure for a good link and, later, from finished repeats."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -22,45 +22,45 @@ class FinishedRepeat:
     """A finished repeat and its duration.
 
     Attributes:
-        plan: Its trial.
-        protocol: Its protocol.
-        took_s: Total duration of all its attempts.
+        plan: Plan of the trial.
+        protocol: Protocol of the repeat.
+        duration_s: Total duration of all attempts at the repeat.
     """
 
     plan: Plan
     protocol: Protocol
-    took_s: float
+    duration_s: float
 
 
 def dead_link_s(procedure: Procedure, protocol: Protocol) -> float:
-    """Return the longest duration of an attempt in which no packet arrives and steps wait for their timeouts."""
+    """Return the longest duration of an attempt in which no packet arrives and all steps reach their timeouts."""
     waits_s = (getattr(placed.step, name, 0.0) for placed in procedure.walk() for name in ("limit", "patience"))
     return procedure.expected_s(protocol) + sum(waits_s)
 
 
 def finished_repeats(plan: Plan, entries: Iterable[JournalEntry]) -> list[FinishedRepeat]:
-    """Return the finished repeats of a journal with their durations; interrupted attempts do not count."""
+    """Return the finished repeats of a journal with their durations; interrupted attempts are not included."""
     start_ns: dict[RepeatId, int] = {}
-    took_s: dict[RepeatId, float] = {}
+    duration_s: dict[RepeatId, float] = {}
     finished: dict[RepeatId, None] = {}
     for entry in entries:
         if entry.status is Status.RUNNING:
             start_ns[entry.repeat] = entry.utc_ns
         elif entry.status in ENDED and entry.repeat in start_ns and not entry.excused:
             attempt_s = max(entry.utc_ns - start_ns[entry.repeat], 0) / 1e9
-            took_s[entry.repeat] = took_s.get(entry.repeat, 0.0) + attempt_s
+            duration_s[entry.repeat] = duration_s.get(entry.repeat, 0.0) + attempt_s
             finished |= {entry.repeat: None} if entry.status is not Status.VOID else {}
-    return [FinishedRepeat(plan, repeat.protocol, took_s[repeat]) for repeat in finished]
+    return [FinishedRepeat(plan, repeat.protocol, duration_s[repeat]) for repeat in finished]
 
 
-def of_trial(plan: Plan, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
-    """Return the estimated duration of all repeats of a trial; see `of_repeats`."""
-    return total(of_repeats(plan, protocol, plan.repeats, finished) for protocol in plan.protocols)
+def estimate_trial(plan: Plan, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
+    """Return the estimated duration of all repeats of a trial; see `estimate_repeats`."""
+    return total(estimate_repeats(plan, protocol, plan.repeats, finished) for protocol in plan.protocols)
 
 
 def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
-    """Yield a sentence for each robot whose battery is, by its profile, too small for a series of trials."""
-    duration = total(of_trial(plan, []) for plan in plans)
+    """Yield a sentence for each robot whose battery is too small for a series of trials, according to its profile."""
+    duration = total(estimate_trial(plan, []) for plan in plans)
     for robot in plans[0].cast.values():
         battery_min = robot.profile.limits.battery_min
         if battery_min is not None and duration.likely_s > 60 * battery_min:
@@ -70,16 +70,16 @@ def battery_notes(plans: Sequence[Plan]) -> Iterator[str]:
             )
 
 
-def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
+def estimate_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of a number of repeats of a trial.
 
-    Finished repeats at the same distance are the best basis. Otherwise repeats at the nearest shorter and longer
-    distances are used, of the same topology if possible. If no finished repeat was at a longer distance, the
-    link may be dead at this distance.
+    The estimate is based on finished repeats at the same distance or, if there are none, at the nearest shorter and
+    longer distances; repeats of the same topology are preferred. If no finished repeat was at a longer distance, the
+    upper bound assumes that no packet arrives.
 
     Args:
         plan: The trial.
-        protocol: The repeats' protocol.
+        protocol: Protocol of the repeats.
         count: Number of repeats.
         finished: Finished repeats of this and of other trials.
     """
@@ -89,7 +89,7 @@ def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[Fi
         if repeat.plan.procedure.name == plan.procedure.name and repeat.protocol is protocol
     ]
     similar = [repeat for repeat in similar if repeat.plan.topology is plan.topology] or similar
-    same_distance_s = [repeat.took_s for repeat in similar if repeat.plan.distance_m == plan.distance_m]
+    same_distance_s = [repeat.duration_s for repeat in similar if repeat.plan.distance_m == plan.distance_m]
     if same_distance_s:
         return TimeEstimate(count * fmean(same_distance_s), count * max(same_distance_s))
     dead_s = dead_link_s(plan.procedure, protocol)
@@ -99,6 +99,6 @@ def of_repeats(plan: Plan, protocol: Protocol, count: int, finished: Sequence[Fi
     longer = [repeat for repeat in similar if repeat.plan.distance_m > plan.distance_m]
     nearest_distances_m = {max(repeat.plan.distance_m for repeat in shorter)} if shorter else set()
     nearest_distances_m |= {min(repeat.plan.distance_m for repeat in longer)} if longer else set()
-    nearest_s = [repeat.took_s for repeat in similar if repeat.plan.distance_m in nearest_distances_m]
-    longest_s = max(repeat.took_s for repeat in similar)
+    nearest_s = [repeat.duration_s for repeat in similar if repeat.plan.distance_m in nearest_distances_m]
+    longest_s = max(repeat.duration_s for repeat in similar)
     return TimeEstimate(count * fmean(nearest_s), count * (longest_s if longer else max(longest_s, dead_s)))

@@ -7,16 +7,16 @@ from typing import Final
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.steps import base
 
-OF_EVERY_ATTEMPT: Final = (
+ATTEMPT_CHECKS: Final = (
     CrossCheck(
-        "that a robot was not restarted",
+        "restarts of a robot",
         (),
         "`ROLE-after.txt`: boot",
         ("`ROLE-before.txt`: boot",),
         "a robot that a step restarts",
     ),
     CrossCheck(
-        "that a clock was not set",
+        "clocks that were set",
         (),
         "`ROLE-after.txt`: clock and seconds since boot",
         ("`ROLE-before.txt`: the same",),
@@ -31,7 +31,7 @@ OF_EVERY_ATTEMPT: Final = (
         CheckOutcome.UNCHECKED,
     ),
     CrossCheck(
-        "that channel and regulatory domain are the same",
+        "changes of channel and regulatory domain",
         ("*_channel", "*_regulatory_domain"),
         "`ROLE-sources-after.txt`: iw-info, iw-reg",
         ("`ROLE-sources-before.txt`: the same",),
@@ -46,21 +46,21 @@ OF_EVERY_ATTEMPT: Final = (
         CheckOutcome.UNCHECKED,
     ),
     CrossCheck(
-        "that jobs ended as they should",
+        "terminations of jobs",
         (),
         "`ROLE-after.txt`: jobs",
-        ("the procedure", "logs and outputs of jobs: each job that left one has an end"),
+        ("the procedure", "logs and outputs of jobs: a job with such a file has a recorded termination"),
         "jobs of steps inside a fault",
     ),
     CrossCheck(
-        "that a robot's state files are complete",
+        "completeness of a robot's state files",
         (),
         "sections of `ROLE-after.txt`",
         ("sections of `ROLE-before.txt`",),
         "a section that a robot cannot provide is missing in both; older trials have no jobs",
     ),
     CrossCheck(
-        "which robot wrote a file",
+        "robot that wrote a file",
         (),
         "name of each file in a robot's archive",
         ("names that only the laptop writes", "jobs of the other robots"),
@@ -75,9 +75,9 @@ OF_EVERY_ATTEMPT: Final = (
         CheckOutcome.UNCHECKED,
     ),
     CrossCheck(
-        "lateness of the emulator, its radio links",
+        "lateness and radio links of the emulator",
         ("emulator_*", "sender_*", "receiver_*"),
-        "`lateness.txt`, `link.csv`; a robot's own `ROLE-link.txt`",
+        "`lateness.txt`, `link.csv`; `ROLE-link.txt` of a robot",
         (),
         "only the testbed or the radio's driver measures them",
         CheckOutcome.UNCHECKED,
@@ -86,8 +86,8 @@ OF_EVERY_ATTEMPT: Final = (
 
 
 def rows() -> Iterator[tuple[str, CrossCheck]]:
-    """Yield every check with its kind of step; the kind is empty for the checks of every attempt."""
-    yield from (("", check) for check in OF_EVERY_ATTEMPT)
+    """Yield the kind of step and the check of every cross-check; the kind is empty for checks of every attempt."""
+    yield from (("", check) for check in ATTEMPT_CHECKS)
     for kind, step in base.step_types().items():
         yield from ((kind, check) for check in step.cross_checks)
 
@@ -99,7 +99,7 @@ def covers(kind: str, column: str) -> bool:
 
 
 def markdown() -> str:
-    """Return the table as it is in `docs/evidence.md`."""
+    """Return the table for `docs/evidence.md`."""
     lines = [
         "| step | quantity | source | compared with | may differ by | else |",
         "| --- | --- | --- | --- | --- | --- |",

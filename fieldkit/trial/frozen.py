@@ -1,4 +1,4 @@
-"""The part of `trial.yaml` that describes its table: columns that not every trial has, and expectations."""
+"""The columns in `trial.yaml`: the columns of the trial's table that not every trial has."""
 
 import json
 import sys
@@ -29,7 +29,7 @@ class FrozenFigure(Strict):
 
 
 class FrozenColumn(Strict):
-    """A frozen `fieldkit.core.columns.Column`; its rank is its position in the list."""
+    """A frozen `fieldkit.core.columns.Column`. Its rank is its position in the list."""
 
     name: str
     unit: str
@@ -61,7 +61,7 @@ Columns = Annotated[tuple[FrozenColumn, ...], Field(max_length=MAX_COLUMNS), Aft
 
 
 def freeze(columns: Iterable[Column]) -> tuple[FrozenColumn, ...]:
-    """Return columns in the form in which a plan stores them."""
+    """Return columns in the form that is stored in a plan."""
     return tuple(
         FrozenColumn(
             name=column.name,

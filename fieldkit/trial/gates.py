@@ -1,4 +1,4 @@
-"""Evidence checks and measures of an attempt; each evidence file is read once."""
+"""Checks and measurements of the evidence of an attempt. Each evidence file is read once."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -28,13 +28,13 @@ _NO_TIMES: Final = "its clock counts the instructions of a processor in software
 
 @dataclass(frozen=True)
 class EvidenceVerdict:
-    """Judgement on the evidence of an attempt.
+    """Result of the checks and measurements of an attempt's evidence.
 
     Attributes:
-        problems: Reasons why the evidence is incomplete or contradictory, so that the attempt is void; one sentence
+        problems: Reasons why the evidence is incomplete or contradictory and the attempt therefore void; one sentence
             each.
-        measured: The values that could be measured nevertheless.
-        step_errors: Tracebacks of the exceptions that steps and readers of files raised on the evidence.
+        measured: The values that could be measured.
+        step_errors: Tracebacks of exceptions that steps and readers of files raised.
         notes: Sentences about values that are missing although the profile of a robot has a source for them.
     """
 
@@ -45,7 +45,7 @@ class EvidenceVerdict:
 
     @property
     def has_failed(self) -> bool:
-        """Whether exceptions of steps are the only problems, so that another attempt would not help."""
+        """True if exceptions of steps are the only problems: another attempt would raise them again."""
         return 0 < len(self.problems) <= len(self.step_errors)
 
 
@@ -53,26 +53,26 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
     """Measure an attempt and check that its evidence is complete.
 
     The evidence of steps inside a fault may be incomplete, because the fault disturbs it. Each column that a step
-    declares must have a value or a reason why it is missing; if it has neither, a value was lost and the attempt is
-    void. The attempt is also void if a step or the reader of a file raises an unexpected exception: a trial must
-    continue, and must be resumable and rebuildable for any content of its files.
+    declares must have a value or a reason why it is missing. If it has neither, a value was lost and the attempt is
+    void. The attempt is also void if a step or the reader of a file raises an unexpected exception: whatever the
+    files contain, the trial must continue, and it must be possible to resume and rebuild it.
 
     Raises:
         MemoryError: This machine has too little memory; this is not a problem of the evidence.
     """
     scene = plan.scene(repeat, "")
     step_errors = StepErrors()
-    # The robots' states are judged first, because their problems cause many of the others.
+    # The robots' states are checked first, because their problems cause many of the other problems.
     problems = list(hosts.problems(plan.procedure, scene, evidence, step_errors))
     lateness = evidence.read_or_none(oracle_delays.read_lateness, oracle_delays.LATENESS_FILE)
-    timeless = plan.simulators.get(CLOCK) == INSTRUCTIONS
+    has_no_times = plan.simulators.get(CLOCK) == INSTRUCTIONS
     measured = oracle_delays.measure_lateness(lateness) | oracle_delays.measure_window_lateness(lateness)
     notes: list[str] = []
     for role in link.ROLES:
-        of_link = link.measure(role, evidence.links(role))
+        link_columns = link.measure(role, evidence.links(role))
         if TELEMETRY in plan.cast[role].profile.sections:
-            of_link = _with_telemetry(plan, role, evidence, of_link, notes)
-        measured |= of_link
+            link_columns = _with_telemetry(plan, role, evidence, link_columns, notes)
+        measured |= link_columns
     placement_problem = _placement_problem(scene, evidence)
     for placed in plan.procedure.walk():
         view = View(scene, evidence, placed.within)
@@ -89,7 +89,7 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
             if placement_problem:
                 dependent = {name: placement_problem for name in result.values if position_columns.is_dependent(name)}
                 result = result.without(dependent)
-            if timeless:
+            if has_no_times:
                 result = result.without({column.name: _NO_TIMES for column in columns if column.unit in _TIME_UNITS})
         except MemoryError:
             raise
@@ -100,33 +100,37 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
         measured |= result.with_step_name(placed.step.prefix)
     problems += _testbed_problems(evidence)
     names = {role: scene.robot(role).name for role in sort_roles(plan.procedure.roles())}
-    roaming = _roaming(plan.procedure)
-    problems += attempt_states.problems(evidence, {role: name for role, name in names.items() if role not in roaming})
+    roaming = roaming_roles(plan.procedure)
+    fixed = {role: name for role, name in names.items() if role not in roaming}
+    problems += attempt_states.problems(evidence, fixed, plan.radios)
     measured = attempt_states.measure(evidence, names, measured)
-    # Otherwise an optional file would count as missing, and the error of its reader would be lost.
+    # Without this, an optional file would be treated as missing, and the error of its reader would not be reported.
     problems += (
         step_errors.add(f"{name} cannot be read", error) for name, error in tuple(evidence.unexpected_errors)
     )
     return EvidenceVerdict(tuple(problems), measured, tuple(step_errors.tracebacks), tuple(notes))
 
 
-def _roaming(procedure: Procedure) -> frozenset[Role]:
+def roaming_roles(procedure: Procedure) -> frozenset[Role]:
     """Return the roles of the robots whose channel may change."""
     steps = (placed.step for placed in procedure.walk())
     return frozenset[Role]().union(*(step.roams() for step in steps if isinstance(step, Roams)))
 
 
 def _with_telemetry(
-    plan: Plan, role: Role, evidence: AttemptEvidence, of_link: Measured, notes: list[str]
+    plan: Plan, role: Role, evidence: AttemptEvidence, link_columns: Measured, notes: list[str]
 ) -> Measured:
-    """Return the columns of a robot's link with the values of its telemetry sources; add to `notes` which failed."""
+    """Return the columns of a robot's link, completed with the values of its telemetry sources.
+
+    A note on each source that failed is added to `notes`.
+    """
     from fieldkit.telemetry import telemetry_columns  # noqa: PLC0415 (few profiles have sources)
     from fieldkit.telemetry.telemetry_section import telemetry_of  # noqa: PLC0415
 
     telemetry = telemetry_of(plan.cast[role].profile)
     if telemetry is None:
-        return of_link
-    verdict = telemetry_columns.measure(role, telemetry, evidence, of_link)
+        return link_columns
+    verdict = telemetry_columns.measure(role, telemetry, evidence, link_columns)
     notes += verdict.notes
     return verdict.measured
 
@@ -141,7 +145,7 @@ def _placement_problem(scene: Scene, evidence: AttemptEvidence) -> str | None:
 
 
 def _step_problem(placed: PlacedStep, reason: str) -> str:
-    """Return a problem of a step's evidence, preceded by the step's name if it has one."""
+    """Return a problem of a step's evidence. If the step has a name, the text starts with it."""
     return f"{placed.step.prefix}: {reason}" if placed.step.prefix else reason
 
 
@@ -154,9 +158,9 @@ def _unexplained_columns(placed: PlacedStep, columns: Iterable[Column], measured
 def _impossible_values(
     placed: PlacedStep, columns: Iterable[Column], measured: Measured
 ) -> Iterator[tuple[str, str]]:
-    """Yield each column whose measured value is outside its declared range, and the reason.
+    """Yield the name of each column whose measured value is outside its declared range, and the reason.
 
-    Such values are removed, because a table that contains one could not be read again.
+    Such values are removed, because a table that contains them could not be read again.
     """
     for column in columns:
         text = "" if column.type is str else cell(measured.values.get(column.name))
@@ -175,7 +179,7 @@ _TESTBED_FILES: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
 
 
 def _testbed_problems(evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield the problems of the files written by the testbed's oracle, if it has one."""
+    """Yield the problems of the files that the testbed's oracle wrote, if there is an oracle."""
     for read, name in _TESTBED_FILES:
         try:
             content = evidence.read(read, name) if evidence.has(name) else None

@@ -1,4 +1,4 @@
-"""Hashes that show whether two trials were measured in the same way, shortened to fit a CSV column."""
+"""Hashes that show if two trials were measured in the same way. They are shortened to fit into a CSV column."""
 
 import hashlib
 import json
@@ -12,16 +12,16 @@ _HASH_DIGITS: Final = 16
 
 @cache
 def code_hash() -> str:
-    """Return the hash over the names and contents of fieldkit's source files, read once."""
+    """Return the hash of the names and contents of fieldkit's source files; the result is cached."""
     digest = hashlib.sha256()
     package = Path(__file__).resolve().parent.parent
-    walked = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names)
-    sources = (path.removeprefix(f"{package}/") for path in walked if path.endswith((".py", ".sh")))
+    file_paths = (f"{folder}/{name}" for folder, _, names in os.walk(package) for name in names)
+    sources = (path.removeprefix(f"{package}/") for path in file_paths if path.endswith((".py", ".sh")))
     for name in sorted(sources, key=lambda name: name.split("/")):
         digest.update(f"{name}\0".encode() + (package / name).read_bytes() + b"\0")
     return digest.hexdigest()[:_HASH_DIGITS]
 
 
 def data_hash(data: object) -> str:
-    """Return the hash over plain data."""
+    """Return the hash of plain data (as JSON)."""
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:_HASH_DIGITS]

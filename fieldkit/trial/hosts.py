@@ -1,4 +1,4 @@
-"""Judge each robot's state before and after an attempt: reboots, clock changes, and how its jobs ended."""
+"""Check each robot's state before and after an attempt: reboots, clock changes, and terminations of jobs."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
@@ -13,15 +13,15 @@ from fieldkit.steps.scene import Planned, Scene
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.step_errors import StepErrors
 
-_LOST: Final = "the section {} is missing in its state before or after the attempt"
+_LOST: Final = "the section {} is missing in its state before or in its state after the attempt"
 REBOOTED: Final = "the robot rebooted during the repeat"
 
 
 def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step_errors: StepErrors) -> Iterator[str]:
-    """Yield the robots' problems that make an attempt void, and the sections that are missing in their state files.
+    """Yield the robots' problems that make an attempt void, including missing sections of their state files.
 
     A section that a robot cannot provide is missing before and after the attempt. A section that is missing only
-    once was lost. If a step restarts a robot, only its jobs are judged, because its clock starts again. Exceptions
+    once was lost. If a step restarts a robot, only its jobs are checked, because its clock starts again. Exceptions
     of steps are added to `step_errors`.
     """
     planned_jobs: list[Planned] = []
@@ -30,7 +30,7 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
             planned_jobs += () if placed.disturbed else own_jobs(placed.step, scene)
         except Exception as error:  # noqa: BLE001 (a step of another package: the trial must continue and be rebuildable)
             yield step_errors.add(f"the commands of {placed.label} cannot be derived", error)
-    restarted_roles = restarted(procedure)
+    restarted = restarted_roles(procedure)
     for role in sorted(procedure.roles()):
         name = scene.robot(role).name
         before, after = (
@@ -41,10 +41,10 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
                 yield f"{name}: {file} is missing, or cannot be read"
         if before is not None and after is not None:
             yield from (f"{name}: {_LOST.format(section)}" for section in host.incomplete_sections(before, after))
-        if before is not None and after is not None and role not in restarted_roles:
-            if rebooted(before.boot, after.boot):
+        if before is not None and after is not None and role not in restarted:
+            if has_rebooted(before.boot, after.boot):
                 yield f"{name}: {REBOOTED}"
-                continue  # a reboot also ends its jobs and restarts its clock
+                continue  # a reboot also terminates the jobs and restarts the clock
             yield from (f"{name}: {reason}" for reason in _clock_problems(before, after))
         if after is not None and after.endings is not None:
             yield from (
@@ -52,23 +52,26 @@ def problems(procedure: Procedure, scene: Scene, evidence: AttemptEvidence, step
             )
 
 
-def restarted(procedure: Procedure) -> frozenset[Role]:
-    """Return the roles whose robots are restarted by a step."""
+def restarted_roles(procedure: Procedure) -> frozenset[Role]:
+    """Return the roles of the robots that a step restarts."""
     steps = (placed.step for placed in procedure.walk() if isinstance(placed.step, Restarts))
     return frozenset[Role]().union(*(step.restarts() for step in steps))
 
 
-def without_effects(reasons: Sequence[str]) -> list[str]:
-    """Return the reasons why an attempt is void. For a robot that rebooted, this is the only reason."""
-    reasons = list(dict.fromkeys(reasons))  # after a lost link, step and fetching give the same reason
+def drop_effects_of_reboots(reasons: Sequence[str]) -> list[str]:
+    """Return the reasons why an attempt is void, without duplicates and without the effects of reboots.
+
+    If a robot rebooted, the reboot is its only reason.
+    """
+    reasons = list(dict.fromkeys(reasons))  # after a lost link, the step and the fetching give the same reason
     rebooted_robots = [reason.removesuffix(REBOOTED) for reason in reasons if reason.endswith(f": {REBOOTED}")]
     return [
         reason for reason in reasons if reason.endswith(REBOOTED) or not reason.startswith(tuple(rebooted_robots))
     ]
 
 
-def rebooted(before: str | None, after: str | None) -> bool:
-    """Return True if two boot identifiers are known and differ."""
+def has_rebooted(before: str | None, after: str | None) -> bool:
+    """Return True if both boot IDs are known and differ."""
     return before is not None and after is not None and before != after
 
 
@@ -84,14 +87,14 @@ def _clock_problems(before: HostState, after: HostState) -> Iterator[str]:
 def _job_problems(
     procedure: Procedure, planned_jobs: Iterable[Planned], role: Role, after: HostState, evidence: AttemptEvidence
 ) -> Iterator[str]:
-    """Yield the jobs on a robot that did not end as required."""
+    """Yield a sentence for each job on a robot that did not end as required."""
     for planned in planned_jobs:
         if planned.role is not role:
             continue
         ending = (after.endings or {}).get(planned.job.name)
         if (
             ending is None
-            and role not in restarted(procedure)
+            and role not in restarted_roles(procedure)
             and any(evidence.has(file) for file in (planned.job.log, planned.job.stdout) if file)
         ):
             yield f"its job {planned.job.name} ran, but its exit was not recorded"

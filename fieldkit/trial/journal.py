@@ -1,4 +1,4 @@
-"""The journal of a trial: an append-only record of each repeat, synced to disk before the trial continues."""
+"""The journal of a trial: an append-only record of its repeats, synced to disk before the trial continues."""
 
 import time
 from collections.abc import Iterator
@@ -28,10 +28,10 @@ class JournalEntry:
         utc_ns: Time of the entry, in nanoseconds since 1970 UTC.
         protocol: Protocol of the repeat.
         number: Number of the repeat.
-        attempt: Number of the attempt, 0 while planned.
-        status: Its status.
-        reason: Reason why it is not valid.
-        excused: Whether it was interrupted from outside, so that it does not count as one of the allowed attempts.
+        attempt: Number of the attempt; 0 while the repeat is planned.
+        status: Status of the repeat or attempt.
+        reason: Reason why the attempt is not valid.
+        excused: True if the attempt was interrupted from outside and therefore is not one of the allowed attempts.
     """
 
     utc_ns: Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -58,12 +58,12 @@ class Attempt:
     Attributes:
         repeat: The repeat.
         number: Number of the attempt.
-        started_utc_ns: Its start.
-        status: Its final status.
-        reason: Reason why it is not valid.
-        excused: Whether it does not count as one of the allowed attempts, because it was interrupted from outside or
+        started_utc_ns: Start, nanoseconds since 1970 UTC.
+        status: Final status.
+        reason: Reason why the attempt is not valid.
+        excused: True if the attempt is not one of the allowed attempts, because it was interrupted from outside or
             its repeat was reopened later.
-        reopened: Whether it failed and its repeat was reopened later, which makes the attempt void.
+        reopened: True if the attempt failed and its repeat was reopened later. The attempt is then void.
     """
 
     repeat: RepeatId
@@ -76,16 +76,16 @@ class Attempt:
 
     @property
     def folder(self) -> str:
-        """Name of its folder under `repeats/`: `udp-07`, or `udp-07.void1` for an attempt that was repeated."""
+        """Name of the attempt's folder in `repeats/`: `udp-07`, or `udp-07.void1` if the attempt was repeated."""
         return self.repeat.folder(self.status, self.number)
 
     def remote(self, trial: str) -> str:
-        """Return its folder on each robot."""
+        """Return the attempt's folder on each robot."""
         return jobs.work_folder(trial, f"{self.repeat}-{self.number}")
 
     @property
     def folders(self) -> tuple[str, ...]:
-        """All names that its folder may get, depending on its final status."""
+        """All names that the folder may have, depending on the final status."""
         return tuple(self.repeat.folder(status, self.number) for status in ENDED)
 
 
@@ -102,7 +102,7 @@ def append(folder: Path, *entries: JournalEntry) -> None:
 def reopen_failed(folder: Path, plan: Plan) -> int:
     """Plan every failed repeat of a locked trial again, and return the number of these repeats.
 
-    `ended` reports the failed attempts as void from then on.
+    `ended_attempts` then returns the failed attempts as void.
 
     Raises:
         EvidenceError: As for `history`.
@@ -110,13 +110,13 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
     """
     remove_torn_line(folder)
     now = time.time_ns()
-    failed = [attempt.repeat for attempt in ended(history(folder, plan)) if attempt.status is Status.FAILED]
+    failed = [attempt.repeat for attempt in ended_attempts(history(folder, plan)) if attempt.status is Status.FAILED]
     append(folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed))
     return len(failed)
 
 
 def remove_torn_line(folder: Path) -> None:
-    """Remove an incomplete last line that a crash has left; see `jsonl.repair_last_line`."""
+    """Remove an incomplete last line that a crash left; see `jsonl.repair_last_line`."""
     jsonl.repair_last_line(folder / JOURNAL_FILE, _CODEC.parse)
 
 
@@ -129,7 +129,7 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
     """Return the entries of a trial's journal after a check that their sequence is possible.
 
     Raises:
-        EvidenceError: As for `read`; or an entry cannot follow the earlier entries, or its repeat is not in the plan.
+        EvidenceError: As for `read`; or an entry contradicts earlier entries, or its repeat is not in the plan.
     """
     entries = read(folder)
     for line, reason in _impossible_entries(entries, plan):
@@ -142,7 +142,7 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
 
 
 def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tuple[int, str]]:
-    """Yield line and reason of each entry that contradicts the plan or an entry before it."""
+    """Yield the line number of each entry that contradicts the plan or an earlier entry, and the reason."""
     started: set[tuple[RepeatId, int]] = set()
     ended: set[tuple[RepeatId, int]] = set()
     final_status: dict[RepeatId, Status] = {}
@@ -164,37 +164,37 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
             final_status |= {repeat: entry.status} if entry.status is not Status.VOID else {}
 
 
-def ended(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts that ended, in order of their ends; failed attempts of a reopened repeat are void."""
+def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
+    """Return the attempts that ended, in the order of their ends. Failed attempts of a reopened repeat are void."""
     started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
     planned_at = {entry.repeat: line for line, entry in enumerate(entries) if entry.status is Status.PLANNED}
 
-    def attempt(entry: JournalEntry, *, earlier: bool) -> Attempt:
-        reopened = earlier and entry.status is Status.FAILED
+    def to_attempt(entry: JournalEntry, *, is_before_reopening: bool) -> Attempt:
+        reopened = is_before_reopening and entry.status is Status.FAILED
         return Attempt(
             repeat=entry.repeat,
             number=entry.attempt,
             started_utc_ns=started[entry.repeat, entry.attempt],
             status=Status.VOID if reopened else entry.status,
             reason=entry.reason,
-            excused=entry.excused or earlier,
+            excused=entry.excused or is_before_reopening,
             reopened=reopened,
         )
 
     return [
-        attempt(entry, earlier=line < planned_at.get(entry.repeat, -1))
+        to_attempt(entry, is_before_reopening=line < planned_at.get(entry.repeat, -1))
         for line, entry in enumerate(entries)
         if entry.status not in _OPEN
     ]
 
 
-def interrupted(entries: list[JournalEntry]) -> list[Attempt]:
-    """Return the attempts with status `running` or `measured`, which did not end because fieldkit was killed."""
-    ended_attempts = {(attempt.repeat, attempt.number) for attempt in ended(entries)}
+def interrupted_attempts(entries: list[JournalEntry]) -> list[Attempt]:
+    """Return the attempts that did not end because fieldkit was killed; their status is `running` or `measured`."""
+    ended = {(attempt.repeat, attempt.number) for attempt in ended_attempts(entries)}
     started = {
         (entry.repeat, entry.attempt): entry.utc_ns
         for entry in entries
-        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended_attempts
+        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended
     }
     measured = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
     return [

@@ -27,7 +27,7 @@ _ESCAPES: Final = (("\\", "\\\\"), ("\n", "\\n"), ("\r", "\\r"))
 
 
 class Manifest:
-    """Checksums of a trial's files, updated while the trial grows; an existing manifest is read first.
+    """Checksums of a trial's files, which are updated during the trial. An existing manifest is read first.
 
     Args:
         folder: The trial's folder.
@@ -49,16 +49,16 @@ class Manifest:
     def unchanged_lines(self, name: str) -> int | None:
         """Return the number of lines that the checksum of a top-level file covers; None if these lines have changed.
 
-        An append-only file may have more lines now. The result is 0 for a file without a checksum.
+        More lines may have been appended since. The result is 0 for a file without a checksum.
         """
         return count_unchanged_lines(self._folder / name, self._top_level[name]) if name in self._top_level else 0
 
     def add(self, attempt: Path) -> None:
-        """Add the checksums of a stored attempt; its evidence is never written again, so this is done once."""
+        """Add the checksums of a stored attempt. Its evidence is not written again, so this is done once."""
         self._lines[attempt.name] = _lines(_sums(self._folder, attempt))
 
     def rename(self, attempt: str, name: str) -> None:
-        """Rename an attempt's folder in the manifest; its checksums are kept, not computed again."""
+        """Rename an attempt's folder in the manifest. Its checksums are not computed again."""
         if attempt in self._lines:
             before, after = (f"{store.REPEATS}/{folder}/" for folder in (attempt, name))
             lines = self._lines.pop(attempt).splitlines(keepends=True)
@@ -66,9 +66,9 @@ class Manifest:
             self._save()
 
     def write(self) -> None:
-        """Write the manifest: the attempts that were added, and the top-level files as they are now.
+        """Write the manifest: checksums of the added attempts, and of the present top-level files.
 
-        The plan never changes, so its first checksum is kept.
+        The plan does not change during a trial, so its first checksum is kept.
         """
         top_level = {path.name: sha256(path) for path in self._folder.iterdir() if _is_top_level(path)}
         if PLAN_FILE in self._top_level:
@@ -77,16 +77,18 @@ class Manifest:
         self._save()
 
     def renew(self, names: Iterable[str]) -> None:
-        """Compute the checksums of the top-level files `names` again; all other checksums are kept."""
+        """Compute the checksums of the top-level files `names` again. Other checksums are not changed."""
         self._top_level |= {name: sha256(self._folder / name) for name in names}
         self._save()
 
     def renew_positions(self) -> None:
-        """Compute the checksums of position files added after the trial again; all others are kept."""
+        """Compute the checksums of the position files that were added after the trial. Others are not changed."""
         top_level = {name: digest for name, digest in self._top_level.items() if not is_positions(name)}
-        added = (path.name for path in self._folder.iterdir() if is_positions(path.name) and _is_top_level(path))
+        position_names = (
+            path.name for path in self._folder.iterdir() if is_positions(path.name) and _is_top_level(path)
+        )
         self._top_level = top_level
-        self.renew(added)
+        self.renew(position_names)
 
     def _save(self) -> None:
         # The keys of attempts end with a slash, so that all lines are sorted by whole file names.
@@ -121,7 +123,7 @@ def is_positions(name: str) -> bool:
 
 
 def count_unchanged_lines(path: Path, digest: str) -> int | None:
-    """Return the number of leading lines of a file that have this checksum, or None if there is no such number."""
+    """Return the number of lines at the start of a file that have this checksum, or None if no number has it."""
     hasher, count = hashlib.sha256(), 0
     try:
         lines = files.read(path, _LIMIT_BYTES).splitlines(keepends=True)
@@ -138,9 +140,9 @@ def by_attempt(sums: Sums) -> dict[str, dict[str, str]]:
     """Return the checksums of the evidence of each attempt, by the name of its folder."""
     sums_by_attempt: dict[str, dict[str, str]] = {}
     for name, digest in sums.items():
-        place, _, rest = name.partition("/")
-        attempt, _, file = rest.partition("/")
-        if place == store.REPEATS and file:
+        top_folder, _, path = name.partition("/")
+        attempt, _, file = path.partition("/")
+        if top_folder == store.REPEATS and file:
             sums_by_attempt.setdefault(attempt, {})[name] = digest
     return sums_by_attempt
 
@@ -150,7 +152,7 @@ def _sums(folder: Path, attempt: Path) -> Sums:
 
 
 def plain_files(folder: Path) -> Iterator[Path]:
-    """Yield the plain files at any depth below a folder, except hidden ones (unfinished, or made by a desktop)."""
+    """Yield the plain files at any depth below a folder, except hidden files (incomplete, or from a desktop)."""
     for where, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith(".")]
         paths = (Path(where, name) for name in names if not name.startswith("."))
@@ -171,10 +173,10 @@ def _lines(sums: Sums) -> bytes:
 
 
 def _line(name: str, digest: str) -> bytes:
-    written = name
+    escaped = name
     for char, escape in _ESCAPES:
-        written = written.replace(char, escape)
-    return os.fsencode(f"{'' if written == name else chr(92)}{digest}  {written}\n")
+        escaped = escaped.replace(char, escape)
+    return os.fsencode(f"{'' if escaped == name else chr(92)}{digest}  {escaped}\n")
 
 
 def _parse(line: bytes) -> tuple[str, str]:
@@ -187,9 +189,9 @@ def _parse(line: bytes) -> tuple[str, str]:
 
 
 def _unescaped(name: str) -> str:
-    plain = {escape[1]: char for char, escape in _ESCAPES}
+    chars = {escape[1]: char for char, escape in _ESCAPES}
     parts = iter(name)
-    return "".join(plain.get(next(parts, ""), "?") if char == "\\" else char for char in parts)
+    return "".join(chars.get(next(parts, ""), "?") if char == "\\" else char for char in parts)
 
 
 def sha256(path: Path) -> str:

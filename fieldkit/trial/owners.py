@@ -1,4 +1,4 @@
-"""Determine which robot may write which file of an attempt, by the procedure's jobs and the role in the file name."""
+"""Owners of the files of an attempt: the robot that may write each file, from the jobs and the role in its name."""
 
 import re
 from collections.abc import Mapping
@@ -13,18 +13,18 @@ from fieldkit.trial.procedure import Procedure
 
 @dataclass(frozen=True)
 class FileOwners:
-    """The roles that may write each file; names are compared without regard to case.
+    """The role that may write each file. Names are compared without regard to case.
 
     Attributes:
-        by_name: The role of each declared file.
-        roles: The roles of the procedure.
+        by_name: Role of each declared file.
+        roles: Roles of the procedure.
     """
 
     by_name: Mapping[str, Role]
     roles: frozenset[Role]
 
     @classmethod
-    def of(cls, procedure: Procedure, scene: Scene) -> Self:
+    def of_procedure(cls, procedure: Procedure, scene: Scene) -> Self:
         """Return the owners of the files of a procedure."""
         owners: dict[str, Role] = {}
         for placed in procedure.walk():
@@ -32,7 +32,7 @@ class FileOwners:
                 for name in (planned.job.log, planned.job.stdout):
                     if name:
                         owners[name.casefold()] = planned.role
-        owners |= {file.name.casefold(): role for role, files in scene.recorded.items() for file in files}
+        owners |= {file.name.casefold(): role for role, files in scene.recordings.items() for file in files}
         return cls(owners, procedure.roles())
 
     def refusal(self, role: Role, name: str) -> str | None:

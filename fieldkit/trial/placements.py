@@ -17,20 +17,20 @@ from fieldkit.measure.positions.trajectories import Trajectory
 from fieldkit.steps.scene import Scene
 
 SATELLITE_M: Final = 15.0
-"""Tolerance for satellite positions: twice 7.5 m. A receiver under open sky is within 5 m in 95 % of cases
-(gps.gov, GPS accuracy); next to a wall the error is larger."""
+"""Tolerance for satellite positions: an error of 7.5 m at each robot. Under open sky, the error of a receiver is
+below 5 m in 95 % of cases (gps.gov, GPS accuracy); next to a wall it is larger."""
 TRACKER_M: Final = 2.0
-"""Tolerance for all other positions: two robots, each within 1 m of its planned place."""
+"""Tolerance for other positions: each of two robots may be 1 m away from its planned place."""
 SHARE: Final = 0.1
-"""Share of the planned distance that is added to both tolerances, for distances measured in paces and for drift of
+"""Share of the planned distance that is added to both tolerances, for distances that were paced off and for drift of
 odometry."""
 
 
 def contradiction(scene: Scene, evidence: AttemptEvidence) -> str | None:
     """Return the reason why the recorded positions contradict the planned placement, or None.
 
-    Robots are at their places when an attempt starts, even if they move later. Therefore the recorded distance of two
-    robots must equal the planned one at some time of the attempt.
+    Robots are at their places when an attempt starts, even if they move later. At some time of the attempt, the
+    recorded distance of two robots must therefore equal the planned distance.
     """
     return next(_contradictions(scene, evidence), None)
 
@@ -44,17 +44,17 @@ def _contradictions(scene: Scene, evidence: AttemptEvidence) -> Iterator[str]:
     for ends in combinations([role for role in sort_roles(sources_by_role) if role in places_m], 2):
         try:
             source, destination = recorded_positions.trajectories_of_pair(evidence, (ends[0], ends[1]))
-            satellites = recorded_positions.samples_of(evidence, ends[0]).frame == WGS84
+            is_satellite = recorded_positions.samples_of(evidence, ends[0]).frame == WGS84
         except EvidenceError:
             continue  # without positions there is no distance
         times_ns = _times_ns(evidence, ends[0], source, destination)
         recorded_m = np.linalg.norm(destination.at_m(times_ns) - source.at_m(times_ns), axis=1)
         planned_m = float(np.linalg.norm(np.subtract(places_m[ends[1]], places_m[ends[0]])))
         deviation_m = float(np.abs(recorded_m - planned_m).min())
-        if deviation_m > (SATELLITE_M if satellites else TRACKER_M) + SHARE * planned_m:
+        if deviation_m > (SATELLITE_M if is_satellite else TRACKER_M) + SHARE * planned_m:
             closest_m = float(recorded_m[np.abs(recorded_m - planned_m).argmin()])
-            planned = f"the {ends[0]} and the {ends[1]} were placed {planned_m:.1f} m apart"
-            yield f"{planned}, but by their recorded positions they were {closest_m:.1f} m apart"
+            planned_text = f"the planned distance of the {ends[0]} and the {ends[1]} is {planned_m:.1f} m"
+            yield f"{planned_text}, but the distance of their recorded positions is {closest_m:.1f} m"
 
 
 def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) -> Ints:
@@ -66,5 +66,5 @@ def _times_ns(evidence: AttemptEvidence, role: Role, *trajectories: Trajectory) 
         return times_ns
     offset_ns = recorded_positions.clock_offset_ns(evidence, role)
     first, last = clocks[0].first_ns - offset_ns, clocks[1].last_ns - offset_ns
-    inside = times_ns[(times_ns > first) & (times_ns < last)]
-    return np.concatenate(((first,), inside, (last,)))
+    inner_times_ns = times_ns[(times_ns > first) & (times_ns < last)]
+    return np.concatenate(((first,), inner_times_ns, (last,)))

@@ -17,7 +17,7 @@ from fieldkit.steps.capabilities import DescribesActions, HasRefusals, Moves
 from fieldkit.steps.scene import Planned, PutProgram, Refusal, Scene
 from fieldkit.steps.variants import Variants
 from fieldkit.trial import step_errors
-from fieldkit.trial.columns import of_steps, trial_columns
+from fieldkit.trial.columns import additional_columns, trial_columns
 from fieldkit.trial.frozen import Columns
 from fieldkit.trial.procedure import Procedure, Repeats
 from fieldkit.trial.procedure_section import ProcedureSection
@@ -27,7 +27,7 @@ PLAN_FILE: Final = laptop_files.PLAN
 
 
 def simulators_text(simulators: Mapping[str, str]) -> str:
-    """Return the simulators of a backend as text: `physics mujoco, network ns3`; empty if there are none."""
+    """Return the simulators of a backend as text, such as `physics mujoco, network ns3`; empty without simulators."""
     return ", ".join(f"{purpose} {name}" for purpose, name in simulators.items())
 
 
@@ -35,26 +35,29 @@ class Plan(Strict):
     """A trial's frozen inputs.
 
     Attributes:
-        schema_version: Version of the CSV columns at planning; each row has the version at its own measurement.
+        schema_version: Version of the CSV columns when the trial was planned; each row has the version that was
+            used for its measurement.
         trial: Name of the trial and of its folder.
-        versions: Versions of fieldkit, Python, packages that measure, and packages that add steps or backends.
-        code_sha256: Hash over fieldkit's source.
-        profiles_sha256: Hash over the profiles of the cast.
+        versions: Versions of fieldkit, Python, packages for measurements, and packages that add steps or backends.
+        code_sha256: Hash of fieldkit's source.
+        profiles_sha256: Hash of the profiles of the cast.
         procedure_sha256: Hash of the procedure.
         backend: Name of the backend.
-        session: Identifies the run of fieldkit in the robots' locks; a resumed trial uses the same value.
+        session: ID of the run of fieldkit in the robots' locks; a resumed trial uses the same value.
         seed: Seed of all random numbers.
         notes: Notes of the operator.
         topology: Topology.
-        distance: Distance as the operator wrote it.
+        distance: Distance as written by the operator.
         distance_m: Distance in metres.
         protocols: Protocols under test.
         repeats: Repeats per protocol.
         cast: The robot in each role.
         procedure: The procedure.
-        lab_bytes: Maximum number of bytes that the lab itself adds to an attempt.
-        simulators: Physics, network and sync policy of a backend that simulates them; empty otherwise.
+        lab_bytes: Maximum number of bytes that the lab adds to an attempt.
+        simulators: Physics, network and sync policy of a backend that simulates them; otherwise empty.
         step_packages: The package of each kind of step that does not ship with fieldkit.
+        radios: Channel and regulatory domain of each robot's radio at the start, which must not change during the
+            trial; empty if they are unknown.
         columns: Columns of its steps that not every trial has; None if there are none, or if an earlier fieldkit
             planned the trial.
     """
@@ -79,22 +82,23 @@ class Plan(Strict):
     lab_bytes: Int = 0
     simulators: dict[str, str] = Field(default_factory=dict, exclude_if=schema.is_empty)
     step_packages: dict[str, StepPackage] = Field(default_factory=dict, exclude_if=schema.is_empty)
+    radios: dict[Role, dict[str, str]] = Field(default_factory=dict, exclude_if=schema.is_empty)
     columns: Columns | None = None
 
     @property
     def backend_with_simulators(self) -> str:
-        """Name of the backend, with its simulators if it has any. Other simulators are another condition."""
+        """Name of the backend with its simulators, if it has any. Trials with other simulators are not comparable."""
         return f"{self.backend} ({simulators_text(self.simulators)})" if self.simulators else self.backend
 
     @cached_property
     def table(self) -> tuple[Column, ...]:
         """The columns of the trial's trial.csv, in order."""
         if self.columns is None:
-            return trial_columns(of_steps(placed.step for placed in self.procedure.walk()))
+            return trial_columns(additional_columns(placed.step for placed in self.procedure.walk()))
         return trial_columns(frozen.column for frozen in self.columns)
 
-    def order(self) -> Iterator[RepeatId]:
-        """Yield the planned repeats; protocols alternate, so that slow changes of the channel affect both equally."""
+    def repeats_in_order(self) -> Iterator[RepeatId]:
+        """Yield the planned repeats. Protocols alternate, so that slow changes of the channel affect both equally."""
         return (RepeatId(protocol, number + 1) for number in range(self.repeats) for protocol in self.protocols)
 
     @property
@@ -108,16 +112,16 @@ class Plan(Strict):
         return self.model_copy(update={"notes": "; ".join(filter(None, (self.notes, note)))})
 
     def scene(self, repeat: RepeatId, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})) -> Scene:
-        """Return the inputs of the command lines of one attempt; `variants` are from the preflight checks."""
+        """Return the inputs for the command lines of one attempt. `variants` are from the preflight checks."""
         scene = self.procedure.scene(repeat.protocol, self.cast, folder, variants)
         return replace(scene, placement=self.placement, repeat=repeat.number)
 
     def scenes(self, variants: Mapping[Role, Variants] = MappingProxyType({})) -> tuple[Scene, ...]:
-        """Return a scene per protocol, for values that are the same in all of its repeats."""
+        """Return a scene for each protocol, for values that are equal in all of its repeats."""
         return tuple(self.procedure.scene(protocol, self.cast, "check", variants) for protocol in self.protocols)
 
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        """Yield every job of one attempt in the order of their starts."""
+        """Yield all jobs of one attempt in the order in which they start."""
         for entry in self.procedure.steps:
             with step_errors.before_trial(f"the commands of the step {entry.kind} cannot be derived"):
                 planned_jobs = tuple(entry.step.jobs(scene))
@@ -130,8 +134,8 @@ class Plan(Strict):
 
     def program_copies(self) -> tuple[PutProgram, ...]:
         """Return the programs of the lab that are copied to robots in every attempt."""
-        planned = (job for scene in self.scenes() for job in self.jobs(scene))
-        return tuple(dict.fromkeys(job.put for job in planned if job.put is not None))
+        planned_jobs = (job for scene in self.scenes() for job in self.jobs(scene))
+        return tuple(dict.fromkeys(job.put for job in planned_jobs if job.put is not None))
 
     def refusals(self, variants: Mapping[Role, Variants]) -> tuple[Refusal, ...]:
         """Return the parts of the procedure that cannot work with the robots' tools, without duplicates."""
@@ -154,13 +158,13 @@ class Plan(Strict):
         return self.procedure.sections.values()
 
     def dry_run_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return the actions of the testbed in one repeat in addition to the commands, one sentence each."""
+        """Return sentences about the actions of one repeat that are not commands on robots."""
         section_notes = (line for section in self._sections() for line in section.dry_run_notes(self))
         steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, DescribesActions))
         return (*section_notes, *(line for step in steps for line in step.dry_run_notes(scene)))
 
     def abort_notes(self, scene: Scene) -> tuple[str, ...]:
-        """Return descriptions of what each robot that moves without a person does if a repeat is aborted."""
+        """Return a sentence about the reaction of each robot that moves without a person if a repeat is aborted."""
         section_notes = (line for section in self._sections() for line in section.abort_notes(self))
         steps = (placed.step for placed in self.procedure.walk() if isinstance(placed.step, Moves))
         return (*section_notes, *(line for step in steps for line in step.abort_notes(scene)))

@@ -1,4 +1,4 @@
-"""Evidence that a repeat leaves according to the plan of its trial: transfers, pings, captures and recordings."""
+"""Evidence of a repeat according to the plan of its trial: transfers, pings, captures and recordings."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ from fieldkit.trial.plan import Plan
 
 
 def transfers(plan: Plan, protocol: Protocol) -> tuple[Transfer, ...]:
-    """Return the packet filter of each transfer, in the order of their starts."""
+    """Return the transfers of a repeat, in the order in which they start."""
     scene = plan.procedure.scene(protocol, plan.cast, "")
     specs = (
         placed.step.transfer(scene, placed.within)
@@ -22,7 +22,7 @@ def transfers(plan: Plan, protocol: Protocol) -> tuple[Transfer, ...]:
 
 
 def ping_sources(plan: Plan) -> tuple[PingSource, ...]:
-    """Return all round-trip time measurements of a repeat, in the order of their starts."""
+    """Return the measurements of round-trip times of a repeat, in the order in which they start."""
     specs = (placed.step.ping_source() for placed in plan.procedure.walk() if isinstance(placed.step, Pings))
     return tuple(source for source in specs if source is not None)
 
@@ -35,6 +35,6 @@ def captures(plan: Plan) -> Mapping[str, Role]:
 
 
 def bags(plan: Plan) -> Mapping[Role, str]:
-    """Return the first file that is recorded on each robot, by name below an attempt's folder."""
+    """Return the name of the first file that is recorded on each robot, relative to an attempt's folder."""
     scene = plan.procedure.scene(plan.protocols[0], plan.cast, "")
-    return {role: recordings[0].name for role, recordings in scene.recorded.items()}
+    return {role: recordings[0].name for role, recordings in scene.recordings.items()}

@@ -54,11 +54,11 @@ Repeats = Annotated[Int, Field(gt=0, le=MAX_REPEATS)]
 
 
 class Place(PathLeg):
-    """Place of a robot in a role that the procedure defines; directions are given as in a leg of a path.
+    """Place of a robot in a role that the procedure defines. Directions are given as in a leg of a path.
 
     Attributes:
-        near: The robot under test that the position is relative to: `sender`, `receiver` or `relay`. At least one of
-            the four directions is required.
+        near: Role of the robot that the place is relative to: `sender`, `receiver` or `relay`. At least one of the
+            four directions is required.
     """
 
     near: Role
@@ -73,25 +73,25 @@ class Place(PathLeg):
 class Procedure(catalog.Named, Sectioned):
     """The steps of a repeat, by role: one YAML file in `procedures/`.
 
-    Roles are `sender`, `receiver`, `relay`, and others that the procedure places. How to write one: [add a
-    procedure](add-a-procedure.md). Steps of a kind are distinguished by their `name`: without one, a procedure has at
-    most one `transfer` and one `ping`, one `record`, one `capture` and one `move` per robot, and one `fault` of a
-    kind. Files must have different names; simultaneous steps need different ports or different listening robots;
-    steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when
-    it is loaded, with its line.
+    Roles are `sender`, `receiver`, `relay`, and further roles for which the procedure gives places. See [add a
+    procedure](add-a-procedure.md). Steps of a kind are distinguished by their `name`. Without names, a procedure can
+    have at most one `transfer`, one `ping`, one `record`, `capture` and `move` per robot, and one `fault` of each
+    kind. Files must have different names. Simultaneous steps must have different ports or different listening robots.
+    Steps in one capture must differ in port, sender or receiver. A procedure that cannot be measured is rejected when
+    it is loaded; the message contains the line.
 
-    In `master` the distance is between each station and the relay, with the stations on opposite sides; in
-    `masterless` it is between sender and receiver. Protocols alternate from repeat to repeat, so that slow changes of
-    the channel affect both equally.
+    In `master`, the distance is between each station and the relay, and the stations are on opposite sides of it. In
+    `masterless`, it is between sender and receiver. Protocols alternate from repeat to repeat, so that slow changes
+    of the channel affect both equally.
 
     Attributes:
-        scenario: `los`, or `nlos`: the sender is behind a wall.
+        scenario: `los` (line of sight), or `nlos`: the sender is behind a wall.
         topology: `master` or `masterless`; the command line may override it.
         protocols: List of `tcp`, `udp`; the command line may override it.
         repeats: Repeats per protocol; the command line may override it.
-        attempts: Maximum number of attempts at a repeat whose evidence is incomplete.
-        needs_ros_master: Whether it needs one ROS master for all robots; a site file without `ros_master` is then
-            rejected.
+        attempts: Maximum number of attempts at a repeat; another attempt is made if the evidence is incomplete.
+        needs_ros_master: True if the procedure needs one ROS master for all robots. A site file without `ros_master`
+            is then rejected.
         places: Positions of robots in additional roles, by role.
         expect: List of [expectations](values.md#expectations).
         steps: The steps of a repeat, in order; each entry has one key, the kind of step.
@@ -114,7 +114,7 @@ class Procedure(catalog.Named, Sectioned):
     @override
     def expanded(cls, document: schema.Document) -> schema.Document:
         """Return the document with every `for:` expanded."""
-        # Few procedures have loops. A document with few values is also below the maximum number of steps.
+        # Most procedures have no loops, and a document with few lines cannot exceed the maximum number of steps.
         if len(document.lines) <= MAX_STEPS and not document.has_key(LOOP):
             return document
         from fieldkit.config import loops  # noqa: PLC0415
@@ -123,13 +123,13 @@ class Procedure(catalog.Named, Sectioned):
 
     @schema.model_validator(mode="after")
     def _has_a_place_for_each_role(self) -> "Procedure":
-        """Reject a role without a place, which is most likely misspelled."""
+        """Reject a role without a place: its name is probably misspelled."""
         known_roles = (*FIXED_ROLES, *self.places)
         for placed in self.walk():
             with step_errors.before_trial(f"{placed.label} cannot be planned"):
                 roles = placed.step.roles()
             for role in sort_roles(roles - set(known_roles)):
-                remedy = f"give its place: places: {{{role}: {{near: sender, left: 5m}}}}"
+                remedy = f"add a place for it: places: {{{role}: {{near: sender, left: 5m}}}}"
                 raise schema.validation_error(
                     f"there is no role {role}; {did_you_mean(role, known_roles, remedy)}", *placed.at
                 )
@@ -138,7 +138,9 @@ class Procedure(catalog.Named, Sectioned):
                 raise schema.validation_error(f"no step has the role {role}", key, role)
         for role in self.places:
             if role in FIXED_ROLES:
-                raise schema.validation_error(f"the place of the {role} follows from the distance", "places", role)
+                raise schema.validation_error(
+                    f"the place of the {role} is determined by the distance", "places", role
+                )
             if role not in self.roles():
                 raise schema.validation_error(f"no step has the role {role}", "places", role)
         return self
@@ -151,14 +153,18 @@ class Procedure(catalog.Named, Sectioned):
             for role in self.roles()
             for name in (host.before_file, host.after_file, link_samples.robot_file)
         )
-        used_resources, files, earlier = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
-        filled = set[str]()
+        used_resources, files, earlier_steps = set[tuple[str, str]](), set(robot_files), list[PlacedStep]()
+        column_names = set[str]()
         for placed in self.walk():
             step = placed.step
-            before = [other.step for other in earlier if not placed.runs_at_same_time_as(other)]
+            completed = [other.step for other in earlier_steps if not placed.runs_at_same_time_as(other)]
             with step_errors.before_trial(f"{placed.label} cannot be planned"):
-                resources, file_names, step_columns = step.exclusive_resources(), step.files(), columns.of_step(step)
-            if isinstance(step, ChecksPlacement) and (reason := step.placement_error(before, placed.within)):
+                resources, file_names, step_columns = (
+                    step.exclusive_resources(),
+                    step.files(),
+                    columns.columns_of_step(step),
+                )
+            if isinstance(step, ChecksPlacement) and (reason := step.placement_error(completed, placed.within)):
                 raise schema.validation_error(reason, *placed.at)
             for resource in resources:
                 if (step.prefix, resource) in used_resources:
@@ -168,13 +174,13 @@ class Procedure(catalog.Named, Sectioned):
                 if reason := _file_conflict(step, name, files):
                     raise schema.validation_error(reason, *placed.at)
                 files.add(name)
-            if reason := next(filter(None, map(placed.port_conflict, earlier)), None):
+            if reason := next(filter(None, map(placed.port_conflict, earlier_steps)), None):
                 raise schema.validation_error(reason, *placed.at, "port")
             for column in step_columns:
-                if reason := columns.column_conflict(column, filled):
+                if reason := columns.column_conflict(column, column_names):
                     raise schema.validation_error(reason, *placed.at)
-                filled.add(column.name)
-            earlier.append(placed)
+                column_names.add(column.name)
+            earlier_steps.append(placed)
         return self
 
     @schema.model_validator(mode="after")
@@ -188,19 +194,19 @@ class Procedure(catalog.Named, Sectioned):
 
     @property
     def sections(self) -> Mapping[str, ProcedureSection]:
-        """Its sections of installed packages, by key."""
+        """The sections that installed packages add, by key."""
         extra = self.model_extra or {}
         return {key: section for key, section in extra.items() if isinstance(section, ProcedureSection)}
 
     @property
     def expectations(self) -> "tuple[Expectation, ...]":
-        """The expectations of its figures."""
+        """The expectations of the procedure."""
         return tuple(map(self._expectation, range(len(self.expect))))
 
     @property
     def figures(self) -> tuple[Quantity, ...]:
-        """The figures that can be aggregated from the columns of its steps."""
-        return quantities(columns.filled_by(placed.step for placed in self.walk()))
+        """The figures that can be aggregated from the columns of the steps."""
+        return quantities(columns.filled_columns(placed.step for placed in self.walk()))
 
     def _expectation(self, index: int) -> "Expectation":
         from fieldkit.analysis import expectations  # noqa: PLC0415 (few procedures have expectations)
@@ -208,7 +214,7 @@ class Procedure(catalog.Named, Sectioned):
         return expectations.parse(self.expect[index], self.figures)
 
     def walk(self) -> Iterator["PlacedStep"]:
-        """Yield every step in the order of their starts, including nested ones."""
+        """Yield all steps in the order in which they start, including nested steps."""
         return _walk(self.steps, ("steps",), ())
 
     def _steps(self) -> Iterator[Step]:
@@ -217,7 +223,7 @@ class Procedure(catalog.Named, Sectioned):
     def scene(
         self, protocol: Protocol, cast: Cast, folder: str, variants: Mapping[Role, Variants] = MappingProxyType({})
     ) -> Scene:
-        """Return the inputs of the command lines and measures of one attempt.
+        """Return the inputs for the command lines and measurements of one attempt.
 
         Args:
             protocol: The transport protocol under test.
@@ -225,11 +231,11 @@ class Procedure(catalog.Named, Sectioned):
             folder: The attempt's folder on every robot.
             variants: The tools of each robot, as determined by the preflight checks.
         """
-        recorded: dict[Role, tuple[RecordedFile, ...]] = {}
+        recordings: dict[Role, tuple[RecordedFile, ...]] = {}
         for step in self._steps():
-            for file in step.recorded(cast) if isinstance(step, Records) else ():
-                recorded[file.role] = (*recorded.get(file.role, ()), file)
-        scene = Scene(protocol, cast, folder, recorded, variants, sections=self.sections)
+            for file in step.recordings(cast) if isinstance(step, Records) else ():
+                recordings[file.role] = (*recordings.get(file.role, ()), file)
+        scene = Scene(protocol, cast, folder, recordings, variants, sections=self.sections)
         senders = (step for step in self._steps() if isinstance(step, SendsTraffic))
         return replace(scene, flows=tuple(flow for step in senders for flow in step.flows(scene)))
 
@@ -237,13 +243,13 @@ class Procedure(catalog.Named, Sectioned):
         """Return the roles that the steps need."""
         return frozenset().union(*(entry.step.roles() for entry in self.steps))
 
-    def moved(self) -> frozenset[Role]:
-        """Return the roles whose robots are moved by steps."""
+    def moved_roles(self) -> frozenset[Role]:
+        """Return the roles of the robots that steps move."""
         return frozenset().union(*(step.moves() for step in self._steps() if isinstance(step, Moves)))
 
     @property
     def posts(self) -> tuple[Post, ...]:
-        """The places of robots in the roles that it defines."""
+        """The places of robots in roles that the procedure defines."""
         return tuple(Post(role, place.near, place.leg) for role, place in self.places.items())
 
     def expected_s(self, protocol: Protocol) -> float:
@@ -251,12 +257,12 @@ class Procedure(catalog.Named, Sectioned):
         return 0.5 + sum(entry.step.expected_s(protocol) for entry in self.steps)
 
     def with_record(self, duration_s: float) -> "Procedure":
-        """Return this procedure with every recording `duration_s` long."""
+        """Return this procedure with the duration `duration_s` for every recording."""
         steps = tuple(with_record(entry, duration_s) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
     def resolved(self, cast: Cast) -> "Procedure":
-        """Return this procedure with its steps completed by values of the robots, for example a maximum speed."""
+        """Return this procedure with values of the robots in its steps, for example a maximum speed."""
         steps = tuple(resolved(entry, cast) for entry in self.steps)
         return self.model_copy(update={"steps": steps})
 
@@ -272,9 +278,9 @@ class PlacedStep:
 
     Attributes:
         step: The step.
-        kind: Its kind.
-        within: The steps that contain it, the outermost first.
-        at: Its location in the file.
+        kind: Kind of the step.
+        within: The steps that contain this step, the outermost first.
+        at: Location of the step in the file.
     """
 
     step: Step
@@ -284,19 +290,19 @@ class PlacedStep:
 
     @property
     def disturbed(self) -> bool:
-        """Whether it may fail because a step that contains it disturbs it."""
+        """True if the step may fail because a step that contains it, such as a fault, disturbs it."""
         return any(nest.disturbs for nest in self.within)
 
     @property
     def label(self) -> str:
-        """Description of the step: `the step transfer up`."""
+        """Description of the step, for example `the step transfer up`."""
         return " ".join(filter(None, ("the step", self.kind, self.step.prefix)))
 
     def port_conflict(self, other: "PlacedStep") -> str | None:
-        """Return the reason why an earlier step conflicts with the ports of this one, or None.
+        """Return the reason why an earlier step conflicts with the ports of this step, or None.
 
-        A port of a robot accepts one listener at a time. In one capture, packets are distinguished by the two robots
-        and the port.
+        One program at a time can listen on a port of a robot. In one capture, packets are distinguished by the two
+        robots and the port.
         """
         is_simultaneous = self.runs_at_same_time_as(other) or any(nest is other.step for nest in self.within)
         is_captured = any(nest.captures() and any(nest is around for around in other.within) for nest in self.within)
@@ -311,7 +317,7 @@ class PlacedStep:
             ):
                 conflict = f"port {listener.port} is used twice at the same time on {listener.role}"
                 return f"{conflict}; change the {listener.by} of one of them"
-            if is_captured and listener.looks_like(other_listener):
+            if is_captured and listener.is_ambiguous_with(other_listener):
                 conflict = (
                     f"port {listener.port} is used twice in one capture, from {listener.peer} to {listener.role}"
                 )
@@ -319,7 +325,7 @@ class PlacedStep:
         return None
 
     def runs_at_same_time_as(self, other: "PlacedStep") -> bool:
-        """Return True if an earlier step runs at the same time and neither contains the other."""
+        """Return True if an earlier step runs at the same time as this step, and neither contains the other."""
         paths = zip((*self.within, self.step), (*other.within, other.step), strict=False)
         fork = next((index for index, (step, other_step) in enumerate(paths) if step is not other_step), 0)
         return fork > 0 and self.within[fork - 1].parallel
@@ -327,19 +333,25 @@ class PlacedStep:
 
 def _file_conflict(step: Step, name: str, files: Set[str]) -> str | None:
     """Return the reason why a step cannot have a file of this name, or None if it can."""
-    written = step.laptop_files() if isinstance(step, WritesOnLaptop) else ()
-    if laptop_files.is_reserved(name) and name not in written:
-        return f"only the laptop writes a file {name}; give it another name"
-    return f"there is already a file {name}; give it, or its step, another name" if name in files else None
+    laptop_names = step.laptop_files() if isinstance(step, WritesOnLaptop) else ()
+    if laptop_files.is_reserved(name) and name not in laptop_names:
+        return f"only the laptop writes a file {name}; choose another file name"
+    return (
+        f"another step has a file {name}; choose another name of the file or of the step" if name in files else None
+    )
 
 
 def _duplicate_resource_message(step: Step, resource: str) -> str:
-    """Return the message for two steps that use the same exclusive resource under one name."""
+    """Return the message for two steps with the same name that use the same exclusive resource."""
     if step.prefix:
         return (
-            f"{resource} named {step.prefix} is defined twice; rename one, inside for: with its variable in the name"
+            f"{resource} named {step.prefix} is defined twice; rename one of them. In a loop, add the variable of "
+            "for: to the name"
         )
-    return f"{resource} is defined twice; give each a name:, inside for: with its variable, name: p{{bytes}}"
+    return (
+        f"{resource} is defined twice; give each of them a name:. In a loop, add the variable of for: to the name, "
+        "for example name: p{bytes}"
+    )
 
 
 def _walk(entries: tuple[StepEntry, ...], at: schema.Location, within: tuple[Nest, ...]) -> Iterator[PlacedStep]:
@@ -354,7 +366,7 @@ def load_procedure(name: str) -> Procedure:
     """Return the procedure `name`; the lab's folder is searched first.
 
     Raises:
-        ConfigurationError: No such procedure (the nearest name is given), or an error in its file.
+        ConfigurationError: There is no such procedure, or its file has an error.
     """
     return catalog.load("procedures", name, Procedure)
 

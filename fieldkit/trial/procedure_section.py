@@ -1,4 +1,4 @@
-"""Sections of procedures: keys that installed packages add, and what they contribute to a trial."""
+"""Sections of procedures: keys that installed packages add, and the methods with which they take part in a trial."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -13,8 +13,8 @@ from fieldkit.steps.scene import Refusal, Scene, Shells
 class ProcedureOutline(Protocol):
     """The part of a procedure that sections use."""
 
-    def moved(self) -> frozenset[Role]:
-        """Return the roles whose robots are moved by steps."""
+    def moved_roles(self) -> frozenset[Role]:
+        """Return the roles of the robots that steps move."""
 
     def expected_s(self, protocol: model.Protocol) -> float:
         """Return the approximate duration of an attempt on a good link, in seconds."""
@@ -33,24 +33,24 @@ class TrialOutline(Protocol):
 
 
 class ProcedureSection:
-    """Base of the models of sections of a procedure; every method has a default."""
+    """Base class of the models of procedure sections. Every method has a default."""
 
     def roles(self) -> frozenset[Role]:
-        """Return the roles that the section names; steps must use these roles, too."""
+        """Return the roles that the section names. Steps must use these roles as well."""
         return frozenset()
 
-    def refusals(self, plan: TrialOutline) -> Iterator[Refusal]:  # noqa: ARG002 (some work with every robot)
-        """Yield the reasons why it cannot work with the robots of a trial."""
+    def refusals(self, plan: TrialOutline) -> Iterator[Refusal]:  # noqa: ARG002 (some sections support all robots)
+        """Yield the reasons why the section cannot be used with the robots of a trial."""
         return iter(())
 
     def dry_run_notes(self, plan: TrialOutline) -> Iterator[str]:  # noqa: ARG002 (some have no such actions)
-        """Yield a line for each action that is not a command on a robot; `--dry-run` prints them."""
+        """Yield a line for each action that is not a command on a robot. `--dry-run` prints these lines."""
         return iter(())
 
     def abort_notes(self, plan: TrialOutline) -> Iterator[str]:  # noqa: ARG002 (most move no robot)
-        """Yield a sentence for each robot on what it does if an attempt is stopped immediately.
+        """Yield a sentence about the reaction of each moving robot if an attempt is stopped immediately.
 
-        If there is such a robot, a request to stop takes effect immediately.
+        If there are such sentences, a request to stop takes effect immediately.
         """
         return iter(())
 

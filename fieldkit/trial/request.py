@@ -1,4 +1,4 @@
-"""The operator's request for a trial, and the plan that is made from it."""
+"""The operator's request for a trial, and the plan that follows from it."""
 
 import platform
 from collections.abc import Iterator, Mapping
@@ -15,7 +15,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import FIXED_ROLES, Distance, Protocol, Role, Topology
 from fieldkit.measure.evidence import link
 from fieldkit.trial import step_packages
-from fieldkit.trial.columns import OTHERS, of_robots, of_steps
+from fieldkit.trial.columns import OTHERS, additional_columns, robot_columns
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.hashes import code_hash, data_hash
 from fieldkit.trial.plan import Plan
@@ -24,13 +24,13 @@ from fieldkit.trial.procedure import Procedure
 
 @dataclass(frozen=True)
 class TrialRequest:
-    """Request of the operator; None means the procedure's value.
+    """Request of the operator. If a value is None, the value of the procedure is used.
 
     Attributes:
         procedure: The procedure.
         distance: The distance.
         topology: Topology.
-        protocols: Protocols; empty for the protocols of the procedure.
+        protocols: Protocols; if empty, the protocols of the procedure are used.
         repeats: Repeats per protocol.
         record_s: Duration of every recording, in seconds.
         seed: Seed.
@@ -47,7 +47,7 @@ class TrialRequest:
     notes: str = ""
 
     @property
-    def chosen_topology(self) -> Topology:
+    def effective_topology(self) -> Topology:
         """The requested topology, or the topology of the procedure."""
         return self.topology or self.procedure.topology
 
@@ -67,17 +67,17 @@ def make_plan(
     Args:
         request: The request.
         backend: Name of the backend.
-        cast: The robot in each role; robots in roles that the procedure does not use are left out.
-        now: Start of the trial; it becomes part of its name.
-        session: The run of fieldkit that the trial belongs to; None if it contains only this trial.
-        lab_bytes: Maximum number of bytes that the lab itself adds to an attempt (`Backend.lab_bytes`).
+        cast: The robot in each role. Robots in roles that the procedure does not use are not part of the plan.
+        now: Start of the trial, which is part of its name.
+        session: The run of fieldkit that the trial belongs to; None if the run contains only this trial.
+        lab_bytes: Maximum number of bytes that the lab adds to an attempt (`Backend.lab_bytes`).
         simulators: Simulators of the backend (`simulators_of`).
 
     Raises:
         ConfigurationError: No robot has a role that the procedure or the topology needs, or the procedure needs a
             common ROS master and each robot has its own.
     """
-    procedure, topology = request.procedure, request.chosen_topology
+    procedure, topology = request.procedure, request.effective_topology
     _require_roles(procedure, topology, cast)
     _require_ros_master(procedure, topology, cast)
     if request.record_s is not None:
@@ -85,7 +85,7 @@ def make_plan(
     procedure = procedure.resolved(cast)
     stamp = now.astimezone(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
     trial = f"{stamp}_{procedure.name}_{request.distance.label}_{topology}"
-    others = (OTHERS,) if procedure.places else ()
+    others_column = (OTHERS,) if procedure.places else ()
     plan = Plan(
         schema_version=SCHEMA_VERSION,
         trial=trial,
@@ -115,17 +115,17 @@ def make_plan(
         procedure=procedure,
         lab_bytes=lab_bytes,
         simulators=dict(simulators),
-        step_packages=step_packages.of_kinds(placed.kind for placed in procedure.walk()),
+        step_packages=step_packages.packages_of_kinds(placed.kind for placed in procedure.walk()),
         columns=freeze(
             (
-                *others,
-                *of_steps(placed.step for placed in procedure.walk()),
-                *of_robots(procedure.roles()),
+                *others_column,
+                *additional_columns(placed.step for placed in procedure.walk()),
+                *robot_columns(procedure.roles()),
                 *_telemetry_columns(cast),
             )
         ),
     )
-    plan.program_copies()  # raises before robots are started if a step of another package cannot give its commands
+    plan.program_copies()  # raises now, before robots start, if the commands of another package's step are invalid
     return plan
 
 
@@ -140,11 +140,11 @@ def _telemetry_columns(cast: Cast) -> Iterator[Column]:
 
 def _robot_data(cast: Cast) -> dict[str, object]:
     """Return the data that distinguishes the robots of this trial from the robots of other trials."""
-    # Earlier versions hashed the key also for a robot without this section; equal robots must have equal hashes.
+    # Earlier versions hashed the key "mavlink" even without this section, and equal robots must have equal hashes.
     data: dict[str, object] = {
         role: {"mavlink": None, **robot.profile.model_dump(mode="json")} for role, robot in cast.items()
     }
-    # The role of the ROS master is used, because addresses differ between labs without effect on the measurement.
+    # The hash includes the role of the ROS master instead of its address, which does not affect the measurement.
     data |= {"ros_master": role for role, robot in cast.items() if robot.address == robot.ros_master}  # noqa: B035
     return data
 
@@ -159,8 +159,8 @@ def _require_ros_master(procedure: Procedure, topology: Topology, cast: Cast) ->
 
 def _require_roles(procedure: Procedure, topology: Topology, cast: Cast) -> None:
     """Raise an error if the cast lacks a role of the procedure or of the topology."""
-    placed = {Role.SENDER, Role.RECEIVER} | ({Role.RELAY} if topology is Topology.MASTER else set())
-    if missing := (procedure.roles() | placed) - cast.keys():
+    required = {Role.SENDER, Role.RECEIVER} | ({Role.RELAY} if topology is Topology.MASTER else set())
+    if missing := (procedure.roles() | required) - cast.keys():
         raise ConfigurationError(
             f"no robot has the role {', '.join(sorted(missing))} in topology {topology}",
             remedy=f"name a robot under roles.{topology} in the site file",

@@ -1,4 +1,4 @@
-"""Rows of trial.csv and summary.csv; they are the same for a repeat that just ended and for one read from disk."""
+"""Rows of trial.csv and summary.csv. The rows of a repeat are the same during the trial and when it is read later."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import filterfalse
@@ -35,7 +35,7 @@ LOSSES: Final = frozenset(
         "mavlink_loss",
     )
 )
-"""Columns that are 1 if nothing arrived; some are missing for a transfer without any packet."""
+"""Columns that are 1 if nothing arrived. Some are missing if a transfer sent no packet."""
 
 
 def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
@@ -68,15 +68,15 @@ def build(plan: Plan, attempt: Attempt, measured: Measured) -> Row:
     return {name: value for name, value in identity.items() if value is not None} | dict(measured.values)
 
 
-def measured(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
-    """Return the row of an attempt, measured from its evidence; values that the evidence lacks are missing."""
+def measure_row(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> Row:
+    """Return the row of an attempt, measured from its evidence. Values without evidence are missing."""
     return build(plan, attempt, gates.judge(plan, attempt.repeat, evidence).measured)
 
 
 def describe(plan: Plan, row: Row) -> str:
-    """Return the most important numbers of a row for display, losses first: `IP packet loss 3.2 %, RTT 12.1 ms`.
+    """Return the most important numbers of a row for display: `IP packet loss 3.2 %, RTT 12.1 ms`.
 
-    The steps that a fault disturbs come before the duration of the fault itself.
+    Losses are first. The numbers of steps inside a fault precede the numbers of the fault.
     """
     steps = sorted(
         (placed.step for placed in plan.procedure.walk()), key=lambda step: isinstance(step, Nest) and step.disturbs
@@ -105,18 +105,18 @@ def _is_loss(part: str) -> bool:
 
 
 def _lost_all(row: Row) -> bool:
-    """Return True if everything that a repeat sent was lost, as far as its steps count losses."""
+    """Return True if the repeat has columns of losses and all of them are 1."""
     losses = [value for name, value in row.items() if columns.plain_name(name) in LOSSES]
     return bool(losses) and all(isinstance(loss, float | int) and loss >= 1 for loss in losses)
 
 
 def to_csv(rows: Iterable[Row], table: Sequence[Column]) -> str:
     """Return the text of a trial.csv with these rows and columns; `table` is `Plan.table`."""
-    return head(table) + "".join(line(row, table) for row in rows)
+    return header(table) + "".join(line(row, table) for row in rows)
 
 
-def head(table: Sequence[Column]) -> str:
-    """Return the first line of a trial.csv."""
+def header(table: Sequence[Column]) -> str:
+    """Return the header line of a trial.csv."""
     return columns.csv_line(column.name for column in table)
 
 

@@ -27,9 +27,9 @@ class StepPackage(Strict):
     code_sha256: str = ""
 
 
-def of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
+def packages_of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
     """Return the package of each kind of step that does not ship with fieldkit."""
-    others = set(names) - kinds.shipped()
+    others = set(names) - kinds.shipped_names()
     return {
         point.name: StepPackage(
             package=point.dist.name, version=point.dist.version, code_sha256=_code_hash(point.module)

@@ -15,11 +15,11 @@ from sim_backends.cosim.federates import (
     next_send_ns,
     seconds_text,
 )
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.world.motion import Lifetime, State
 
 
-class Sent(NamedTuple):
+class SentDatagram(NamedTuple):
     """A datagram that a program sent.
 
     Attributes:
@@ -71,13 +71,13 @@ class _PresentStates(Mapping[str, State]):
 
 
 _MAX_WAKES_AT_ONE_TIME: Final = 1000
-_ALWAYS: Final[Mapping[str, Lifetime]] = MappingProxyType({})
+_NO_LIFETIMES: Final[Mapping[str, Lifetime]] = MappingProxyType({})
 _CHANGE: Final = ""
 """Name of the queue entry for the next beginning or end of a lifetime; it sorts before all names of agents."""
 
 
 class Agents:
-    """Advances bodies and programs together. In any window, programs read the current state of their bodies.
+    """Advances bodies and programs together, so that programs always read the current state of their bodies.
 
     An agent is absent outside of its lifetime. If the attribute `agents_disappear` of the physics is True, an agent
     is also absent while the physics returns no state for it. The program of an absent agent does not wake.
@@ -85,8 +85,8 @@ class Agents:
     Args:
         physics: Moves the bodies.
         programs: The program of each agent; an agent may have none.
-        lifetimes: The agents that do not exist during the whole run.
-        starts: The states of agents that are absent at time 0; None if there are none.
+        lifetimes: The lifetimes of agents that do not exist during the whole run.
+        starts: The start states of agents that are absent at time 0; None if there are no such agents.
 
     Raises:
         FederateError: A program failed.
@@ -102,7 +102,7 @@ class Agents:
         self,
         physics: PhysicsFederate,
         programs: Mapping[str, Program],
-        lifetimes: Mapping[str, Lifetime] = _ALWAYS,
+        lifetimes: Mapping[str, Lifetime] = _NO_LIFETIMES,
         starts: Mapping[str, State] | None = None,
     ) -> None:
         self.physics = physics
@@ -115,13 +115,13 @@ class Agents:
         }
         self.has_changed = bool(self._lifetimes)
         self._new_agents: frozenset[str] = frozenset()
-        self._lost: dict[str, State] = {}
+        self._last_states: dict[str, State] = {}
         self._names = frozenset(programs) - self.absent.keys()
         self._states: Mapping[str, State] = {}
-        self._hidden = frozenset(self.absent)
+        self._names_outside_lifetime = frozenset(self.absent)
         self._changes_ns = sorted({at_ns for lifetime in lifetimes.values() for at_ns in lifetime.changes_ns})[::-1]
-        self._at_ns = 0
-        self._received: dict[str, list[Received]] = {}
+        self._states_ns = 0
+        self._received: dict[str, list[ReceivedDatagram]] = {}
         self._commands: dict[str, Any] = {}
         self._wake_times_ns: dict[str, int] = {}
         self._queue: list[tuple[int, str]] = []
@@ -137,19 +137,19 @@ class Agents:
                 present.
         """
         if self._changes_ns:
-            self._read_changes(now_ns)
+            self._read_states_at_changes(now_ns)
         commands = self._commands
         if commands:
             self._commands = {}
         try:
             states = self.physics.advance(now_ns, commands)
         except Exception as error:
-            request = f"advance from {seconds_text(self._at_ns)} to {seconds_text(now_ns)}"
+            request = f"advance from {seconds_text(self._states_ns)} to {seconds_text(now_ns)}"
             raise federate_error(error, "physics", request) from error
-        self._at_ns = now_ns
+        self._states_ns = now_ns
         try:
             if self._lifetimes:
-                states = self._without_hidden(states, now_ns)
+                states = self._states_within_lifetime(states, now_ns)
             if states.keys() != self._names:
                 self._update_names(states, now_ns)
         except AttributeError:
@@ -160,80 +160,89 @@ class Agents:
         self._states = states
         return states
 
-    def _read_changes(self, now_ns: int) -> None:
-        """Read the states before and at each change of a lifetime; the last states then do not depend on windows."""
+    def _read_states_at_changes(self, now_ns: int) -> None:
+        """Read the states just before and at each beginning or end of a lifetime.
+
+        The last state of an agent then does not depend on the lengths of windows.
+        """
         while (change_ns := self.next_change_ns()) is not None and change_ns <= now_ns:
-            if self._at_ns < change_ns - 1:
+            if self._states_ns < change_ns - 1:
                 self.states(change_ns - 1)
             if change_ns == now_ns:
                 return  # the caller reads the states at this time
             self.states(change_ns)
 
-    def _without_hidden(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
-        """Return the states of the agents that are within their lifetimes; a physics may move the others, too."""
+    def _states_within_lifetime(self, states: Mapping[str, State], now_ns: int) -> Mapping[str, State]:
+        """Return the states of the agents that are within their lifetimes; the physics may also move other agents."""
         if self._changes_ns and self._changes_ns[-1] <= now_ns:
             while self._changes_ns and self._changes_ns[-1] <= now_ns:
                 self._changes_ns.pop()
             self._schedule_change()
-            self._hidden = frozenset(
+            self._names_outside_lifetime = frozenset(
                 name for name, lifetime in self._lifetimes.items() if not lifetime.contains(now_ns)
             )
-        if self._hidden.isdisjoint(states.keys()):
+        if self._names_outside_lifetime.isdisjoint(states.keys()):
             return states
-        return _PresentStates(states, dict.fromkeys(name for name in states if name not in self._hidden))
+        return _PresentStates(
+            states, dict.fromkeys(name for name in states if name not in self._names_outside_lifetime)
+        )
 
     def _update_names(self, states: Mapping[str, State], now_ns: int) -> None:
         """Update the names of the present agents.
 
         Raises:
-            FederateError: An agent has disappeared within its lifetime, and the physics must not remove agents.
+            FederateError: An agent has disappeared within its lifetime, but this physics may not remove agents.
         """
-        lost = self._names - states.keys()
-        missing = lost - self._hidden
-        if missing and not (self._states and getattr(self.physics, "agents_disappear", False)):
-            names = ", ".join(sorted(missing))
+        lost_names = self._names - states.keys()
+        missing_names = lost_names - self._names_outside_lifetime
+        if missing_names and not (self._states and getattr(self.physics, "agents_disappear", False)):
+            names = ", ".join(sorted(missing_names))
             raise FederateError(f"physics, requested to advance to {seconds_text(now_ns)}, has no state of {names}")
-        for name in sorted(lost):
+        for name in sorted(lost_names):
             state = self._states[name]
             lifetime = self._lifetimes.get(name)
             ended_ns = None if lifetime is None or lifetime.contains(now_ns) else lifetime.disappears_ns
             self.absent[name] = AgentAbsence(now_ns if ended_ns is None else ended_ns, State(state.position_m))
-            self._lost[name] = state
+            self._last_states[name] = state
             self._received.pop(name, None)
             self._commands.pop(name, None)
             self._wake_times_ns.pop(name, None)
-        new = states.keys() - self._names
-        for name in new:
+        new_names = states.keys() - self._names
+        for name in new_names:
             self.absent.pop(name, None)
         if self._states:  # the first states include the agents without a program
-            self._new_agents |= new
-            self.has_changed |= bool(lost or new)
+            self._new_agents |= new_names
+            self.has_changed |= bool(lost_names or new_names)
         self._names = frozenset(states)
-        self._schedule((name for name in sorted(new) if name in self.programs), now_ns)
+        self._schedule((name for name in sorted(new_names) if name in self.programs), now_ns)
 
     def with_changes(self, begin: Mapping[str, State], *, end: Mapping[str, State]) -> Mapping[str, State]:
-        """Return the states that the network assumes in a window, for all agents that were present in it.
+        """Return the states that the network uses in a window, for all agents that were present in the window.
 
         An agent that appeared in the window has its state at the end of the window. An agent that disappeared has its
         last state.
 
         Args:
-            begin: States for the window, at its beginning or end.
-            end: States at its end.
+            begin: The states that the sync policy selects for the window: those at its beginning or at its end.
+            end: The states at the end of the window.
         """
-        if not (self._new_agents or self._lost):
+        if not (self._new_agents or self._last_states):
             return begin
         new_agents, self._new_agents = self._new_agents, frozenset()
-        lost, self._lost = self._lost, {}
-        added = {name: end.get(name) or lost[name] for name in sorted(new_agents | lost.keys()) if name not in begin}
-        return {**added, **begin} if added else begin
+        last_states, self._last_states = self._last_states, {}
+        added_states = {
+            name: end.get(name) or last_states[name]
+            for name in sorted(new_agents | last_states.keys())
+            if name not in begin
+        }
+        return {**added_states, **begin} if added_states else begin
 
     def next_wake_ns(self) -> int | None:
         """Return the next time at which a program's timer wakes it, or None if no timer is set."""
         return self._next_ns
 
     def next_send_ns(self) -> int | None:
-        """Return a time before which no program sends because of a timer, or None if no timer causes sending.
+        """Return a lower bound of the next time at which a timer causes a program to send; None without such a time.
 
         Raises:
             FederateError: A program failed, or did not answer in time.
@@ -245,14 +254,14 @@ class Agents:
             try:
                 at_ns = next_send_ns(program)
             except Exception as error:
-                request = f"return its next send time after {seconds_text(self._at_ns)}"
+                request = f"return its next send time after {seconds_text(self._states_ns)}"
                 raise federate_error(error, f"the program of {name}", request) from error
             if at_ns is not None and (earliest_ns is None or at_ns < earliest_ns):
                 earliest_ns = at_ns
         return earliest_ns
 
     def _schedule(self, names: Iterable[str], earliest_ns: int | None = None) -> None:
-        """Read the next wake times of programs, and update the queue; they change only when a program wakes.
+        """Read the next wake times of programs, and update the queue. The time of a program changes when it wakes.
 
         Args:
             names: The agents of the programs.
@@ -263,7 +272,7 @@ class Agents:
             try:
                 wake_ns = self.programs[name].next_wake_ns()
             except Exception as error:
-                request = f"return its next wake time after {seconds_text(self._at_ns)}"
+                request = f"return its next wake time after {seconds_text(self._states_ns)}"
                 raise federate_error(error, f"the program of {name}", request) from error
             if wake_ns is None:
                 self._wake_times_ns.pop(name, None)
@@ -276,7 +285,7 @@ class Agents:
         self._update_next()
 
     def _schedule_change(self) -> None:
-        """Add the next time at which a lifetime begins or ends to the queue, so that states are read then."""
+        """Add the next beginning or end of a lifetime to the queue, so that the states at that time are read."""
         if self._changes_ns:
             self._wake_times_ns[_CHANGE] = self._changes_ns[-1]
             heapq.heappush(self._queue, (self._changes_ns[-1], _CHANGE))
@@ -289,10 +298,10 @@ class Agents:
             heapq.heappop(queue)
         self._next_ns = queue[0][0] if queue else None
 
-    def deliver(self, receiver: str, received: Received) -> None:
+    def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
         """Store a datagram for the program of an agent; the next call of `advance` delivers it."""
         if receiver in self.programs and receiver not in self.absent:
-            self._received.setdefault(receiver, []).append(received)
+            self._received.setdefault(receiver, []).append(received_datagram)
 
     def is_absent(self, names: Iterable[str], at_ns: int) -> bool:
         """Return True if any of these agents is absent now and has been absent since `at_ns` or earlier."""
@@ -305,11 +314,11 @@ class Agents:
 
     @property
     def has_undelivered(self) -> bool:
-        """True if a stored datagram waits for the next call of `advance`."""
+        """True if there are stored datagrams that the next call of `advance` delivers."""
         return bool(self._received)
 
-    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
-        """Wake programs that received datagrams or whose timer is due up to `last_ns`; move bodies to `end_ns`.
+    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[SentDatagram], Mapping[str, State]]:
+        """Wake programs that received datagrams or whose timers fire until `last_ns`; move bodies to `end_ns`.
 
         Returns:
             The datagrams that programs sent, and the states at `end_ns` (see `states`).
@@ -318,22 +327,22 @@ class Agents:
             FederateError: Physics or a program failed or did not answer in time, or a program wakes endlessly at one
                 time.
         """
-        sent: list[Sent] = []
+        sent_datagrams: list[SentDatagram] = []
         if self._received:
-            received, self._received = self._received, {}
-            sent += self._wake(now_ns, received)
-        woke_ns, repeats = -1, 0
+            received_by_name, self._received = self._received, {}
+            sent_datagrams += self._wake(now_ns, received_by_name)
+        previous_wake_ns, repeats = -1, 0
         while (wake_ns := self._next_ns) is not None and wake_ns <= last_ns:
             names = self._pop_due(wake_ns)
-            repeats = repeats + 1 if wake_ns <= woke_ns else 0
+            repeats = repeats + 1 if wake_ns <= previous_wake_ns else 0
             if repeats > _MAX_WAKES_AT_ONE_TIME:
                 raise FederateError(
                     f"the program of {' and '.join(names)} woke {repeats} times at {seconds_text(wake_ns)}: its "
                     "next wake time does not advance"
                 )
-            woke_ns = wake_ns
-            sent += self._wake(wake_ns, dict.fromkeys(names, ()))
-        return sent, self.states(end_ns)
+            previous_wake_ns = wake_ns
+            sent_datagrams += self._wake(wake_ns, dict.fromkeys(names, ()))
+        return sent_datagrams, self.states(end_ns)
 
     def _pop_due(self, wake_ns: int) -> list[str]:
         """Remove the agents whose programs wake at `wake_ns` from the queue, and return their names."""
@@ -345,18 +354,20 @@ class Agents:
                 names.append(name)
         return names
 
-    def _wake(self, now_ns: int, received: Mapping[str, Sequence[Received]]) -> list[Sent]:
+    def _wake(self, now_ns: int, received_by_name: Mapping[str, Sequence[ReceivedDatagram]]) -> list[SentDatagram]:
         states = self.states(now_ns)
-        if self.absent or _CHANGE in received:
-            received = {name: received[name] for name in received if name in states and name in self.programs}
-        sent: list[Sent] = []
-        for name in sorted(received):
+        if self.absent or _CHANGE in received_by_name:
+            received_by_name = {
+                name: received_by_name[name] for name in received_by_name if name in states and name in self.programs
+            }
+        sent_datagrams: list[SentDatagram] = []
+        for name in sorted(received_by_name):
             try:
-                action = self.programs[name].wake(now_ns, states[name], received[name])
+                action = self.programs[name].wake(now_ns, states[name], received_by_name[name])
             except Exception as error:
                 raise federate_error(error, f"the program of {name}", f"act at {seconds_text(now_ns)}") from error
-            sent += [Sent(now_ns, name, datagram, states) for datagram in action.datagrams]
+            sent_datagrams += [SentDatagram(now_ns, name, datagram, states) for datagram in action.datagrams]
             if action.command is not None:
                 self._commands[name] = action.command
-        self._schedule(received)
-        return sent
+        self._schedule(received_by_name)
+        return sent_datagrams

@@ -38,15 +38,15 @@ class Errors:
         delivery_error_s: Absolute difference of delivery times, over packets that arrived in both runs.
         position_error_m: Largest error, at the time when a packet was sent, of the relative position that the network
             assumed for two of the agents that transmit, forward or interfere in this run. The true positions are the
-            positions on the continuous trajectories. The mean error of a state that is held for a step of length h,
-            at speed v, is therefore v h / 2.
+            positions on the continuous trajectories. If the network uses the same state for a step of length h, its
+            mean error at speed v is therefore v h / 2.
         path_error_m: Distance of agents from their positions in the reference, over time; above 0 only if programs
             steer by received data.
         fate_disagreement: Share of packets that arrived in one run only.
         first_disagreement: The first of these packets by time of sending, or None.
-        first_disagreement_s: Time when it was sent, or nan.
-        causality_violations: Number of arrivals at a time that the receiver had already passed.
-        late_s: Time by which the receiver had passed the time of arrival, over all arrivals.
+        first_disagreement_s: Time when that packet was sent, or nan.
+        causality_violations: Number of arrivals at a time that was already in the past of the receiver.
+        late_s: For all arrivals: time from the arrival to the receiver's simulated time, if that is later; else 0.
         delay_added_s: Mean delay that the policy added, before a packet entered the network and after its delivery.
         exchanges_per_s: Windows per simulated second.
         wall_s: Wall time by part.
@@ -78,22 +78,28 @@ def errors(reference: Run, run: Run, path_errors_m: Floats | None = None) -> Err
             was absent; None if positions were not sampled.
     """
     fate_pairs = [(fate, run.fates[identity]) for identity, fate in reference.fates.items() if identity in run.fates]
-    decided = [(expected, actual) for expected, actual in fate_pairs if expected.is_decided and actual.is_decided]
-    differing = [expected.packet for expected, actual in decided if bool(expected.reason) != bool(actual.reason)]
+    decided_pairs = [
+        (reference_fate, fate) for reference_fate, fate in fate_pairs if reference_fate.is_decided and fate.is_decided
+    ]
+    differing_packets = [
+        reference_fate.packet
+        for reference_fate, fate in decided_pairs
+        if bool(reference_fate.reason) != bool(fate.reason)
+    ]
     counted_ns = [
-        (expected.counted_ns, actual.counted_ns)
-        for expected, actual in decided
-        if expected.counted_ns is not None and actual.counted_ns is not None
+        (reference_fate.counted_ns, fate.counted_ns)
+        for reference_fate, fate in decided_pairs
+        if reference_fate.counted_ns is not None and fate.counted_ns is not None
     ]
     late_ns = [fate.late_ns for fate in run.fates.values() if fate.arrived_ns is not None]
     simulated_s = run.windows_ns[-1] / 1e9 if run.windows_ns else math.nan
-    first = min(differing, key=lambda packet: packet.sent_ns, default=None)
+    first = min(differing_packets, key=lambda packet: packet.sent_ns, default=None)
     return Errors(
-        packets=len(decided),
+        packets=len(decided_pairs),
         delivery_error_s=_spread([abs(expected_ns - actual_ns) / 1e9 for expected_ns, actual_ns in counted_ns]),
         position_error_m=_spread([position_error_m(fate) for fate in run.fates.values()]),
         path_error_m=_spread([] if path_errors_m is None else path_errors_m[~np.isnan(path_errors_m)]),
-        fate_disagreement=len(differing) / len(decided) if decided else math.nan,
+        fate_disagreement=len(differing_packets) / len(decided_pairs) if decided_pairs else math.nan,
         first_disagreement=None if first is None else first.identity,
         first_disagreement_s=math.nan if first is None else first.sent_ns / 1e9,
         causality_violations=sum(time_ns > 0 for time_ns in late_ns),
@@ -158,8 +164,8 @@ def delay_added_s(run: Run) -> float:
 
 def lost_share(run: Run) -> float:
     """Return the share of lost packets among the packets whose fate is decided; nan without such packets."""
-    lost = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
-    return sum(lost) / len(lost) if lost else math.nan
+    losses = [bool(fate.reason) for fate in run.fates.values() if fate.is_decided]
+    return sum(losses) / len(losses) if losses else math.nan
 
 
 def _spread(values: Sequence[float] | Floats) -> Spread:

@@ -1,6 +1,6 @@
 """The coordinator: advances agents and network window by window, and exchanges data between them.
 
-It keeps the payloads; the network gets identities, sizes and times only. It records the fate of every packet.
+It stores the payloads; the network gets only identities, sizes and times. It records the fate of every packet.
 """
 
 import copy
@@ -10,7 +10,7 @@ from operator import index
 from typing import Final
 
 from fieldkit.core.errors import ConfigurationError, FieldkitError, describe_exception
-from sim_backends.cosim.agents import Agents, Sent
+from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.cosim.federates import (
     FederateError,
     NetworkFederate,
@@ -31,7 +31,7 @@ from sim_backends.cosim.policies.sync_policy import (
 )
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
 from sim_backends.cosim.wall_time import Progress, WallTime, rate_limited
-from sim_backends.network.packets import Arrival, Drop, Packet, Received
+from sim_backends.network.packets import Arrival, Drop, Packet, ReceivedDatagram
 from sim_backends.world.motion import DeadReckoned, State
 
 _NOTHING: Final[tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate], Sequence[Fate]]] = (), (), (), ()
@@ -55,9 +55,10 @@ class Coordinator:
         policy: The policy; it may be replaced after a window has ended.
         situation: The input of the policy for the next window.
         run: The record so far.
-        is_committing: True while a window is being hashed and passed to the observer. An interrupt must wait until
-            both are done, or the recording and the event hash differ by that window (`between_windows`).
-        is_interrupted: True if `KeyboardInterrupt` must be raised after that.
+        is_committing: True while a window is being hashed and passed to the observer. An interrupt is delayed until
+            both are done; otherwise the recording and the event hash would differ by that window
+            (`interrupt_between_windows`).
+        is_interrupted: True if `KeyboardInterrupt` must be raised as soon as `is_committing` is False.
 
     Raises:
         ConfigurationError: The physics does not move an agent that may send or receive, or the physics lacks a member
@@ -76,9 +77,9 @@ class Coordinator:
         measures_all: bool = False,
     ) -> None:
         check_physics(agents.physics)
-        if missing := missing_members(policy):
+        if missing_names := missing_members(policy):
             raise ConfigurationError(
-                f"the sync policy {type(policy).__name__} lacks {', '.join(missing)}",
+                f"the sync policy {type(policy).__name__} lacks {', '.join(missing_names)}",
                 remedy="see what a sync policy needs: fieldkit docs cosim-api",
             )
         self._agents = agents
@@ -89,14 +90,14 @@ class Coordinator:
         self.is_committing = self.is_interrupted = False
         other_agents, emitters_m = transmitters(network), fixed_emitters_m(network)
         in_pairs = {name for pair in pairs for name in pair}
-        # If there are only two agents, each packet has both as its ends.
-        measured = {*other_agents, *(in_pairs if measures_all and len(in_pairs) > 2 else ())}
+        # With only two agents, every packet is between these two.
+        measured_agents = {*other_agents, *(in_pairs if measures_all and len(in_pairs) > 2 else ())}
         self._ledger = PacketLedger(
-            self.run.fates, agents.physics.step_ns, measured, has_fixed_emitters=bool(emitters_m)
+            self.run.fates, agents.physics.step_ns, measured_agents, has_fixed_emitters=bool(emitters_m)
         )
         self._active = in_pairs | {*other_agents}
         self._pairs, self._other_agents = tuple(pairs), other_agents
-        self._deferred: Sequence[Sent] = ()
+        self._deferred: Sequence[SentDatagram] = ()
         self._empty_windows = EmptyWindows()
         self._digest = EventDigest()
         self._extrapolates = getattr(network, "extrapolates", False)
@@ -116,10 +117,11 @@ class Coordinator:
             fixed_emitters_m=emitters_m,
         )
         check_states(self.situation.states)
-        unmoved = self._active - self.situation.states.keys() - agents.absent.keys()
-        if unmoved:
+        unmoved_agents = self._active - self.situation.states.keys() - agents.absent.keys()
+        if unmoved_agents:
             raise ConfigurationError(
-                f"{', '.join(sorted(unmoved))} may send, receive or interfere, but the physics does not move it"
+                f"{', '.join(sorted(unmoved_agents))} may send, receive or interfere, but the physics does not move "
+                "this agent"
             )
         self._select_present()
         if observer is not None:
@@ -134,8 +136,9 @@ class Coordinator:
             max_windows: Number of windows after which to stop in any case, or None for no limit.
 
         Raises:
-            PolicyError: The policy has no window, or time does not advance; the record so far is kept.
-            FederateError: Physics, network or a program failed, did not answer in time, or gave an impossible answer.
+            PolicyError: The policy has no window, or time does not advance; `run` has the record so far.
+            FederateError: Physics, network or a program failed, did not answer in time, or returned an impossible
+                answer.
         """
         try:
             self._run_windows(to_ns, max_windows, None if progress is None else rate_limited(progress))
@@ -178,30 +181,30 @@ class Coordinator:
             if begin_ns >= to_ns:
                 break
             if looking_ahead is not None:
-                end_ns, sent, states, assumed = self._look_ahead(looking_ahead, begin_ns, to_ns)
+                end_ns, sent_datagrams, states, assumed_states = self._look_ahead(looking_ahead, begin_ns, to_ns)
                 last_ns = end_ns - 1
             else:
                 end_ns = self._next_window(begin_ns, to_ns)
                 lap("exchange")
-                # The end of a window belongs to it if the network uses the states at its end.
+                # If the network uses the states at the end of the window, that time is part of the window.
                 last_ns = end_ns if uses_end_states else end_ns - 1
-                sent, states = agents.advance(begin_ns, last_ns, end_ns)
+                sent_datagrams, states = agents.advance(begin_ns, last_ns, end_ns)
                 lap("agents")
-                assumed = agents.with_changes(states if uses_end_states else situation.states, end=states)
-            entered, packets, dropped, ended = _NOTHING
-            if sent or self._deferred:
-                entered, packets, dropped = self._enter(sent, begin_ns, assumed)
+                assumed_states = agents.with_changes(states if uses_end_states else situation.states, end=states)
+            entered_fates, packets, dropped_fates, decided_fates = _NOTHING
+            if sent_datagrams or self._deferred:
+                entered_fates, packets, dropped_fates = self._enter(sent_datagrams, begin_ns, assumed_states)
                 lap("exchange")
             try:
-                arrivals, drops = network.advance(last_ns, packets, assumed)
+                arrivals, drops = network.advance(last_ns, packets, assumed_states)
             except Exception as error:
                 request = f"advance from {seconds_text(begin_ns)} to {seconds_text(last_ns)}"
                 raise federate_error(error, "network", request) from error
             lap("network")
             self.is_committing = is_observed
-            if entered or arrivals or drops or agents.absent:
-                ended = [*dropped, *self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)]
-                self._digest.add_window(end_ns, entered, ended)
+            if entered_fates or arrivals or drops or agents.absent:
+                decided_fates = [*dropped_fates, *self._record_outcomes(arrivals, drops, begin_ns, last_ns, end_ns)]
+                self._digest.add_window(end_ns, entered_fates, decided_fates)
             else:
                 quiet_ends_ns.append(end_ns)
             windows_ns.append(end_ns)
@@ -209,7 +212,7 @@ class Coordinator:
             self._select_present()
             if is_observed:
                 lap("exchange")
-                self._notify(begin_ns, entered, ended, assumed, report=report)
+                self._notify(begin_ns, entered_fates, decided_fates, assumed_states, report=report)
                 self._wall_time.start()
 
     def _next_window(self, begin_ns: int, to_ns: int) -> int:
@@ -240,7 +243,7 @@ class Coordinator:
 
     def _look_ahead(
         self, policy: LookingAhead, begin_ns: int, to_ns: int
-    ) -> tuple[int, list[Sent], Mapping[str, State], Mapping[str, State]]:
+    ) -> tuple[int, list[SentDatagram], Mapping[str, State], Mapping[str, State]]:
         """Advance the agents ahead of the network within a window, as far as the policy allows.
 
         Returns:
@@ -249,23 +252,23 @@ class Coordinator:
         """
         agents, situation = self._agents, self.situation
         begin = situation.states
-        # The network gets the states of other agents after one has appeared or disappeared.
+        # The window ends when an agent appears or disappears, because the set of states for the network then changes.
         to_ns = min(to_ns, agents.next_change_ns() or to_ns)
         # A network without dead reckoning assumes that agents do not move.
         moving = begin if self._extrapolates else {name: State(state.position_m) for name, state in begin.items()}
         step_ns = situation.physics_step_ns
         # The states are from the last physics step, which may be before the beginning of the window.
         since_ns = begin_ns // step_ns * step_ns
-        self._update_situation(begin_ns, begin, moving, sent=())
+        self._update_situation(begin_ns, begin, moving, sent_datagrams=())
         reckoning_step_ns = policy.reckoning_step_ns(situation)
-        assumed = DeadReckoned(moving, since_ns, reckoning_step_ns)
+        assumed_states = DeadReckoned(moving, since_ns, reckoning_step_ns)
         end_ns = self._next_window(begin_ns, to_ns)
         lap = self._wall_time.lap
         lap("exchange")
-        sent, states = agents.advance(begin_ns, end_ns - 1, end_ns)
+        sent_datagrams, states = agents.advance(begin_ns, end_ns - 1, end_ns)
         lap("agents")
         while end_ns < to_ns:
-            self._update_situation(end_ns, states, assumed.at(end_ns), sent)
+            self._update_situation(end_ns, states, assumed_states.at(end_ns), sent_datagrams)
             try:
                 later_ns = min(policy.extended_end_ns(situation), to_ns)
             except Exception as error:
@@ -274,46 +277,59 @@ class Coordinator:
             if later_ns <= end_ns:
                 break
             lap("exchange")
-            later_sent, states = agents.advance(end_ns, later_ns - 1, later_ns)
+            later_datagrams, states = agents.advance(end_ns, later_ns - 1, later_ns)
             lap("agents")
-            sent += later_sent
+            sent_datagrams += later_datagrams
             end_ns = later_ns
-        if agents.has_changed and (changed := agents.with_changes(begin, end=states)) is not begin:
-            begin = changed
+        if agents.has_changed and (states_with_changes := agents.with_changes(begin, end=states)) is not begin:
+            begin = states_with_changes
             stationary = {name: State(state.position_m) for name, state in begin.items()}
-            assumed = DeadReckoned({**stationary, **moving}, since_ns, reckoning_step_ns)
-        return end_ns, sent, states, assumed if self._extrapolates else begin
+            assumed_states = DeadReckoned({**stationary, **moving}, since_ns, reckoning_step_ns)
+        return end_ns, sent_datagrams, states, assumed_states if self._extrapolates else begin
 
     def _update_situation(
-        self, now_ns: int, states: Mapping[str, State], assumed: Mapping[str, State], sent: Sequence[Sent]
+        self,
+        now_ns: int,
+        states: Mapping[str, State],
+        assumed_states: Mapping[str, State],
+        sent_datagrams: Sequence[SentDatagram],
     ) -> None:
         """Set the situation to a time within a window that the agents have reached before the network."""
         situation = self.situation
-        situation.now_ns, situation.states, situation.assumed = now_ns, states, assumed
+        situation.now_ns, situation.states, situation.assumed_states = now_ns, states, assumed_states
         self._select_present()
-        is_pending = sent or self._deferred or self._agents.has_undelivered
+        is_pending = sent_datagrams or self._deferred or self._agents.has_undelivered
         situation.next_send_ns = now_ns if is_pending else self._agents.next_send_ns()
 
     def _enter(
-        self, sent: Sequence[Sent], begin_ns: int, assumed: Mapping[str, State]
+        self, sent_datagrams: Sequence[SentDatagram], begin_ns: int, assumed_states: Mapping[str, State]
     ) -> tuple[Sequence[Fate], Sequence[Packet], Sequence[Fate]]:
-        """Record the packets that enter in a window: sent in it or, if sends are deferred, in the previous one.
+        """Record the packets that enter the network in a window.
+
+        They were sent in the window or, if the policy defers sends, in the previous window.
 
         Returns:
-            Their fates; the packets that the network must carry; the fates of the others, which are dropped.
+            The fates of these packets; the packets that the network must carry; the fates of the dropped packets.
         """
         if self.policy.defers_sends:
-            sent, self._deferred = self._deferred, sent
+            sent_datagrams, self._deferred = self._deferred, sent_datagrams
         elif self._deferred:
-            sent, self._deferred = [*self._deferred, *sent], ()
-        absent = self._agents.absent if self._agents.has_changed else None
-        entered = [self._ledger.enter(datagram, max(datagram.at_ns, begin_ns), assumed, absent) for datagram in sent]
-        for fate in entered:
+            sent_datagrams, self._deferred = [*self._deferred, *sent_datagrams], ()
+        absences = self._agents.absent if self._agents.has_changed else None
+        entered_fates = [
+            self._ledger.enter(datagram, max(datagram.at_ns, begin_ns), assumed_states, absences)
+            for datagram in sent_datagrams
+        ]
+        for fate in entered_fates:
             source, destination = fate.packet.source, fate.packet.destination
             if source not in self._active or destination not in self._active:
                 self._add_active(source, destination)
-        carried = [fate.packet for fate in entered if not fate.reason]
-        return entered, carried, [] if len(carried) == len(entered) else [fate for fate in entered if fate.reason]
+        carried_packets = [fate.packet for fate in entered_fates if not fate.reason]
+        return (
+            entered_fates,
+            carried_packets,
+            [] if len(carried_packets) == len(entered_fates) else [fate for fate in entered_fates if fate.reason],
+        )
 
     def _add_active(self, *names: str) -> None:
         """Add agents that send or receive but are not in `pairs`, so that policies that look ahead include them."""
@@ -322,15 +338,15 @@ class Coordinator:
         self._select_present()
 
     def _select_present(self) -> None:
-        """Limit the pairs and the other agents of the situation to present agents, if some have been absent."""
+        """Limit the pairs and the other agents of the situation to present agents."""
         if not self._agents.has_changed:
             return
         situation = self.situation
-        present = set(situation.states)
-        if situation.assumed is not None:
-            present &= situation.assumed.keys()
-        situation.pairs = tuple(pair for pair in self._pairs if present >= {*pair})
-        situation.other_agents = tuple(name for name in self._other_agents if name in present)
+        present_names = set(situation.states)
+        if situation.assumed_states is not None:
+            present_names &= situation.assumed_states.keys()
+        situation.pairs = tuple(pair for pair in self._pairs if present_names >= {*pair})
+        situation.other_agents = tuple(name for name in self._other_agents if name in present_names)
 
     def _record_outcomes(
         self, arrivals: Sequence[Arrival], drops: Sequence[Drop], begin_ns: int, last_ns: int, end_ns: int
@@ -339,7 +355,7 @@ class Coordinator:
 
         Packets from and to agents that are absent at the end of the window are dropped.
         """
-        ended, agents, ledger = [], self._agents, self._ledger
+        decided_fates, agents, ledger = [], self._agents, self._ledger
         for arrival in arrivals:
             if ledger.is_withdrawn(arrival.packet_id):
                 continue
@@ -347,39 +363,41 @@ class Coordinator:
             packet = fate.packet
             if agents.absent and agents.is_absent((packet.source, packet.destination), arrival.at_ns):
                 fate.arrived_ns, fate.reason = None, ABSENT
-                ended.append(fate)
+                decided_fates.append(fate)
                 continue
             fate.counted_ns = end_ns if self.policy.defers_arrivals else arrival.at_ns
             fate.late_ns = end_ns - fate.counted_ns
-            received = Received(packet.source, payload, packet.sent_ns, fate.counted_ns)
-            agents.deliver(packet.destination, received)
-            ended.append(fate)
+            received_datagram = ReceivedDatagram(packet.source, payload, packet.sent_ns, fate.counted_ns)
+            agents.deliver(packet.destination, received_datagram)
+            decided_fates.append(fate)
         for drop in drops:
             if ledger.is_withdrawn(drop.packet_id):
                 continue
             fate = ledger.drop(drop)
             if agents.absent and agents.is_absent((fate.packet.source, fate.packet.destination), end_ns):
                 fate.reason = ABSENT
-            ended.append(fate)
+            decided_fates.append(fate)
         if agents.absent:
-            ended += ledger.withdraw(agents.absent)
-        return ended
+            decided_fates += ledger.withdraw(agents.absent)
+        return decided_fates
 
     def _notify(
         self,
         begin_ns: int,
-        entered: Sequence[Fate],
-        ended: Sequence[Fate],
-        assumed: Mapping[str, State],
+        entered_fates: Sequence[Fate],
+        decided_fates: Sequence[Fate],
+        assumed_states: Mapping[str, State],
         *,
         report: Callable[[int], None] | None,
     ) -> None:
-        """Pass the window that ends now to the observer and the progress report."""
+        """Pass the window that ends now to the observer, and report the progress."""
         end_ns, states = self.situation.now_ns, self.situation.states
         if self._observer is not None:
             decided_by = getattr(self.policy, "decided_by", "")
             wall_s = self._wall_time.window()
-            self._observer.window(Window(begin_ns, end_ns, decided_by, entered, ended, states, assumed, wall_s))
+            self._observer.window(
+                Window(begin_ns, end_ns, decided_by, entered_fates, decided_fates, states, assumed_states, wall_s)
+            )
         if report is not None:
             report(end_ns)
         self.is_committing = False

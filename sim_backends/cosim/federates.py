@@ -14,7 +14,7 @@ from sim_backends.federates.protocols import (
     federate_error,
     seconds_text,
 )
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.world.motion import State
 
 # The other modules of the co-simulation import these names from here.
@@ -41,16 +41,16 @@ def check_physics(physics: object) -> None:
         ConfigurationError: It lacks an attribute or method; the message names it.
     """
     step_ns = getattr(physics, "step_ns", None)
-    missing = ""
+    problem = ""
     if not isinstance(step_ns, int) or isinstance(step_ns, bool) or step_ns <= 0:
-        missing = f"no step_ns, an integer above 0 (it is {step_ns!r})"
+        problem = f"no step_ns, an integer above 0 (it is {step_ns!r})"
     elif not isinstance(getattr(physics, "limits_m_s2", None), Mapping):
-        missing = "no limits_m_s2, a mapping from each agent to a number"
+        problem = "no limits_m_s2, a mapping from each agent to a number"
     elif not callable(getattr(physics, "advance", None)):
-        missing = "no method advance(to_ns, commands)"
-    if missing:
+        problem = "no method advance(to_ns, commands)"
+    if problem:
         raise ConfigurationError(
-            f"the physics {type(physics).__name__} has {missing}",
+            f"the physics {type(physics).__name__} has {problem}",
             remedy="see what a physics class needs: fieldkit docs cosim-api",
         )
 
@@ -64,7 +64,7 @@ def check_states(states: Mapping[str, object]) -> None:
     for name, state in states.items():
         if not isinstance(state, State):
             raise ConfigurationError(
-                f"the physics gave {state!r} for {name}, which is not a State",
+                f"the physics returned {state!r} for {name}, which is not a State",
                 remedy="see what a physics class needs: fieldkit docs cosim-api",
             )
 
@@ -86,22 +86,22 @@ class Program(Protocol):
     """Software of one agent: it reads the agent's state, receives datagrams, sends, and steers."""
 
     def next_wake_ns(self) -> int | None:
-        """Return the time when its timer wakes it next, or None without a timer; only a wake changes this time."""
+        """Return the time when its timer fires next, or None without a timer; only `wake` changes this time."""
         ...
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Return the action at this time.
 
         Args:
             now_ns: The current time.
             own_state: State of its agent at the last step of the physics.
-            received: Datagrams that have arrived since it woke last.
+            received_datagrams: Datagrams that have arrived since the previous call.
         """
         ...
 
 
 def next_send_ns(program: Program) -> int | None:
-    """Return a time before which a program sends nothing unless it receives a datagram, or None if it never sends.
+    """Return a time before which a program sends only in reply to a received datagram, or None if it never sends.
 
     A program may have a method `next_send_ns`; otherwise it is assumed to send whenever it wakes.
     """

@@ -31,10 +31,10 @@ _TEXTS: Final[dict[str, Callable[[Fate], str]]] = {
 
 
 def columns(run: Run) -> dict[str, NDArray[Any]]:
-    """Return one array per column, one row per packet in the order in which the network got them.
+    """Return one array per column, with one row per packet in the order in which the packets entered the network.
 
-    `flow`, `source`, `destination`, `protocol` and `reason` are texts; `reason` is why the packet never arrived,
-    and is empty if it arrived or is under way. `number`, `size_bytes` and the times `sent_ns`, `enters_ns`,
+    `flow`, `source`, `destination`, `protocol` and `reason` are texts; `reason` is the reason why the packet never
+    arrived, and is empty if it arrived or is under way. `number`, `size_bytes` and the times `sent_ns`, `enters_ns`,
     `arrived_ns`, `counted_ns` and `late_ns`, in nanoseconds of simulated time, are 64-bit integers; a missing time is
     `NEVER`.
     """

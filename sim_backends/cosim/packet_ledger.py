@@ -6,7 +6,7 @@ from itertools import combinations
 from typing import Any, Final
 
 from fieldkit.core.model import Vector
-from sim_backends.cosim.agents import AgentAbsence, Sent
+from sim_backends.cosim.agents import AgentAbsence, SentDatagram
 from sim_backends.cosim.federates import FederateError, seconds_text
 from sim_backends.cosim.run_record import Fate
 from sim_backends.network.packets import Arrival, Drop, Packet
@@ -38,28 +38,32 @@ def position_error_m(fate: Fate) -> float:
     """
     if fate.position_error_m is not None:
         return fate.position_error_m
-    return _max_distance_m(_offsets_m(fate.assumed, fate.true))
+    return _max_distance_m(_offsets_m(fate.assumed_states, fate.true_states))
 
 
 def max_position_error_m(
-    assumed: Mapping[str, State], true: Sequence[State], names: Collection[str], *, has_fixed_emitters: bool
+    assumed_states: Mapping[str, State],
+    true_states: Sequence[State],
+    names: Collection[str],
+    *,
+    has_fixed_emitters: bool,
 ) -> float:
     """Return the largest error of the network's relative position of two agents.
 
     Args:
-        assumed: States of the agents that the network assumes.
-        true: True states of the agents in `names`, in the same order.
+        assumed_states: States of the agents that the network assumes.
+        true_states: True states of the agents in `names`, in the same order.
         names: The agents to include.
         has_fixed_emitters: True to also include a point that never moves.
     """
-    offsets_m = _offsets_m([assumed[name] for name in names], true)
+    offsets_m = _offsets_m([assumed_states[name] for name in names], true_states)
     return _max_distance_m([*offsets_m, STILL] if has_fixed_emitters else offsets_m)
 
 
-def _offsets_m(assumed: Iterable[State], true: Iterable[State]) -> list[Vector]:
+def _offsets_m(assumed_states: Iterable[State], true_states: Iterable[State]) -> list[Vector]:
     """Return the error vector of each assumed position."""
     offsets_m = []
-    for assumed_state, true_state in zip(assumed, true, strict=True):
+    for assumed_state, true_state in zip(assumed_states, true_states, strict=True):
         (e, n, u), (true_e, true_n, true_u) = assumed_state.position_m, true_state.position_m
         offsets_m.append((e - true_e, n - true_n, u - true_u))
     return offsets_m
@@ -73,9 +77,10 @@ class PacketLedger:
     """Tracks each packet from its entry to its arrival or drop; an impossible report raises a `FederateError`.
 
     Args:
-        fates: Receives the fate of every packet that enters the network, by flow and number.
+        fates: Mapping to which the ledger adds the fate of every packet that enters the network, by flow and number.
         step_ns: The physics step.
-        measured: Agents that the position error of every packet includes, besides its sender and receiver.
+        measured_agents: Agents that the position error of every packet includes, in addition to its sender and
+            receiver.
         has_fixed_emitters: True if the position error includes a point that never moves.
     """
 
@@ -83,49 +88,52 @@ class PacketLedger:
         self,
         fates: dict[PacketIdentity, Fate],
         step_ns: int,
-        measured: Iterable[str] = (),
+        measured_agents: Iterable[str] = (),
         *,
         has_fixed_emitters: bool = False,
     ) -> None:
         self._fates = fates
         self._step_ns = step_ns
-        self._measured = frozenset(measured)
+        self._measured_agents = frozenset(measured_agents)
         self._has_fixed_emitters = has_fixed_emitters
         self._under_way: dict[int, tuple[Fate, Any]] = {}
-        self._withdrawn: set[int] = set()
-        self._packets = 0
+        self._withdrawn_ids: set[int] = set()
+        self._packet_count = 0
 
     def enter(
         self,
-        sent: Sent,
+        sent_datagram: SentDatagram,
         enters_ns: int,
-        assumed: Mapping[str, State],
-        absent: Mapping[str, AgentAbsence] | None = None,
+        assumed_states: Mapping[str, State],
+        absences: Mapping[str, AgentAbsence] | None = None,
     ) -> Fate:
         """Record a datagram as a packet that enters the network; it is dropped if one of its ends is absent.
 
         Args:
-            sent: The datagram, as its program sent it.
+            sent_datagram: The datagram, as its program sent it.
             enters_ns: Time when it enters the network.
-            assumed: States that the network assumes throughout the window, or at its beginning (`DeadReckoned`).
-            absent: The agents that are absent at the end of the window; None if all have always been present.
+            assumed_states: States that the network assumes during the window, or at its beginning (`DeadReckoned`).
+            absences: The agents that are absent at the end of the window; None if all have always been present.
 
         Raises:
             FederateError: Its destination is not an agent, or its flow already has a packet of this number.
         """
-        at_ns, source, datagram, true = sent
+        at_ns, source, datagram, true_states = sent_datagram
         destination = datagram.destination
-        if isinstance(assumed, DeadReckoned):
-            assumed = assumed.at(enters_ns)
+        if isinstance(assumed_states, DeadReckoned):
+            assumed_states = assumed_states.at(enters_ns)
         is_dropped = False
-        if absent is not None:
-            is_dropped = destination not in true or any(
-                name in absent and absent[name].since_ns <= enters_ns for name in (source, destination)
+        if absences is not None:
+            is_dropped = destination not in true_states or any(
+                name in absences and absences[name].since_ns <= enters_ns for name in (source, destination)
             )
-            last = {name: absence.state for name, absence in absent.items()}
-            assumed, true = {**true, **last, **assumed}, {**assumed, **last, **true}
+            last_states = {name: absence.state for name, absence in absences.items()}
+            assumed_states, true_states = (
+                {**true_states, **last_states, **assumed_states},
+                {**assumed_states, **last_states, **true_states},
+            )
         try:
-            assumed_ends = assumed[source], assumed[destination]
+            assumed_ends = assumed_states[source], assumed_states[destination]
         except KeyError:
             raise FederateError(f"the program of {source} sent to {destination}, which is not an agent") from None
         identity = datagram.flow, datagram.number
@@ -133,26 +141,33 @@ class PacketLedger:
             raise FederateError(
                 f"the program of {source} sent two packets of flow {datagram.flow} with the number {datagram.number}"
             )
-        self._packets += 1
+        self._packet_count += 1
         packet = Packet(
-            self._packets, source, destination, datagram.size_bytes, identity, at_ns, enters_ns, datagram.protocol
+            self._packet_count,
+            source,
+            destination,
+            datagram.size_bytes,
+            identity,
+            at_ns,
+            enters_ns,
+            datagram.protocol,
         )
         since_step_s = at_ns % self._step_ns / 1e9
-        ends = true[source], true[destination]
+        ends = true_states[source], true_states[destination]
         if since_step_s:
             ends = extrapolate(ends[0], since_step_s), extrapolate(ends[1], since_step_s)
         fate = Fate(packet, assumed_ends, ends)
-        if self._measured or self._has_fixed_emitters:
-            names = self._measured | {source, destination}
-            states = [extrapolate(true[name], since_step_s) for name in names]
+        if self._measured_agents or self._has_fixed_emitters:
+            names = self._measured_agents | {source, destination}
+            states = [extrapolate(true_states[name], since_step_s) for name in names]
             fate.position_error_m = max_position_error_m(
-                assumed, states, names, has_fixed_emitters=self._has_fixed_emitters
+                assumed_states, states, names, has_fixed_emitters=self._has_fixed_emitters
             )
         self._fates[identity] = fate
         if is_dropped:
             fate.reason = ABSENT
         else:
-            self._under_way[self._packets] = fate, datagram.payload
+            self._under_way[self._packet_count] = fate, datagram.payload
         return fate
 
     def withdraw(self, names: Container[str]) -> list[Fate]:
@@ -162,17 +177,17 @@ class PacketLedger:
             for packet_id, (fate, _) in self._under_way.items()
             if fate.packet.source in names or fate.packet.destination in names
         ]
-        self._withdrawn.update(packet_ids)
+        self._withdrawn_ids.update(packet_ids)
         fates = [self._under_way.pop(packet_id)[0] for packet_id in packet_ids]
         for fate in fates:
             fate.reason = ABSENT
         return fates
 
     def is_withdrawn(self, packet_id: int) -> bool:
-        """Return True if a reported packet was withdrawn before; a second call for it returns False."""
-        if packet_id not in self._withdrawn:
+        """Return True if a packet was withdrawn, but only once: a second call for the same packet returns False."""
+        if packet_id not in self._withdrawn_ids:
             return False
-        self._withdrawn.remove(packet_id)
+        self._withdrawn_ids.remove(packet_id)
         return True
 
     def arrive(self, arrival: Arrival, begin_ns: int, last_ns: int) -> tuple[Fate, Any]:
@@ -211,5 +226,7 @@ class PacketLedger:
         try:
             return self._under_way.pop(packet_id)
         except KeyError:
-            why = "which was reported before" if 0 < packet_id <= self._packets else "which never entered it"
-            raise FederateError(f"the network reported the fate of packet {packet_id}, {why}") from None
+            explanation = (
+                "which was reported before" if 0 < packet_id <= self._packet_count else "which never entered it"
+            )
+            raise FederateError(f"the network reported the fate of packet {packet_id}, {explanation}") from None

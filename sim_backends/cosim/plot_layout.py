@@ -45,7 +45,7 @@ class LogPanel:
         y_label: Quantity and unit of y.
         curves: The curves.
         labels_at_right: True to stack the labels at the right; the axis then leaves space for the longest.
-        over_time: True if x is a time from 0 on: its axis is then linear, and there are no markers.
+        over_time: True if x is a time that starts at 0: its axis is then linear, and there are no markers.
     """
 
     title: str
@@ -79,12 +79,12 @@ class ObstacleOutline:
 
     Attributes:
         corners_m: Its corners, metres east and north.
-        is_light: True if robots on the ground may be within the outline: below a roof or a tree crown, or on higher
-            ground.
+        is_passable: True if robots on the ground may be within the outline: below a roof or a tree crown, or on
+            higher ground.
     """
 
     corners_m: Sequence[Point]
-    is_light: bool
+    is_passable: bool
 
 
 def outlines(world: World) -> Iterator[ObstacleOutline]:
@@ -98,18 +98,18 @@ def outlines(world: World) -> Iterator[ObstacleOutline]:
 
 
 def direction_arrow(path_m: Sequence[Point]) -> tuple[Point, Point] | None:
-    """Return both ends of an arrow at the end of a path, in the direction of travel; None without motion."""
+    """Return the ends of an arrow at the end of a path, in the direction of travel; None without motion."""
     east_m, north_m = path_m[-1]
-    covered_m = math.hypot(*(max(axis) - min(axis) for axis in zip(*path_m, strict=True)))
+    extent_m = math.hypot(*(max(axis) - min(axis) for axis in zip(*path_m, strict=True)))
     for from_e, from_n in reversed(path_m):
-        back_m = math.dist((from_e, from_n), path_m[-1])
-        if back_m >= max(_ARROW_SHARE * covered_m, _FLOOR_M):
+        distance_m = math.dist((from_e, from_n), path_m[-1])
+        if distance_m >= max(_ARROW_SHARE * extent_m, _FLOOR_M):
             return (from_e, from_n), (east_m, north_m)
     return None
 
 
 _DISTANCE_FACTOR = 1.3
-"""Factor by which the distance of a label from its point grows until it does not cover anything."""
+"""Factor between the candidate distances of a label from its point."""
 _MAX_STEPS = 12
 _OVERLAP_COST = 10.0
 """Cost of any overlap, as a distance from the point in heights of the label."""
@@ -164,12 +164,14 @@ def place_labels(
         bounds: The area in which labels may be.
         obstacles: Boxes that labels must not cover: the points themselves, and lines.
     """
-    placed: list[tuple[Point, LabelBox]] = []
+    placed_labels: list[tuple[Point, LabelBox]] = []
     for points, size in zip(anchors, sizes, strict=True):
-        covered = [*obstacles, *(box for _, box in placed)]
+        covered = [*obstacles, *(box for _, box in placed_labels)]
         candidates = ((point, box) for point in points for box in _boxes_around(point, size))
-        placed.append(min(candidates, key=lambda candidate: _cost(candidate[1], candidate[0], bounds, covered)))
-    return placed
+        placed_labels.append(
+            min(candidates, key=lambda candidate: _cost(candidate[1], candidate[0], bounds, covered))
+        )
+    return placed_labels
 
 
 def stack_labels(
@@ -185,10 +187,10 @@ def stack_labels(
     """
     order = sorted(range(len(anchors)), key=lambda index: anchors[index][1])
     bottoms: dict[int, float] = {}
-    free = bounds.bottom
+    next_bottom = bounds.bottom
     for index in order:
-        bottoms[index] = max(anchors[index][1] - sizes[index][1] / 2, free)
-        free = bottoms[index] + sizes[index][1]
+        bottoms[index] = max(anchors[index][1] - sizes[index][1] / 2, next_bottom)
+        next_bottom = bottoms[index] + sizes[index][1]
     top = bounds.bottom + bounds.height
     for index in reversed(order):  # move labels above the upper bound down again
         bottoms[index] = min(bottoms[index], top - sizes[index][1])

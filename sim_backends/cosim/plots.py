@@ -41,7 +41,7 @@ _LABEL_POINTS: Final = 7.0
 """Font size of the labels of curves."""
 _RUN_INCHES: Final = 3.2
 _TIME_AXIS_FACTOR: Final = 1.45
-"""Ratio of the length of the time axis to the duration of the run, which leaves space for labels."""
+"""Ratio of the length of the time axis to the duration of the run; the difference is the space for labels."""
 _MARKER_POINTS: Final = 5.0
 _POINTS_PER_INCH: Final = 72.0
 _ZERO_SHARE: Final = 0.16
@@ -77,13 +77,13 @@ def log_figure(panels: Sequence[LogPanel], form: Format) -> bytes:
     rows = -(-len(panels) // columns)
     with _drawing():
         figure = Figure(figsize=(_BOTH_COLUMNS_INCHES, _PANEL_INCHES * rows), layout="constrained")
-        drawn = []
+        drawn_panels = []
         for number, panel in enumerate(panels, start=1):
             axes = figure.add_subplot(rows, columns, number)
-            drawn.append((axes, panel, _draw_log(axes, panel)))
+            drawn_panels.append((axes, panel, _draw_log(axes, panel)))
         figure.draw_without_rendering()  # the axes have their final positions only after this call
         figure.set_layout_engine("none")
-        for axes, panel, curves in drawn:
+        for axes, panel, curves in drawn_panels:
             _label(
                 axes,
                 [curve.label or curve.name for curve in panel.curves],
@@ -117,7 +117,7 @@ def run_figure(
         _draw_paths(map_axes, paths_m)
         for outline in outlines:
             # Added as an artist without data, so that distant obstacles do not change the limits of the axes.
-            shade, alpha = LIGHT["muted"], 0.2 if outline.is_light else 0.6
+            shade, alpha = LIGHT["muted"], 0.2 if outline.is_passable else 0.6
             map_axes.add_artist(Polygon(outline.corners_m, facecolor=shade, alpha=alpha, linewidth=0, zorder=1))
         delay, distance = (figure.add_subplot(grid[row, 1]) for row in (0, 1))
         _draw_delays(delay, flows)
@@ -138,7 +138,7 @@ def run_figure(
 
 
 def _set_time_axis(axes: Axes, end_s: float) -> None:
-    """Set the x axis to times from 0 to an end, and leave space for labels behind it."""
+    """Set the x axis to times from 0 to an end, and leave space for labels at the right."""
     axes.set_xlim(0, end_s * _TIME_AXIS_FACTOR)
     axes.xaxis.set_major_locator(MaxNLocator(nbins=8, steps=(1, 2, 5, 10)))
     axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= end_s * 1.02])
@@ -217,14 +217,14 @@ def _draw_log(axes: Axes, panel: LogPanel) -> list[Line2D]:
     low, high = 10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high * 1.001))
     has_zero = any(value == 0 for curve in panel.curves for value in curve.y)
     zero = low / 10 ** (_ZERO_SHARE * max(math.log10(high / low), 1))
-    drawn: list[Line2D] = []
+    drawn_lines: list[Line2D] = []
     for number, curve in enumerate(panel.curves):
         colour, marker = _style(curve.name, number)
         shown_marker = "" if panel.over_time else marker
         style: dict[str, Any] = {"color": LIGHT[colour], "marker": shown_marker, "markersize": _MARKER_POINTS}
-        drawn += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **style)
+        drawn_lines += axes.plot(curve.x, [max(y, zero) for y in curve.y], clip_on=False, zorder=3, **style)
     _ticks(axes, panel, zero if has_zero else None, low, high)
-    return drawn
+    return drawn_lines
 
 
 def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: float) -> None:
@@ -250,7 +250,7 @@ def _ticks(axes: Axes, panel: LogPanel, zero: float | None, low: float, high: fl
 def _label(
     axes: Axes,
     labels: Sequence[str],
-    drawn: Sequence[Line2D],
+    drawn_lines: Sequence[Line2D],
     *,
     at_right: bool = False,
     other_lines: Sequence[Line2D] = (),
@@ -260,12 +260,12 @@ def _label(
     Args:
         axes: The axes of the lines, at their final position.
         labels: One per line.
-        drawn: The lines.
+        drawn_lines: The lines.
         at_right: True to stack the labels at the right.
         other_lines: Further lines that labels must not cover.
     """
     groups: dict[tuple[Point, ...], list[int]] = {}
-    for index, line in enumerate(drawn):
+    for index, line in enumerate(drawn_lines):
         groups.setdefault(_points(axes, line), []).append(index)
     texts = [sanitized("\n".join(labels[index] for index in group)) for group in groups.values()]
     sizes = [_text_size(text) for text in texts]
@@ -280,7 +280,7 @@ def _label(
         covered = [*groups, *(_points(axes, line) for line in other_lines)]
         places = place_labels(list(groups), sizes, bounds, list(curve_boxes(covered, _MARKER_POINTS / 2 + 1)))
     for (point, box), text, group in zip(places, texts, groups.values(), strict=True):
-        _annotate(axes, text, point, box, str(drawn[group[0]].get_color()), at_left=at_right)
+        _annotate(axes, text, point, box, str(drawn_lines[group[0]].get_color()), at_left=at_right)
 
 
 def _points(axes: Axes, line: Line2D) -> tuple[Point, ...]:

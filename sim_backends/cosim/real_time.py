@@ -19,7 +19,7 @@ LATE_BOUND_S: Final = 0.1
 
 
 class RealTimeError(EvidenceError):
-    """A run could not keep up with real time; its results are therefore not valid for real time."""
+    """A run was slower than real time, so its results are not valid."""
 
 
 @dataclass
@@ -36,13 +36,13 @@ class WindowLateness:
     largest_ns: int = 0
 
     def add(self, late_ns: int) -> None:
-        """Count a window; a negative lateness is the time left until its deadline."""
+        """Count a window; a negative lateness is the remaining time until its deadline."""
         self.windows[_limit_ns(late_ns)] += 1
         self.largest_ns = max(self.largest_ns, late_ns)
 
 
 _SHORTEST_NS: Final = 100_000
-"""Smallest limit above 0; a sleeping process is woken up with about this lateness."""
+"""Smallest limit above 0; the kernel resumes a sleeping process with about this lateness."""
 
 
 def _limit_ns(late_ns: int) -> int:
@@ -71,7 +71,7 @@ class Pace:
 
         Args:
             simulation: The simulation at time 0.
-            lateness: Receives the lateness of each window.
+            lateness: The lateness of each window is added to it.
             progress: As for `Simulation.run`.
 
         Raises:
@@ -81,19 +81,19 @@ class Pace:
         coordinator, end_ns = simulation.coordinator, simulation.scenario.duration_ns
         bound_ns = round(self.late_bound_s * 1e9)
         report = None if progress is None else rate_limited(progress)
-        started_ns = time.monotonic_ns()
+        start_ns = time.monotonic_ns()
         while (now_ns := coordinator.situation.now_ns) < end_ns:
             coordinator.advance(end_ns, max_windows=1)
-            ended_ns, wall_ns = coordinator.situation.now_ns, time.monotonic_ns()
-            if ended_ns == now_ns:
+            window_end_ns, wall_ns = coordinator.situation.now_ns, time.monotonic_ns()
+            if window_end_ns == now_ns:
                 continue  # an empty window has the deadline of the previous window
-            late_ns = wall_ns - started_ns - round(ended_ns / self.factor)
+            late_ns = wall_ns - start_ns - round(window_end_ns / self.factor)
             lateness.add(late_ns)
             if report is not None:
-                report(ended_ns)
+                report(window_end_ns)
             if late_ns > bound_ns:
                 raise RealTimeError(
-                    f"the run could not keep up with real time: the window that ends at {seconds_text(ended_ns)} was "
+                    f"the run was slower than real time: the window that ends at {seconds_text(window_end_ns)} was "
                     f"{late_ns / 1e9:.3f} s late, and the bound is {self.late_bound_s:g} s",
                     remedy="use a lower --realtime, a longer window, or a less busy machine",
                 )

@@ -19,9 +19,9 @@ class Fate:
 
     Attributes:
         packet: The packet, with the times when it was sent and when it entered the network.
-        assumed: States of source and destination that the network assumed when the packet entered.
-        true: True states of source and destination at the time of sending: the states at the last physics step,
-            extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
+        assumed_states: States of source and destination that the network assumed when the packet entered.
+        true_states: True states of source and destination at the time of sending: the states at the last physics
+            step, extrapolated at their velocity. At an acceleration a and a step h the error is at most a h^2 / 2.
         arrived_ns: Time when the network delivered it, or None.
         counted_ns: Time from which the arrival counts for its receiver: `arrived_ns` or the end of the window,
             depending on the policy.
@@ -33,8 +33,8 @@ class Fate:
     """
 
     packet: Packet
-    assumed: tuple[State, State]
-    true: tuple[State, State]
+    assumed_states: tuple[State, State]
+    true_states: tuple[State, State]
     arrived_ns: int | None = None
     counted_ns: int | None = None
     late_ns: int = 0
@@ -43,7 +43,7 @@ class Fate:
 
     @property
     def is_decided(self) -> bool:
-        """True if the packet has arrived, or never will."""
+        """True if the packet has arrived or has been dropped."""
         return self.arrived_ns is not None or bool(self.reason)
 
 
@@ -94,22 +94,22 @@ class EventDigest:
         self._events = bytearray()
         self._windows = 0
 
-    def add_window(self, end_ns: int, entered: Iterable[Fate], ended: Iterable[Fate]) -> None:
+    def add_window(self, end_ns: int, entered_fates: Iterable[Fate], decided_fates: Iterable[Fate]) -> None:
         """Hash a window.
 
         Args:
             end_ns: Its end.
-            entered: The fates of packets that entered the network, in order.
-            ended: The fates that were decided in the window, in order.
+            entered_fates: The fates of packets that entered the network, in order.
+            decided_fates: The fates that were decided in the window, in order.
         """
         self._add_quiet_windows()
         events = self._events
-        for fate in entered:
+        for fate in entered_fates:
             packet = fate.packet
             flow, number = packet.identity
             events += _PACKET.pack(packet.packet_id, number, packet.size_bytes, packet.sent_ns, packet.enters_ns)
             events += f"{packet.source}\0{packet.destination}\0{flow}\0{packet.protocol}\0".encode()
-        for fate in ended:
+        for fate in decided_fates:
             if fate.arrived_ns is None:
                 events += _EVENT.pack(b"d", fate.packet.packet_id, end_ns)
                 events += fate.reason.encode()
@@ -151,11 +151,11 @@ class Window(NamedTuple):
         begin_ns: Its beginning.
         end_ns: Its end.
         decided_by: Reason for its length, for example a pair of agents; empty if the policy does not report it.
-        entered: Fates of the packets that entered the network in it, in order. Most are not decided yet; the same
-            objects are in `ended` of a later window.
-        ended: Fates that were decided in it, in order.
+        entered_fates: Fates of the packets that entered the network in it, in order. Most are not decided yet; they
+            are updated, and are in `decided_fates` of a later window.
+        decided_fates: Fates that were decided in it, in order.
         states: States of the agents at its end.
-        assumed: States that the network assumed throughout it, or at its beginning if it extrapolates
+        assumed_states: States that the network assumed throughout it, or at its beginning if it extrapolates
             (`DeadReckoned`).
         wall_s: Wall time that it took, by part, as in `Run`.
     """
@@ -163,15 +163,18 @@ class Window(NamedTuple):
     begin_ns: int
     end_ns: int
     decided_by: str
-    entered: Sequence[Fate]
-    ended: Sequence[Fate]
+    entered_fates: Sequence[Fate]
+    decided_fates: Sequence[Fate]
     states: Mapping[str, State]
-    assumed: Mapping[str, State]
+    assumed_states: Mapping[str, State]
     wall_s: Mapping[str, float]
 
 
 class WindowObserver(Protocol):
-    """Observes a run. It must not change its arguments; the recorded wall time does not include its time."""
+    """Observes a run.
+
+    Its methods must not change their arguments. The recorded wall time does not include the time of their calls.
+    """
 
     def begin(self, states: Mapping[str, State]) -> None:
         """Receive the states of the agents at time 0, before the first window."""

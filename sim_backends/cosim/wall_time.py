@@ -14,7 +14,7 @@ Progress = Callable[[int, float], None]
 
 
 @runtime_checkable
-class Waits(Protocol):
+class HasWaitingTime(Protocol):
     """A federate or program that waits in wall time: for another process, a device, or a fault.
 
     It raises `AnswerTimeoutError` if it waits for longer than its deadline.
@@ -32,24 +32,24 @@ class WallTime:
     Time during which a federate of that part waited is added to `wait` instead.
 
     Args:
-        total_s: Receives the sums, in seconds by part, whenever `window` is called.
+        total_s: The sums in seconds, by part; each call of `window` updates them.
         agents: Physics and programs.
         network: The network.
     """
 
     def __init__(self, total_s: dict[str, float], *, agents: Iterable[object], network: Iterable[object]) -> None:
         self._total_s = total_s
-        self._waiting: dict[str, Sequence[Waits]] = {
-            "agents": [federate for federate in agents if isinstance(federate, Waits)],
-            "network": [federate for federate in network if isinstance(federate, Waits)],
+        self._waiting_federates: dict[str, Sequence[HasWaitingTime]] = {
+            "agents": [federate for federate in agents if isinstance(federate, HasWaitingTime)],
+            "network": [federate for federate in network if isinstance(federate, HasWaitingTime)],
             "exchange": (),
         }
-        self._waited_s = {part: self._total_waited_s(part) for part in self._waiting}
+        self._waited_s = {part: self._total_waited_s(part) for part in self._waiting_federates}
         self._spent_s = dict.fromkeys(total_s, 0.0)
         self._lap_start_s = time.perf_counter()
 
     def start(self) -> None:
-        """Start a lap; the time since the last lap belongs to no part."""
+        """Start a lap; the time since the last lap is not added to any part."""
         self._lap_start_s = time.perf_counter()
 
     def lap(self, part: Literal["agents", "network", "exchange"]) -> None:
@@ -57,7 +57,7 @@ class WallTime:
         now_s = time.perf_counter()
         self._spent_s[part] += now_s - self._lap_start_s
         self._lap_start_s = now_s
-        if self._waiting[part]:
+        if self._waiting_federates[part]:
             waited_s = self._total_waited_s(part)
             new_s = waited_s - self._waited_s[part]
             self._waited_s[part] = waited_s
@@ -72,7 +72,7 @@ class WallTime:
         return spent_s
 
     def _total_waited_s(self, part: str) -> float:
-        return sum(federate.waited_s for federate in self._waiting[part])
+        return sum(federate.waited_s for federate in self._waiting_federates[part])
 
 
 DEADLINE_S: Final = 30.0
@@ -115,24 +115,24 @@ class Stall:
         self._sleep(self._wall_s)
 
     def _sleep(self, wall_s: float) -> None:
-        started_s = time.perf_counter()
+        start_s = time.perf_counter()
         time.sleep(wall_s)
-        self.waited_s += time.perf_counter() - started_s
+        self.waited_s += time.perf_counter() - start_s
 
 
 _REQUESTS: Final = ("advance", "wake")
 """Methods of federates and programs whose first argument is a simulated time."""
 
 
-class _Stalled:
+class _StallingFederate:
     def __init__(self, federate: object, stall: Stall) -> None:
         self._federate = federate
         self._stall = stall
 
     @property
     def waited_s(self) -> float:
-        """The waiting time of the stall and of the federate itself (`wall_time.Waits`)."""
-        return self._stall.waited_s + (self._federate.waited_s if isinstance(self._federate, Waits) else 0.0)
+        """The waiting time of the stall and of the federate itself (`wall_time.HasWaitingTime`)."""
+        return self._stall.waited_s + (self._federate.waited_s if isinstance(self._federate, HasWaitingTime) else 0.0)
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 (depends on the federate)
         if name.startswith("_"):  # an unfinished copy has no federate yet
@@ -140,30 +140,30 @@ class _Stalled:
         attribute = getattr(self._federate, name)
         return partial(self._delayed, attribute) if name in _REQUESTS else attribute
 
-    def _delayed(self, request: Callable[..., Any], now_ns: int, *rest: object) -> Any:  # noqa: ANN401 (as above)
+    def _delayed(self, request: Callable[..., Any], now_ns: int, *arguments: object) -> Any:  # noqa: ANN401 (as above)
         self._stall.wait(now_ns)
-        return request(now_ns, *rest)
+        return request(now_ns, *arguments)
 
 
-def stalled(federate: Federate, stall: Stall) -> Federate:
+def with_stall(federate: Federate, stall: Stall) -> Federate:
     """Return a federate or program with a delayed answer.
 
     Args:
         federate: The federate or program.
-        stall: When it stalls, and for how long.
+        stall: The time and the duration of the delay.
     """
-    return cast("Federate", _Stalled(federate, stall))
+    return cast("Federate", _StallingFederate(federate, stall))
 
 
 def rate_limited(progress: Progress) -> Callable[[int], None]:
     """Return a function of the simulated time that calls `progress` at most every 0.2 s of wall time."""
-    started_s = reported_s = time.perf_counter()
+    start_s = last_report_s = time.perf_counter()
 
     def report(now_ns: int) -> None:
-        nonlocal reported_s
+        nonlocal last_report_s
         wall_s = time.perf_counter()
-        if wall_s - reported_s >= _PROGRESS_EVERY_S:
-            reported_s = wall_s
-            progress(now_ns, wall_s - started_s)
+        if wall_s - last_report_s >= _PROGRESS_EVERY_S:
+            last_report_s = wall_s
+            progress(now_ns, wall_s - start_s)
 
     return report

@@ -55,7 +55,7 @@ class EmulatedBackend:
 
     by_hand: Final = False
     permissions: frozenset[str] = frozenset()
-    """Without effect: emulated robots endanger no person."""
+    """No permission is needed, because emulated robots endanger no person."""
 
     def __init__(self, site: Site | None, document: Document | None) -> None:
         if site is None:
@@ -124,7 +124,7 @@ class EmulatedBackend:
         return not radios.runs_here()
 
     def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
-        """Implement `Relocating.run_elsewhere` by a virtual machine."""
+        """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""
         from sim_backends.emulated.linux_wifi import guest  # noqa: PLC0415 (as above)
 
         return guest.run_command(argv, results, radios=self._radios)
@@ -139,7 +139,7 @@ class EmulatedBackend:
         self._options = self._options.with_wifi(kind)
 
     def _site_of_guest(self) -> dict[str, object]:
-        """Return the content of a site file for this lab."""
+        """Return the content of the site file for this lab in a virtual machine."""
         content = dict(self._document.data) if self._document is not None else {}
         emulated = content.get("emulated") or {}
         assert isinstance(emulated, dict)
@@ -174,9 +174,9 @@ class EmulatedBackend:
         }
 
     def _abilities(self, robot: Robot, cast: Cast) -> frozenset[str]:
-        """Return the sections of the robot's profile by which steps may move it.
+        """Return the sections of the robot's profile with which steps may move it.
 
-        If other robots of the cast would receive the velocities of a driven robot too, the lab moves it instead.
+        If other robots of the cast would also receive the commanded velocities of a robot, the lab moves it instead.
         """
         drive = drive_of(robot.profile)
         is_driven = (
@@ -184,8 +184,8 @@ class EmulatedBackend:
             and drives_by_topic(robot.profile, self._options)
             and drive.topic_conflict(robot, cast.values()) is None
         )
-        is_flown = mavlink_of(robot.profile) is not None
-        return frozenset({DRIVE} if is_driven else ()) | frozenset({MAVLINK} if is_flown else ())
+        has_autopilot = mavlink_of(robot.profile) is not None
+        return frozenset({DRIVE} if is_driven else ()) | frozenset({MAVLINK} if has_autopilot else ())
 
     @contextmanager
     def open(
@@ -200,7 +200,7 @@ class EmulatedBackend:
         # A dry run needs only `cast`, and imports neither SSH nor keys.
         from sim_backends.emulated import requirements, testbed  # noqa: PLC0415
 
-        ros = self._checked_ros(robot.name for robot in cast.values())
+        ros = self._find_ros(robot.name for robot in cast.values())
         _check_bridges(cast, ros)
         if any(robot.ros_master for robot in cast.values()):
             requirements.check_shared_master(ros)
@@ -216,8 +216,8 @@ class EmulatedBackend:
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
             operator=operator,
-        ) as up:
-            yield up
+        ) as opened_testbed:
+            yield opened_testbed
 
     def persistent_shells(self, *, sink: Sink) -> AbstractContextManager[Mapping[str, Shell | FieldkitError]]:  # noqa: ARG002 (none)
         """Implement `Backend.persistent_shells`: emulated robots stop with their lab, so there are none."""
@@ -239,12 +239,12 @@ class EmulatedBackend:
             with guest_lab.bring_up(members, self._site_of_guest(), seed=seed, radios=self._radios, draw=draw) as lab:
                 yield lab
             return
-        ros = self._checked_ros(members)
+        ros = self._find_ros(members)
         _check_bridges(members, ros)
         self._note_simulators(sink)
         sink(PhaseStarted("start robots"))
-        with interactive_lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as up:
-            yield up
+        with interactive_lab.bring_up(members, options=self._options, world=self._world, ros=ros, seed=seed) as lab:
+            yield lab
 
     def overview(self) -> "Overview":
         """Implement `LabBackend.overview`, without shadowing, which depends on the seed."""
@@ -311,7 +311,7 @@ class EmulatedBackend:
             texts = (f"{purpose} {simulator}" for purpose, simulator in self.simulators.items())
             sink(Note(f"{purposes} {', '.join(texts)}"))
 
-    def _checked_ros(self, names: Iterable[str]) -> RosChoice:
+    def _find_ros(self, names: Iterable[str]) -> RosChoice:
         """Check that this machine has the programs that these robots need, and return the source of their ROS."""
         from sim_backends.emulated import requirements  # noqa: PLC0415 (as in `open`)
 

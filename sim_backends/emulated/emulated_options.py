@@ -99,7 +99,7 @@ class Ros2Options(Strict):
     def _check_router(self) -> "Ros2Options":
         if (self.discovery == "router") != (self.router is not None):
             raise schema.validation_error(
-                "`discovery: router` and `router: ROBOT`, which runs it, require each other", "router"
+                "`discovery: router` and `router: ROBOT` must be given together; ROBOT runs the router", "router"
             )
         return self
 
@@ -123,7 +123,7 @@ class SyncOptions(Strict):
 
     @schema.model_validator(mode="before")
     @classmethod
-    def _named(cls, value: object) -> object:
+    def _expand_name(cls, value: object) -> object:
         """Accept a name without parameters."""
         return {"name": value} if isinstance(value, str) else value
 
@@ -212,7 +212,7 @@ class EmulatedOptions(Strict):
         """Return a copy with another `wifi`.
 
         Raises:
-            ConfigurationError: It cannot be combined with other options.
+            ConfigurationError: This Wi-Fi cannot be combined with other options of the lab.
         """
         try:
             return EmulatedOptions.model_validate(self.model_dump(mode="json") | {"wifi": kind})
@@ -246,7 +246,7 @@ class EmulatedOptions(Strict):
 
 
 def load_options(document: Document | None) -> EmulatedOptions:
-    """Return the options in a site file's document; the defaults without one.
+    """Return the options in a site file's document, or the defaults if it has no section `emulated`.
 
     Raises:
         ConfigurationError: The section is wrong; the message has file and line.

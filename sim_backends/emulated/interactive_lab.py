@@ -1,4 +1,4 @@
-"""Interactive lab: all robots of a site file are up, none has a role, and all of them communicate directly."""
+"""Interactive lab: all robots of a site file run, without roles, and communicate directly."""
 
 import socket
 import threading
@@ -20,7 +20,7 @@ from fieldkit.lab.protocol import LabLateness, LabLink, Login, Outline, Overview
 from fieldkit.lab.robots import Destination, LabRobot
 from sim_backends.emulated import placement
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
-from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered
+from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_motions
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
@@ -36,7 +36,7 @@ class EmulatedLab:
 
     Args:
         members: The robots by name.
-        up: The running robots and their medium.
+        running: The running robots and their medium.
         options: The lab's options.
         world: The world around the robots.
 
@@ -45,24 +45,24 @@ class EmulatedLab:
     """
 
     def __init__(
-        self, members: Mapping[str, LabRobot], up: RunningRobots[str], options: EmulatedOptions, world: World
+        self, members: Mapping[str, LabRobot], running: RunningRobots[str], options: EmulatedOptions, world: World
     ) -> None:
-        self._running = up
+        self._running = running
         self._options = options
         self._world = world
         self._places_m = placement.square_m(members, world)
         self._path_starts_ns: dict[str, int] = {}
         self._states: dict[str, State] = {}
         self._watch: MotionThread | None = None
-        # A separate thread follows robots that steer themselves.
+        # A separate thread updates the places of robots that steer themselves.
         self._lock = threading.RLock()
         for name in members:
             self._assign_place(name, self._places_m[name])
-        up.media.place(self._places_m)
-        up.places.write(self._places_m)
-        self._first_stats = up.medium.stats() if options.is_cosimulated else None
+        running.media.place(self._places_m)
+        running.places.write(self._places_m)
+        self._first_stats = running.medium.stats() if options.is_cosimulated else None
         self.members = members
-        self.login = Login(USER, up.private_key, up.host_keys)
+        self.login = Login(USER, running.private_key, running.host_keys)
 
     def connect(self, name: str, timeout_s: float) -> socket.socket:
         """Implement `Lab.connect`."""
@@ -83,7 +83,7 @@ class EmulatedLab:
     def move(self, name: str, to: Destination) -> Vector:
         """Implement `Lab.move`."""
         with self._lock:
-            place_m = placement.moved_m(self._places_m[name], to, self._world)
+            place_m = placement.destination_m(self._places_m[name], to, self._world)
             places_m = self._places_m | {name: place_m}
             # As in a trial, the robot is updated before the medium, whose physics refuses a place in an obstacle.
             self._assign_place(name, place_m)
@@ -105,17 +105,17 @@ class EmulatedLab:
         """Return a context that keeps the medium up to date with robots that steer themselves."""
         if not any(robot.spec.steers for robot in self._running.robots.values()):
             return nullcontext()
-        self._watch = MotionThread(self._follow, "watch")
+        self._watch = MotionThread(self._update_places, "watch")
         return self._watch
 
-    def _follow(self) -> float:
+    def _update_places(self) -> float:
         """Update the places of robots that steer themselves; return the seconds until the next update."""
         with self._lock:
             states = {
                 name: motion.state
                 if mavlink_of(self.members[name].profile) is not None
                 else placement.on_ground(motion.state, self._world)
-                for name, motion in self_steered(self._running.robots, self._path_starts_ns).items()
+                for name, motion in self_steered_motions(self._running.robots, self._path_starts_ns).items()
             }
             if states != self._states:
                 self._states = states
@@ -131,7 +131,8 @@ class EmulatedLab:
         if before is None:
             return None
         now, bound_ns = self._running.medium.stats(), round(self._options.late_bound * 1e9)
-        packets, windows = _added(before.late, now.late), _added(before.late_windows, now.late_windows)
+        packets = _new_counts(before.late, now.late)
+        windows = _new_counts(before.late_windows, now.late_windows)
         return LabLateness(
             bound_s=self._options.late_bound,
             packet_max_s=max(packets) / 1e9 if packets else None,
@@ -154,8 +155,8 @@ def bring_up(
     Raises:
         FieldkitError: A robot or the medium did not start.
     """
-    with running_robots(members, options=options, world=world, ros=ros, seed=seed) as up:
-        lab = EmulatedLab(members, up, options, world)
+    with running_robots(members, options=options, world=world, ros=ros, seed=seed) as running:
+        lab = EmulatedLab(members, running, options, world)
         with lab.watching():
             yield lab
 
@@ -195,7 +196,7 @@ def overview(
         LabLink(
             (names[first_index], names[second_index]),
             min(channel.snr_db(first_index, second_index), channel.snr_db(second_index, first_index)),
-            channel.linked(first_index, second_index),
+            channel.are_linked(first_index, second_index),
             tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
         )
         for (first_index, second_index), crossed in zip(pairs, world.crossings(first, second), strict=True)
@@ -206,8 +207,8 @@ def overview(
     return Overview(world.name, world.area_m, outlines, robots, links)
 
 
-def _added(before: Mapping[int, int], after: Mapping[int, int]) -> Counter[int]:
-    """Return the counts that were added to a histogram."""
+def _new_counts(before: Mapping[int, int], after: Mapping[int, int]) -> Counter[int]:
+    """Return the counts by which a histogram has increased."""
     return Counter(after) - Counter(before)
 
 

@@ -16,7 +16,7 @@ from sim_backends.emulated import placement as places
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import EmulatedRobot, Laptop
 from sim_backends.emulated.provisioning import RobotKey
-from sim_backends.emulated.ros.steered import Steered
+from sim_backends.emulated.ros.motion_record import RecordedMotion
 from sim_backends.world.motion import STILL, Motion, State
 from sim_backends.world.world import World
 
@@ -38,11 +38,11 @@ class MotionThread:
     """Thread that reports a motion step by step; use it as a context manager, which stops the thread on leaving.
 
     Args:
-        step: Reports where the robots are now; returns the seconds until its next call, or None at the end.
+        step: Reports the present places of the robots; returns the seconds until its next call, or None at the end.
         name: Name of the thread.
 
     Raises:
-        FieldkitError: The error of `step`, raised when the context is left, unless its body raised.
+        FieldkitError: The error of `step`. It is raised when the context is left, unless its body raised an error.
     """
 
     def __init__(self, step: Callable[[], float | None], name: str = "motion") -> None:
@@ -64,7 +64,7 @@ class MotionThread:
             raise self._error
 
     def check(self) -> None:
-        """Raise the error of `step` if there was one, since no step follows it."""
+        """Raise the error of `step` if there was one; after an error there are no more steps."""
         if self._error is not None:
             raise self._error
 
@@ -76,9 +76,9 @@ class MotionThread:
             self._error = error
 
 
-def self_steered(
+def self_steered_motions(
     robots: Mapping[RobotKey, EmulatedRobot], path_starts_ns: Mapping[RobotKey, int]
-) -> dict[RobotKey, Steered]:
+) -> dict[RobotKey, RecordedMotion]:
     """Return the current motion of each robot that has steered itself since the lab assigned its last path.
 
     Args:
@@ -86,16 +86,16 @@ def self_steered(
         path_starts_ns: Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
     """
     now_ns = time.monotonic_ns()
-    recorded = {key: robot.steered() for key, robot in robots.items()}
+    motions = {key: robot.recorded_motion() for key, robot in robots.items()}
     return {
-        key: steered.at(now_ns) if steered.moves else steered
-        for key, steered in recorded.items()
-        if steered is not None and steered.path_start_ns == path_starts_ns.get(key)
+        key: motion.at(now_ns) if motion.is_moving else motion
+        for key, motion in motions.items()
+        if motion is not None and motion.path_start_ns == path_starts_ns.get(key)
     }
 
 
 class PlacesRobots(Protocol):
-    """A medium, or several."""
+    """One medium, or several media."""
 
     def place(
         self,
@@ -115,7 +115,7 @@ class Mobility:
         media: The media that carry the robots' packets.
         world: The world around the robots.
         laptop: The operator's laptop, placed beside the robots; None if it is not on the air.
-        robots: Handles of the robots, which get their paths and report their motion if they steer themselves.
+        robots: Handles of the robots, which receive their paths and report their motion if they steer themselves.
         write_positions: Called with the robots' positions, metres east, north, up, for the lasers of other robots.
     """
 
@@ -141,7 +141,7 @@ class Mobility:
         self._motions: list[tuple[int, Motion]] = []
         # Start of each robot's last assigned path; motion that refers to an earlier path is ignored.
         self._path_starts_ns: dict[Role, int] = {}
-        self._last_steered: dict[Role, Steered] = {}
+        self._last_motions: dict[Role, RecordedMotion] = {}
         self._track: list[TrackPoint] = []
         # Each motion runs in a separate thread.
         self._lock = threading.RLock()
@@ -160,7 +160,7 @@ class Mobility:
             self._update_medium()
 
     def return_to_place(self, role: Role) -> None:
-        """Put one robot back in its place, immediately; errors as `set_out_of_range`."""
+        """Put one robot back in its place, immediately. Raises the errors of `set_out_of_range`."""
         with self._lock:
             self._send_path(Move(role, (), speed_m_s=1.0), time.monotonic_ns())
             self._update_medium()
@@ -168,7 +168,7 @@ class Mobility:
     def set_out_of_range(self, role: Role | None) -> None:
         """Move one robot out of the range of all others, or move it back with None.
 
-        Without the relay no robot receives another.
+        If the relay is out of range, no robot receives packets of another robot.
 
         Raises:
             LinkError: The medium ended or did not answer.
@@ -181,7 +181,7 @@ class Mobility:
 
     @contextmanager
     def moving(self, move: Move) -> Iterator[None]:
-        """Let a robot move while the body runs; afterwards, also after an error, it is back at its place immediately.
+        """Move a robot while the body runs; afterwards, also after an error, put it back at its place immediately.
 
         Raises:
             LinkError: The medium ended or did not answer.
@@ -210,16 +210,16 @@ class Mobility:
     def _watch(self) -> float:
         """Update the medium if a robot has moved itself; return the seconds until the next call."""
         with self._lock:
-            steered = self._steered()
-            if steered == self._last_steered and not any(motion.moves for motion in steered.values()):
+            motions = self._self_steered_motions()
+            if motions == self._last_motions and not any(motion.is_moving for motion in motions.values()):
                 return WATCH_S
-            self._last_steered = steered
+            self._last_motions = motions
             self._update_medium()
-            fastest_m_s = max((math.hypot(*motion.velocity_m_s) for motion in steered.values()), default=0.0)
+            fastest_m_s = max((math.hypot(*motion.velocity_m_s) for motion in motions.values()), default=0.0)
             return min(max(STEP_M / fastest_m_s, _MIN_PERIOD_S), WATCH_S) if fastest_m_s else WATCH_S
 
-    def _steered(self) -> dict[Role, Steered]:
-        return self_steered(self._robots, self._path_starts_ns)
+    def _self_steered_motions(self) -> dict[Role, RecordedMotion]:
+        return self_steered_motions(self._robots, self._path_starts_ns)
 
     def track(self, since_utc_ns: int) -> tuple[TrackPoint, ...]:
         """Return the positions of all robots from a time on; earlier ones are discarded."""
@@ -244,22 +244,23 @@ class Mobility:
         """Send the medium all positions; return the seconds until the next update, or None without motion."""
         with self._lock:
             placement = self._require_placement()
-            # The time of the track is that of the positions: the medium's answer may take long on a busy machine.
+            # The track gets the time of the positions, because the medium's answer may take long on a busy machine.
             now_ns, utc_ns = time.monotonic_ns(), time.time_ns()
             positions_m = places.positions_m(self._cast, placement, self._world)
             states = {name: State(place_m) for name, place_m in positions_m.items()}
             for start_ns, motion in self._motions:
                 states |= motion.at(now_ns - start_ns)
             states |= {
-                self._cast[role].name: self._steered_state(role, steered) for role, steered in self._steered().items()
+                self._cast[role].name: self._self_steered_state(role, steered)
+                for role, steered in self._self_steered_motions().items()
             }
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
                 states[self._laptop.name] = State(places.laptop_m(self._cast, placement, self._world))
-            absent = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
-            self._write_positions({name: state.position_m for name, state in states.items() if name != absent})
-            if absent is not None:
-                states = {} if absent == relay else {name: state for name, state in states.items() if name != absent}
+            hidden = None if self._out_of_range_role is None else self._cast[self._out_of_range_role].name
+            self._write_positions({name: state.position_m for name, state in states.items() if name != hidden})
+            if hidden is not None:
+                states = {} if hidden == relay else {name: state for name, state in states.items() if name != hidden}
             self._media.place(
                 {name: state.position_m for name, state in states.items()},
                 relay=relay if relay in states else None,
@@ -278,19 +279,19 @@ class Mobility:
             if before is None or (before.position_m, before.velocity_m_s) != now:
                 self._track.append(TrackPoint(utc_ns, role, *now))
 
-    def _steered_state(self, role: Role, steered: Steered) -> State:
+    def _self_steered_state(self, role: Role, steered: RecordedMotion) -> State:
         """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""
         flies = mavlink_of(self._cast[role].profile) is not None
         return steered.state if flies else places.on_ground(steered.state, self._world)
 
     def _next_update_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
-        left_ns = [
+        remaining_ns = [
             math.inf if motion.end_ns is None else start_ns + motion.end_ns - now_ns
             for start_ns, motion in self._motions
         ]
-        if all(left <= 0 for left in left_ns):
+        if all(duration_ns <= 0 for duration_ns in remaining_ns):
             return None
         fastest_m_s = max((math.hypot(*state.velocity_m_s) for state in states.values()), default=0.0)
         step_s = STEP_M / fastest_m_s if fastest_m_s else _MAX_PERIOD_S
-        next_end_s = min(left for left in left_ns if left > 0) / 1e9
+        next_end_s = min(duration_ns for duration_ns in remaining_ns if duration_ns > 0) / 1e9
         return min(max(step_s, _MIN_PERIOD_S), _MAX_PERIOD_S, next_end_s)

@@ -14,7 +14,7 @@ MAVLINK: Final = "mavlink"
 
 
 class DriveSection(Protocol):
-    """How a ground robot is driven by velocities on a topic; its keys are in docs/reference/robot-profile.md."""
+    """The base of a ground robot, driven by velocities on a topic; keys: docs/reference/robot-profile.md."""
 
     topic: str
     turn_rad_s: float

@@ -27,15 +27,15 @@ from sim_backends.emulated.robot.init import START_S
 from sim_backends.emulated.robot.spec import HOME, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.ssh_server import SSH_PORT
 from sim_backends.emulated.ros.laser import PlacesWriter
+from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 from sim_backends.emulated.ros.own_motion import AssignedPath
-from sim_backends.emulated.ros.steered import Steered, SteeredRecord
 from sim_backends.radio.antennas import antenna_of, fixed_mode
 from sim_backends.world.world import World
 
 if TYPE_CHECKING:
     from sim_backends.emulated.linux_wifi.radios import HwsimRadio
 
-# Equal to the robots' own radios, so that a link has the same quality in both directions.
+# The same radio as on robots, so that a link has the same quality in both directions.
 LAPTOP_RADIO: Final = Radio(interface="wlan0", standard="802.11n 2.4 GHz", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
@@ -60,7 +60,9 @@ class Node:
         self.interface = interface
         self.address = address
         self._radio_fd: int | None = None
-        self._worker = Worker(name, "sim_backends.emulated.robot.init", within=namespaces.command(), home=HOME)
+        self._worker = Worker(
+            name, "sim_backends.emulated.robot.init", command_prefix=namespaces.command(), home=HOME
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -113,7 +115,7 @@ class Node:
             TestbedLostError: The node has exited.
         """
         try:
-            # The socket is made in the node and connected here, so that a slow peer blocks this thread, not the node.
+            # The socket is created in the node and connected here, so a slow peer blocks this thread, not the node.
             _, (fd,) = self._worker.request({"do": "socket"})
         except TestbedLostError:
             raise
@@ -133,7 +135,7 @@ class Node:
         self._worker.check_alive()
 
     def request_exit(self) -> None:
-        """Request that the node stops, without waiting for it; requests under way fail immediately."""
+        """Request that the node stops, without waiting for it; pending requests fail immediately."""
         self._worker.request_exit()
 
     def close(self) -> None:
@@ -160,41 +162,41 @@ class EmulatedRobot(Node):
         link_fds: Descriptor of the TUN device of each further link, by its name, after `open_links`.
 
     Raises:
-        ConfigurationError: As `Node`.
+        ConfigurationError: See `Node`.
     """
 
     def __init__(self, spec: RobotSpec, places_fd: int | None = None) -> None:
         super().__init__(spec.name, interface=spec.interface, address=spec.address)
         self.spec = spec
         self._places_fd = places_fd
-        self._record: SteeredRecord | None = None
+        self._record: MotionRecord | None = None
         self.physics_fds: Sequence[int] = ()
         self.link_fds: dict[str, int] = {}
 
     def build(self) -> None:
-        """Give the robot its host name and its file system. Errors as `open_radio`."""
+        """Give the robot its host name and its file system. Raises the errors of `open_radio`."""
         shared = () if self._places_fd is None else (self._places_fd,)
         _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
-        self._record = SteeredRecord(fd)
+        self._record = MotionRecord(fd)
         self.physics_fds = (fd, *others) if others else ()
 
     def open_wifi(self, device: str) -> None:
-        """Bring up the Wi-Fi interface `device`, which was moved to the robot. Errors as `open_radio`."""
+        """Bring up the Wi-Fi interface `device`, which was moved to the robot. Raises the errors of `open_radio`."""
         if self.spec.wifi is None:
             raise RobotError("it has no Wi-Fi of Linux", where=self.name)
         link = {"device": device, "interface": self.interface, "address": self.address}
         self._worker.request({"do": "open wifi", "wifi": asdict(self.spec.wifi), **link})
 
-    def steered(self) -> Steered | None:
-        """Return the motion that the robot recorded last, or None if it never steered itself. Sends no request."""
+    def recorded_motion(self) -> RecordedMotion | None:
+        """Return the last motion that the robot recorded, or None if it never steered itself. Sends no request."""
         return None if self._record is None else self._record.read()
 
     def start(self) -> None:
-        """Start the robot's programs and return when they are ready. Errors as `open_radio`."""
+        """Start the robot's programs and return when they are ready. Raises the errors of `open_radio`."""
         self._worker.request({"do": "start", "robot": asdict(self.spec)}, timeout_s=START_S + REPLY_S)
 
     def open_links(self) -> None:
-        """Bring up the interfaces of its further links. Errors as `open_radio`."""
+        """Bring up the interfaces of its further links. Raises the errors of `open_radio`."""
         for name, (interface, address) in self.spec.links.items():
             mesh = self.spec.mesh_hello_s is not None
             _, fds = self._worker.request(
@@ -204,12 +206,12 @@ class EmulatedRobot(Node):
                 (self.link_fds[name],) = fds
 
     def switch_off(self, link: str = "") -> None:
-        """Take the interface of a further link down, or of the radio. Errors as `open_radio`."""
+        """Take the interface of a further link, or of the radio, down. Raises the errors of `open_radio`."""
         interface, _ = self.spec.links.get(link, (self.spec.interface, ""))
         self._worker.request({"do": "switch off", "interface": interface})
 
     def switch_on(self, link: str = "") -> None:
-        """Bring the interface of a further link up again, or of the radio. Errors as `open_radio`."""
+        """Bring the interface of a further link, or of the radio, up again. Raises the errors of `open_radio`."""
         if link in self.spec.links:
             self._worker.request({"do": "switch link on", "interface": self.spec.links[link][0]})
         else:
@@ -220,19 +222,22 @@ class EmulatedRobot(Node):
         return [self.spec.interface, *(self.spec.links[name][0] for name in self.link_fds)]
 
     def kill(self, process: str) -> None:
-        """Kill every process of this name. Errors as `open_radio`; it is also an error if there is none."""
+        """Kill every process of this name.
+
+        Raises the errors of `open_radio`, and RobotError if there is no such process.
+        """
         self._worker.request({"do": "kill", "process": process})
 
     def move(self, path: AssignedPath) -> None:
-        """Send the robot's sensors the path on which the lab moves it. Errors as `open_radio`."""
+        """Send the robot's sensors the path on which the lab moves it. Raises the errors of `open_radio`."""
         self._worker.request({"do": "move", "path": asdict(path)})
 
     def halt(self) -> None:
-        """Cut the power: all processes except init are killed, and memory is lost. Errors as `open_radio`."""
+        """Cut the power: kill all processes but init, and discard the memory. Raises the errors of `open_radio`."""
         self._worker.request({"do": "halt", "interfaces": self._interfaces})
 
     def boot(self) -> None:
-        """Boot after `halt`: the interface is up and the programs are starting. Errors as `open_radio`."""
+        """Boot after `halt`: the interface is up and the programs are starting. Raises the errors of `open_radio`."""
         self._worker.request({"do": "boot", "interfaces": self._interfaces, "robot": asdict(self.spec)})
 
     @override
@@ -249,7 +254,7 @@ class EmulatedRobot(Node):
     def connect(self, timeout_s: float) -> socket.socket:
         """Return a TCP connection to the robot's SSH server over its loopback, which bypasses the radio.
 
-        Errors as `stream_to`.
+        Raises the errors of `stream_to`.
         """
         return self.stream_to("127.0.0.1", SSH_PORT, timeout_s)
 
@@ -261,14 +266,14 @@ class Laptop(Node):
         address: Its address with the prefix length.
 
     Raises:
-        ConfigurationError: As `Node`.
+        ConfigurationError: See `Node`.
     """
 
     def __init__(self, address: str) -> None:
         super().__init__(LAPTOP_NAME, interface=LAPTOP_RADIO.interface, address=address)
 
     def reach(self, address: str, timeout_s: float) -> socket.socket:
-        """Return a TCP connection to the SSH server of the robot at `address`. Errors as `stream_to`."""
+        """Return a TCP connection to the SSH server of the robot at `address`. Raises the errors of `stream_to`."""
         return self.stream_to(address, SSH_PORT, timeout_s)
 
 
@@ -278,7 +283,7 @@ _MAX_PARALLEL_STARTS: Final = 16
 
 @dataclass(frozen=True)
 class RunningRobots(Generic[RobotKey]):
-    """Running robots on their media, without places yet.
+    """Running robots on their media; they have no places yet.
 
     Attributes:
         robots: The robots.
@@ -308,7 +313,7 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    Arguments as `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
+    Arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
     and connect to it over the radio.
 
     Raises:
@@ -324,22 +329,22 @@ def running_robots(
         if options.has_linux_wifi:
             from sim_backends.emulated.linux_wifi import lab  # noqa: PLC0415 (other labs need none of it)
 
-            wifi = lab.parts(robots, options.linux_wifi, options.radio)
+            wifi = lab.wifi_specs(robots, options.linux_wifi, options.radio)
             radios = lab.radios_of(robots.values(), options.radio)
             medium: MediumClient = stack.enter_context(lab.medium(options.radio, world, seed, radios, wifi.values()))
         elif options.is_cosimulated:
-            medium = stack.enter_context(_cosimulated(options, world, robots, seed, framing))
+            medium = stack.enter_context(_cosimulated_medium(options, world, robots, seed, framing))
         else:
             medium = stack.enter_context(MediumClient(options.radio, world, seed=seed, framing=framing))
-        used = {name for robot in robots.values() for name in robot.profile.further_links}
+        used_links = {name for robot in robots.values() for name in robot.profile.further_links}
         links = {
             name: stack.enter_context(MediumClient(link_options, world, seed=seed, framing=framing))
             for name, link_options in options.links.items()
-            if name in used
+            if name in used_links
         }
         media = Media(medium, links)
         places = stack.enter_context(closing(PlacesWriter([robot.name for robot in robots.values()])))
-        # The pool is left after the robots: a request that waits for a robot fails only when the robot exits.
+        # The pool is shut down after the robots have exited, because a request that waits for a robot ends only then.
         pool = stack.enter_context(ThreadPoolExecutor(min(len(robots), _MAX_PARALLEL_STARTS)))
         running: dict[RobotKey, EmulatedRobot] = {}
         for key in robots:
@@ -350,7 +355,7 @@ def running_robots(
             running[key] = stack.enter_context(EmulatedRobot(spec, places.fd))
         list(pool.map(partial(_build, radios=radios), running.values()))
         # Robots with a ROS master start first, because the other robots wait for it.
-        started = pool.map(
+        startups = pool.map(
             EmulatedRobot.start, sorted(running.values(), key=lambda robot: not robot.spec.runs_master)
         )
         for key, robot in running.items():
@@ -361,7 +366,7 @@ def running_robots(
         if any(robot.spec.waits_for_another for robot in running.values()):
             names = [*(robot.name for robot in running.values()), *(options.radio.access_points if wifi else ())]
             media.place(placement.side_by_side_m(names))
-        list(started)
+        list(startups)
         yield RunningRobots(
             running, medium, media, places, {key: pair.public for key, pair in host_keys.items()}, login.private
         )
@@ -369,7 +374,7 @@ def running_robots(
             robot.request_exit()
 
 
-def _cosimulated(
+def _cosimulated_medium(
     options: EmulatedOptions, world: World, robots: Mapping[RobotKey, Robot | LabRobot], seed: int, framing: Framing
 ) -> MediumClient:
     from sim_backends.emulated import simulator_choice  # noqa: PLC0415 (other labs import no simulator)

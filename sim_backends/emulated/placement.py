@@ -39,14 +39,14 @@ def positions_m(cast: Cast, placement: Placement, world: World) -> dict[str, Vec
 
 
 def motion(cast: Cast, placement: Placement, move: Move, world: World) -> Motion:
-    """Return the motion of a ground robot of a trial; errors as `positions_m`."""
+    """Return the motion of a ground robot in a trial. Raises the errors of `positions_m`."""
     corners = [(*corner, 0.0) for corner in _corners_m(placement, move, world)]
     path = WayPoints(cast[move.role].name, corners, move.speed_m_s)
     return OnGround(path, lambda place_m: antenna_m(world, place_m)[2])
 
 
 def assigned_path(placement: Placement, move: Move, world: World, start_ns: int) -> AssignedPath:
-    """Return the path of a move in the form that the robot receives; errors as `positions_m`.
+    """Return the path of a move in the form that the robot receives; raises the errors of `positions_m`.
 
     At its place the robot faces away from the other end of its link.
 
@@ -120,7 +120,7 @@ def square_m(names: Collection[str], world: World) -> dict[str, Vector]:
     }
 
 
-def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
+def destination_m(place_m: Vector, to: Destination, world: World) -> Vector:
     """Return the position of an antenna after a move.
 
     Args:
@@ -138,16 +138,16 @@ def moved_m(place_m: Vector, to: Destination, world: World) -> Vector:
         raise ConfigurationError(
             f"{end_m[0]:g} m east, {end_m[1]:g} m north is outside of the world {world.name}, which is "
             f"{width_m:g} m by {depth_m:g} m",
-            remedy="choose a place inside it, or select a larger world by emulated.world in the site file; see: "
+            remedy="choose a place inside it, or select a larger world with emulated.world in the site file; see: "
             "fieldkit docs world-file",
         )
     ground_m = world.ground_m(end_m)
     if to.relative:
-        over_ground_m = place_m[2] - world.ground_m(place_m[:2]) + (to.up_m or 0.0)
+        above_ground_m = place_m[2] - world.ground_m(place_m[:2]) + (to.up_m or 0.0)
     else:
-        over_ground_m = ANTENNA_M if to.up_m is None else to.up_m - ground_m
-    up_m = ground_m + over_ground_m
-    if not 0 <= over_ground_m <= _CEILING_M:
+        above_ground_m = ANTENNA_M if to.up_m is None else to.up_m - ground_m
+    up_m = ground_m + above_ground_m
+    if not 0 <= above_ground_m <= _CEILING_M:
         raise ConfigurationError(
             f"{up_m:g} m up is not a valid height: the ground is at {ground_m:g} m there, and nothing flies above "
             f"{_CEILING_M / 1000:g} km",
@@ -160,10 +160,10 @@ def laptop_m(cast: Cast, placement: Placement, world: World) -> Vector:
     """Return the position of the laptop: 2 m beside the robot that stays in its place.
 
     With a master this is the relay, because operators are near the access point. Without a master it is the receiver,
-    because a person carries the sender, also behind the wall, where the laptop never is.
+    because a person carries the sender, possibly behind a wall, and the laptop is never behind a wall.
     """
-    staying = Role.RELAY if placement.topology is Topology.MASTER else Role.RECEIVER
-    east_m, north_m, up_m = positions_m(cast, placement, world)[cast[staying].name]
+    stationary_role = Role.RELAY if placement.topology is Topology.MASTER else Role.RECEIVER
+    east_m, north_m, up_m = positions_m(cast, placement, world)[cast[stationary_role].name]
     return east_m, north_m + _OPERATOR_M, up_m
 
 

@@ -1,6 +1,7 @@
 """Provisioning of emulated robots: addresses, SSH keys, message definitions, and the specification of each robot.
 
-Keys are made per lab and never written to the host's disk. This is the only module that imports `cryptography`.
+Each lab has new keys, which are never written to the host's disk. This is the only module that imports
+`cryptography`.
 """
 
 from collections.abc import Mapping
@@ -86,7 +87,7 @@ class KeyPair:
 def definition(kind: str, text: str = "") -> Definition:
     """Return the definition of the ROS 1 message type `package/Name`; `text` is used if ROS has no such type.
 
-    Errors as `template_of`.
+    Raises the errors of `template_of`.
     """
     from sim_backends.emulated.ros import templates  # noqa: PLC0415 (rosbags takes 50 ms, as above)
 
@@ -94,12 +95,12 @@ def definition(kind: str, text: str = "") -> Definition:
 
 
 def sensors_of(robot: "Robot | LabRobot") -> tuple[Sensor, ...]:
-    """Return the sensors of a robot, one per published topic. Errors as `template_of`."""
+    """Return the sensors of a robot, one per published topic. Raises the errors of `template_of`."""
     return tuple(_sensor(topic) for topic in robot.profile.topics)
 
 
 def _definitions(robot: "Robot | LabRobot") -> dict[str, Definition]:
-    """Return the definitions of the message types that a robot publishes; errors as `template_of`."""
+    """Return the definitions of the message types that a robot publishes. Raises the errors of `template_of`."""
     definitions = {topic.type: definition(topic.type, topic.definition) for topic in robot.profile.topics}
     if static_frames.links(sensors_of(robot)):
         definitions[static_frames.TYPE] = definition(static_frames.TYPE)
@@ -151,11 +152,11 @@ def neighbour(number: int, profile: RobotProfile) -> Neighbour:
 
 
 def ros_master_of(robot: "Robot | LabRobot") -> str:
-    """Return the address of the ROS master that a robot uses; in an interactive lab each robot has its own."""
+    """Return the address of the ROS master that a robot uses; in an interactive lab each robot runs a master."""
     return (robot.ros_master if isinstance(robot, Robot) else "") or LOOPBACK
 
 
-def _registered(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[str, ...]:
+def _registered_topics(robots: "Mapping[RobotKey, Robot | LabRobot]", key: RobotKey) -> tuple[str, ...]:
     """Return the topics that a robot registers at its ROS master.
 
     If robots share a master, a topic that several of them have is registered by the first one: nodes of a second
@@ -185,9 +186,9 @@ def drives_by_topic(profile: RobotProfile, options: EmulatedOptions) -> bool:
 
 
 def ros2_middleware(profile: RobotProfile, options: EmulatedOptions) -> str:
-    """Return the middleware of a profile's ROS 2 over the radio, `dds` or `zenoh`, or "" without one.
+    """Return the middleware of a profile's ROS 2 over the radio: `dds`, `zenoh`, or "" if it has none.
 
-    The result is "" too if the middleware is not installed on this machine.
+    The result is also "" if the middleware is not installed on this machine.
     """
     ros = profile.ros
     if ros is None or ros.variant != "ros2" or options.ros is RosChoice.BUILTIN:
@@ -201,7 +202,7 @@ def link_addresses(profile: RobotProfile, address: str, options: EmulatedOptions
 
     Args:
         profile: The robot's profile.
-        address: Its address on the radio; its addresses have the same last byte.
+        address: Its address on the radio; all its addresses have the same last byte.
         options: The lab's options.
 
     Raises:
@@ -242,7 +243,9 @@ def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:
 def _ros2_spec(
     robots: "Mapping[RobotKey, Robot | LabRobot]", robot: "Robot | LabRobot", options: EmulatedOptions
 ) -> Ros2Spec | None:
-    """Return the ROS 2 of a robot over the radio, or None if it has none or its middleware is not installed here.
+    """Return the settings of a robot's ROS 2 over the radio.
+
+    The result is None if the robot has none, or if its middleware is not installed on this machine.
 
     Raises:
         ConfigurationError: The robot with the router is not among `robots`.
@@ -310,7 +313,7 @@ def robot_spec(
         setup=profile_ros.command.setup if profile_ros else (),
         ros_master=ros_master_of(robot),
         sensors=sensors_of(robot),
-        registered=_registered(robots, key),
+        registered_topics=_registered_topics(robots, key),
         definitions=_definitions(robot),
         mavlink_port=mavlink.port if mavlink else None,
         simulated_flight=mavlink is not None and options.is_cosimulated,

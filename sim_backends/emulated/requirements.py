@@ -21,10 +21,10 @@ PACKAGE_OF: Final = {
     "tcpdump": "tcpdump",
     "ping": "iputils-ping",
 }
-"""Debian package per program that every emulated lab runs."""
+"""Debian package of each program that every emulated lab runs."""
 
 ORDINARY_PACKAGE_OF: Final = {"newuidmap": "uidmap", "newgidmap": "uidmap"}
-"""Debian package per program that only an ordinary user needs."""
+"""Debian package of each program that only an ordinary user needs."""
 
 VARIANT_PACKAGE_OF: Final = {
     "nc.openbsd": "netcat-openbsd",
@@ -38,7 +38,7 @@ VARIANT_PACKAGE_OF: Final = {
     "nft": "nftables",
     "wpa_supplicant": "wpasupplicant",
 }
-"""Debian package per program that only an option of the lab needs."""
+"""Debian package of each program that only an option of the lab needs."""
 
 ROS_PACKAGES: Final = ("python3-rosmaster", "python3-rosbag", "python3-rospy", "python3-sensor-msgs")
 _MASTER_FILES: Final = {services.ROSCORE: "python3-roslaunch", "/usr/lib/rosout/rosout": "rosout"}
@@ -77,7 +77,7 @@ def _check_files() -> None:
     missing = [path for path in rootfs.OWN_FILES if not Path(path).exists()]
     if missing:
         raise ConfigurationError(
-            f"this machine has no {', '.join(missing)}, over which each robot's file is mounted",
+            f"this machine has no {', '.join(missing)}; each robot mounts its own file there",
             remedy=f"sudo touch {' '.join(missing)}",
         )
 

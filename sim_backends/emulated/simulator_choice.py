@@ -21,19 +21,19 @@ from sim_backends.federates.named import (
     PythonFederate,
     command_line,
     default_options,
-    named,
+    named_federate,
 )
 from sim_backends.physics.robot_limits import BODIES, TURTLEBOT3_BURGER, DriveLimits, quadrotor
 from sim_backends.radio.radio_options import INFRASTRUCTURE
 
 _EXTERNAL_NETWORK = SyncOptions.model_validate({"name": "sliding_window", "window": "2ms"})
-"""Default for a network in another process: an exchange at each of its events would take too long for real time.
-ns-3 has about 14 events per packet, and an exchange takes 0.2 ms."""
+"""Default for a network in another process, because an exchange at each of its events would take too long for real
+time: ns-3 has about 14 events per packet, and an exchange takes 0.2 ms."""
 
 
 GAZEBO: Final = "gazebo"
 _EXTERNAL_PHYSICS = SyncOptions.model_validate({"name": "sliding_window", "window": "10ms"})
-"""Default for Gazebo: an exchange for each step of 1 ms would take too long for real time."""
+"""Default for Gazebo, because an exchange at each step of 1 ms would take too long for real time."""
 
 
 def sync_of(options: EmulatedOptions) -> SyncOptions:
@@ -49,7 +49,7 @@ def resolve(options: EmulatedOptions) -> Simulators:
     """Return the simulators of a lab; programs are compiled if necessary.
 
     Raises:
-        ConfigurationError: A simulator is not installed, does not support the lab, or the policy is invalid.
+        ConfigurationError: A simulator is not installed or does not support the lab, or the policy is invalid.
     """
     sync = sync_of(options)
     policy = make_policy(sync.name, **sync.parameters)
@@ -68,7 +68,7 @@ def _physics(options: EmulatedOptions) -> str:
     name = options.physics or KINEMATIC
     if name == KINEMATIC:
         return name
-    federate = named(name, PHYSICS)
+    federate = named_federate(name, PHYSICS)
     if isinstance(federate, ProgramFederate):
         return federate.command()
     if isinstance(federate, PythonFederate):
@@ -77,9 +77,10 @@ def _physics(options: EmulatedOptions) -> str:
 
 
 def _gazebo_options() -> dict[str, Any]:
-    """Return the options of Gazebo, with its partition and address from the environment, which the medium lacks.
+    """Return the options of Gazebo, with its partition and address from the environment.
 
-    Velocities are means over a window: velocities over its last step would need a second request per window.
+    They are options because the medium does not inherit the environment. Velocities are means over a window, because
+    velocities over its last step would need a second request per window.
     """
     set_options = {
         option: os.environ.get(f"GZ_{variable}") or os.environ.get(f"IGN_{variable}")
@@ -104,7 +105,7 @@ def _network(options: EmulatedOptions) -> str:
     ):
         if is_set:
             raise ConfigurationError(
-                f"the network {name} does not support {key} of emulated",
+                f"the network {name} does not support emulated: {key}",
                 remedy=f"remove it, or write network: {BUILTIN}",
             )
     return command_line(name, NETWORK)
@@ -136,12 +137,12 @@ def summary(options: EmulatedOptions) -> Mapping[str, str]:
     policy = make_policy(sync.name, **sync.parameters)
     defaults = {name: parameter.default for name, parameter in inspect.signature(type(policy)).parameters.items()}
     values = sync.parameters
-    used = [
+    parameter_texts = [
         f"{name.rpartition('_')[0]} {values[name]:g} {name.rpartition('_')[2]}" for name in defaults if name in values
     ]
     return {
         "physics": options.physics or KINEMATIC,
         "network": options.network or BUILTIN,
-        "sync": ", ".join([sync.name, *used]),
+        "sync": ", ".join([sync.name, *parameter_texts]),
         "step": f"{sync.step:g} s",
     }

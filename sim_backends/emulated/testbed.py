@@ -64,14 +64,16 @@ class EmulatedOracle:
 
     def delays(self, source: Role, destination: Role, protocol: Protocol, port: int, *, link: str = "") -> DelayParts:
         """Implement `Oracle.delays`."""
-        return self._media.of(link).delays(
+        return self._media.medium_of(link).delays(
             self._names[source], self._names[destination], _IP_PROTOCOL[protocol], port
         )
 
     def lateness(self) -> Lateness:
         """Implement `Oracle.lateness`."""
         windows = self._medium.stats().late_windows if self._has_windows else None
-        return Lateness(bound_ns=round(self._late_bound_s * 1e9), packets=self._media.late(), windows=windows)
+        return Lateness(
+            bound_ns=round(self._late_bound_s * 1e9), packets=self._media.lateness_counts(), windows=windows
+        )
 
     def links(self, *, continue_sampling: bool) -> dict[Role, list[LinkSample]]:
         """Implement `Oracle.links`."""
@@ -144,15 +146,15 @@ class EmulatedTestbed:
         return DONE
 
     def inject(self, fault: Fault) -> float | None:
-        """Implement `Testbed.inject`; the fault is also removed if the call is interrupted."""
+        """Implement `Testbed.inject`; the fault is also reverted if the call is interrupted."""
         robot = self.robots[fault.role]
         match fault.kind:
             case FaultKind.LINK_DOWN:
-                down, up = partial(robot.switch_off, fault.link), partial(robot.switch_on, fault.link)
-                return _apply_for(fault.duration_s, down, up)
+                switch_off, switch_on = partial(robot.switch_off, fault.link), partial(robot.switch_on, fault.link)
+                return _apply_for(fault.duration_s, switch_off, switch_on)
             case FaultKind.OUT_OF_RANGE:
-                remove = partial(self._mobility.set_out_of_range, fault.role)
-                return _apply_for(fault.duration_s, remove, partial(self._mobility.set_out_of_range, None))
+                move_away = partial(self._mobility.set_out_of_range, fault.role)
+                return _apply_for(fault.duration_s, move_away, partial(self._mobility.set_out_of_range, None))
             case FaultKind.REBOOT:
                 _apply_for(self._boot_s, robot.halt, robot.boot)
             case FaultKind.KILL:
@@ -173,7 +175,10 @@ class EmulatedTestbed:
 
 
 class LinuxWifiTestbed(EmulatedTestbed):
-    """Robots with the Wi-Fi of Linux; their radio is measured as on real robots. Arguments as the base class."""
+    """Robots with the Wi-Fi of Linux, whose radio is measured as on real robots.
+
+    Arguments are those of the base class.
+    """
 
     @property
     @override
@@ -182,7 +187,7 @@ class LinuxWifiTestbed(EmulatedTestbed):
 
 
 def _apply_for(duration_s: float, apply: Callable[[], None], revert: Callable[[], None]) -> float:
-    """Call `apply`, call `revert` after `duration_s` or on an interrupt, and return the seconds between both."""
+    """Call `apply`, and `revert` after `duration_s` or on an interrupt; return the seconds between both calls."""
     apply()
     start_s = time.monotonic()
     try:

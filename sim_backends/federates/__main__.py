@@ -3,7 +3,7 @@
 import sys
 
 from sim_backends.federates.frames import ROLES
-from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.named import PythonFederate, named_federate
 from sim_backends.federates.serving import serve_service
 
 
@@ -19,7 +19,7 @@ def main(role_name: str, name: str, address: str | None = None) -> None:
         SystemExit: There is no such federate.
     """
     (role,) = (number for number, text in ROLES.items() if text == role_name)
-    federate = named(name, role)
+    federate = named_federate(name, role)
     if not isinstance(federate, PythonFederate):
         raise SystemExit(f"{name} is not a Python class")
     serve_service(federate.load(), address=address)

@@ -1,7 +1,7 @@
 """Agents by index, and their states, in the layout of the wire protocol.
 
-Every exchange has the states of all agents, so they are packed and checked together, and a received state is created
-when it is requested.
+Every exchange contains the states of all agents, so they are packed and checked together. A received state is
+unpacked only when it is requested.
 """
 
 import math
@@ -55,14 +55,15 @@ class AgentTable:
         names: Their names, in order.
         indices: Their indices by name. An addition replaces the mapping, so that received states can keep the
             previous one.
-        order: All indices.
-        valid_limits: The limits of the last states that were received, which seldom change and need no second check.
+        all_indices: All indices.
+        valid_limits: The limits in the last received states. They seldom change, and equal limits are not checked
+            again.
     """
 
     def __init__(self, names: Iterable[str] = ()) -> None:
         self.names: list[str] = []
         self.indices: dict[str, int] = {}
-        self.order: tuple[int, ...] = ()
+        self.all_indices: tuple[int, ...] = ()
         self.valid_limits: tuple[float, ...] = ()
         self.add(list(names))
 
@@ -74,7 +75,7 @@ class AgentTable:
         """Add agents with the next indices."""
         self.names = [*self.names, *names]
         self.indices = {name: index for index, name in enumerate(self.names)}
-        self.order = tuple(range(len(self.names)))
+        self.all_indices = tuple(range(len(self.names)))
 
     def name(self, index: int, position: int) -> str:
         """Return the name of an agent.
@@ -99,13 +100,13 @@ def announcements_bytes(states: Mapping[str, State], agents: AgentTable) -> byte
     """
     if states.keys() <= agents.indices.keys():
         return _NO_NEW_AGENTS
-    new = [name for name in states if name not in agents.indices]
+    new_names = [name for name in states if name not in agents.indices]
     first = len(agents.names)
-    if first + len(new) > MAX_AGENTS:
+    if first + len(new_names) > MAX_AGENTS:
         raise ValueError(f"there are more than {MAX_AGENTS} agents")
-    agents.add(new)
-    return count_bytes(len(new)) + b"".join(
-        _INDEX.pack(index) + text_bytes(name) for index, name in enumerate(new, start=first)
+    agents.add(new_names)
+    return count_bytes(len(new_names)) + b"".join(
+        _INDEX.pack(index) + text_bytes(name) for index, name in enumerate(new_names, start=first)
     )
 
 
@@ -113,31 +114,31 @@ def read_announcements(reader: FrameReader, agents: AgentTable) -> None:
     """Add announced agents to the table.
 
     Raises:
-        MalformedFrameError: An index is not the next one, or a name is known already.
+        MalformedFrameError: An index is not the next one, or a name is already in use.
     """
     count = reader.count(_NEW_AGENT_BYTES)
     if not count:
         return
-    new: dict[str, None] = {}
+    new_names: dict[str, None] = {}
     for _ in range(count):
-        position, expected = reader.position, len(agents.names) + len(new)
+        position, expected = reader.position, len(agents.names) + len(new_names)
         (index,) = reader.unpack(_INDEX)
         if index != expected or index >= MAX_AGENTS:
             raise MalformedFrameError(position, f"the new agent has index {index}, not {expected}")
         position = reader.position
         name = reader.text()
-        if not name or name in agents.indices or name in new:
-            raise MalformedFrameError(position, f"the new agent's name {name!r} is empty or known already")
-        new[name] = None
-    agents.add(list(new))
+        if not name or name in agents.indices or name in new_names:
+            raise MalformedFrameError(position, f"the new agent's name {name!r} is empty or already in use")
+        new_names[name] = None
+    agents.add(list(new_names))
 
 
 class ReceivedStates(Mapping[str, State]):
-    """States of agents as they were received, each created on request.
+    """Received states of agents; each is unpacked on request.
 
     Args:
-        rows: Number of each agent's state.
-        data: Their bytes.
+        rows: Row of each agent's state in `data`.
+        data: The bytes of the states.
         limits: The limits of the agents, in the order of the rows.
     """
 
@@ -153,8 +154,8 @@ class ReceivedStates(Mapping[str, State]):
     def __getitem__(self, name: str) -> State:
         state = self._cache.get(name)
         if state is None:
-            at = self._rows[name] * STATE.size + _MOTION_OFFSET
-            e, n, u, v_e, v_n, v_u, heading_rad = _MOTION.unpack_from(self.data, at)
+            offset = self._rows[name] * STATE.size + _MOTION_OFFSET
+            e, n, u, v_e, v_n, v_u, heading_rad = _MOTION.unpack_from(self.data, offset)
             # NaN, which means no heading, is the only number that is not equal to itself.
             heading = heading_rad if heading_rad == heading_rad else None  # noqa: PLR0124 (see above)
             state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), heading)
@@ -175,7 +176,7 @@ class ReceivedStates(Mapping[str, State]):
         return self._rows is agents.indices or self._rows == agents.indices
 
     def has_limits_of(self, other: Mapping[str, State]) -> bool:
-        """Return True if other states have the same agents with the same limits; False may also mean unknown."""
+        """Return True if other states have the same agents and limits; it may also return False for equal limits."""
         return isinstance(other, ReceivedStates) and self._rows is other._rows and self._limits == other._limits  # noqa: SLF001 (of the same class)
 
     @property
@@ -185,12 +186,12 @@ class ReceivedStates(Mapping[str, State]):
 
 
 def states_bytes(states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float] | None) -> bytes:
-    """Return the states of announced agents.
+    """Return the states of announced agents as bytes.
 
     Args:
         states: The states.
         agents: The agents.
-        limits_m_s2: Limits of their accelerations; None if they have no meaning.
+        limits_m_s2: Limits of their accelerations; None if the message has no limits.
     """
     count = len(states)
     if limits_m_s2 is None and isinstance(states, ReceivedStates) and states.has_indices(agents):
@@ -237,7 +238,7 @@ def unpack_states(data: bytes, begin: int, agents: AgentTable) -> ReceivedStates
     ):
         _check_each(data, begin)
     agents.valid_limits = limits
-    if indices == agents.order:
+    if indices == agents.all_indices:
         return ReceivedStates(agents.indices, data, limits)
     _check_each(data, begin)
     rows: dict[str, int] = {}

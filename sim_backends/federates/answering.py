@@ -77,7 +77,7 @@ class FederateService:
         """
         role = PHYSICS if hasattr(federate, "step_ns") else NETWORK
         if role != hello.role:
-            raise ValueError(f"it is a {ROLES[role]}, and a {ROLES[hello.role]} was requested")
+            raise ValueError(f"it is a {ROLES[role]}, but a {ROLES[hello.role]} was requested")
         flags = {
             FederateCapability.DETERMINISTIC: self.is_deterministic,
             FederateCapability.FORK: self.forks,
@@ -92,7 +92,7 @@ class FederateService:
             self.name or type(federate).__name__,
             hello.configuration_hash,
             self.software,
-            FederateCapability(sum(flag for flag, has in flags.items() if has)),
+            FederateCapability(sum(flag for flag, is_set in flags.items() if is_set)),
             federate.step_ns if role == PHYSICS else 0,
             _next_event_ns(federate),
             self.commands if role == PHYSICS else (),
@@ -135,11 +135,11 @@ class _Heartbeat:
         threading.Thread(target=self._run, daemon=True).start()
 
     def begin(self, request: int, copy_number: int, at_ns: int) -> None:
-        """Begin a request, at a simulated time."""
+        """Begin to send `busy` for a request, with a simulated time."""
         self._request = request, copy_number, at_ns
 
     def answer(self, frame: bytes) -> None:
-        """End the request with an answer."""
+        """Send the answer to the request, and no further `busy` for it."""
         with self._lock:
             self._request = None
             self._channel.send(frame, None)
@@ -153,11 +153,11 @@ class _Heartbeat:
         previous = None
         while not self._stopped.wait(self._interval_s):
             with self._lock, suppress(ClosedError):
-                current = self._request
-                if current is not None and current is previous and not self._stopped.is_set():
-                    request, copy_number, at_ns = current
+                current_request = self._request
+                if current_request is not None and current_request is previous and not self._stopped.is_set():
+                    request, copy_number, at_ns = current_request
                     self._channel.send(encode(MessageKind.BUSY, request, copy_number, encode_number(at_ns)), None)
-                previous = current
+                previous = current_request
 
 
 @dataclass
@@ -172,7 +172,7 @@ class _Run:
     heartbeat: _Heartbeat | None = None
 
     def serve(self) -> bool:
-        """Answer requests until the coordinator ends the run; return True if it did so without an error."""
+        """Answer requests until the coordinator ends the run; return True if there was no error."""
         try:
             deadline_s = None if self.hello_s is None else time.monotonic() + self.hello_s
             frame = self.channel.receive(deadline_s, MAX_HELLO_BYTES)
@@ -223,17 +223,17 @@ class _Run:
             return MessageKind.WELCOME, self._begin(Hello.decode(body), header.request)
         if header.kind is MessageKind.PING:
             return MessageKind.PONG, encode_number(decode_number(body))
-        current = self.copies.get(header.copy)
-        if current is None:
+        federate_copy = self.copies.get(header.copy)
+        if federate_copy is None:
             raise MalformedFrameError(12, f"there is no copy {header.copy}, or hello is missing")
         if self.heartbeat is not None:
-            self.heartbeat.begin(header.request, header.copy, current.last_ns)
-        if header.kind is MessageKind.ADVANCE_PHYSICS and hasattr(current.federate, "step_ns"):
-            return MessageKind.STATES, self._advance_physics(current, body)
-        if header.kind is MessageKind.ADVANCE_NETWORK and not hasattr(current.federate, "step_ns"):
-            return MessageKind.OUTCOMES, self._advance_network(current, body)
+            self.heartbeat.begin(header.request, header.copy, federate_copy.last_ns)
+        if header.kind is MessageKind.ADVANCE_PHYSICS and hasattr(federate_copy.federate, "step_ns"):
+            return MessageKind.STATES, self._advance_physics(federate_copy, body)
+        if header.kind is MessageKind.ADVANCE_NETWORK and not hasattr(federate_copy.federate, "step_ns"):
+            return MessageKind.OUTCOMES, self._advance_network(federate_copy, body)
         if header.kind is MessageKind.FORK and self.service.forks:
-            return MessageKind.DONE, self._fork(current, decode_fork(body))
+            return MessageKind.DONE, self._fork(federate_copy, decode_fork(body))
         raise MalformedFrameError(4, f"the request {header.kind.name.lower()} is not supported")
 
     def _begin(self, hello: Hello, request: int) -> bytes:
@@ -245,38 +245,40 @@ class _Run:
         self.copies[0] = _FederateCopy(federate, AgentTable(agent.name for agent in hello.agents))
         return self.service.welcome(federate, hello).encode()
 
-    def _advance_physics(self, current: _FederateCopy, body: bytes) -> bytes:
-        to_ns, from_ns, commands = decode_advance_physics(body, current.agents)
+    def _advance_physics(self, federate_copy: _FederateCopy, body: bytes) -> bytes:
+        to_ns, from_ns, commands = decode_advance_physics(body, federate_copy.agents)
         for name, command in commands.items():
             if command_type(command) not in self.service.commands:
                 raise ValueError(f"the command {type(command).__name__} to {name} is not supported")
-        federate = current.federate
-        if from_ns > current.last_ns:
-            # The coordinator does not send requests that change nothing; the federate must get the time of the last
-            # one.
+        federate = federate_copy.federate
+        if from_ns > federate_copy.last_ns:
+            # The coordinator omits requests that change nothing. The federate first advances to the time of the last
+            # omitted request.
             federate.advance(from_ns, {})
         states = federate.advance(to_ns, commands)
-        current.last_ns = to_ns
-        return encode_states(to_ns - to_ns % federate.step_ns, states, current.agents, federate.limits_m_s2)
+        federate_copy.last_ns = to_ns
+        return encode_states(to_ns - to_ns % federate.step_ns, states, federate_copy.agents, federate.limits_m_s2)
 
-    def _advance_network(self, current: _FederateCopy, body: bytes) -> bytes:
-        request = AdvanceNetwork.decode(body, current.agents)
+    def _advance_network(self, federate_copy: _FederateCopy, body: bytes) -> bytes:
+        request = AdvanceNetwork.decode(body, federate_copy.agents)
         for packet in request.packets:
             if self.service.transports and packet.protocol not in self.service.transports:
                 raise ValueError(f"the transport {packet.protocol} is not supported")
         states = request.states
         if request.reckoning_ns:
             states = DeadReckoned(states, request.since_ns, request.reckoning_ns)
-        arrivals, drops = current.federate.advance(request.to_ns, request.packets, states)
-        current.last_ns = request.to_ns
-        return NetworkOutcomes(request.to_ns, _next_event_ns(current.federate), arrivals, drops).encode(
-            current.agents
+        arrivals, drops = federate_copy.federate.advance(request.to_ns, request.packets, states)
+        federate_copy.last_ns = request.to_ns
+        return NetworkOutcomes(request.to_ns, _next_event_ns(federate_copy.federate), arrivals, drops).encode(
+            federate_copy.agents
         )
 
-    def _fork(self, current: _FederateCopy, number: int) -> bytes:
+    def _fork(self, federate_copy: _FederateCopy, number: int) -> bytes:
         if number in self.copies or len(self.copies) > _MAX_COPIES:
-            raise MalformedFrameError(16, f"copy {number} exists already, or there are too many")
-        self.copies[number] = _FederateCopy(copy.deepcopy(current.federate), current.agents.copy(), current.last_ns)
+            raise MalformedFrameError(16, f"copy {number} already exists, or there are too many copies")
+        self.copies[number] = _FederateCopy(
+            copy.deepcopy(federate_copy.federate), federate_copy.agents.copy(), federate_copy.last_ns
+        )
         return b""
 
 
@@ -289,6 +291,6 @@ def serve_channel(
         channel: The channel.
         service: The federate.
         token: Token that the coordinator must send.
-        hello_s: Maximum wait for its first message; None for no limit.
+        hello_s: Timeout of the first message of the coordinator, in seconds; None for no limit.
     """
     return _Run(service, channel, token, hello_s).serve()

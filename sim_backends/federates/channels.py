@@ -1,4 +1,4 @@
-"""Channels between both sides: byte streams that carry frames, with a deadline on every wait."""
+"""Channels between coordinator and federate: byte streams that carry frames, with a deadline for every wait."""
 
 import os
 import select
@@ -57,7 +57,7 @@ class FrameChannel(Protocol):
 class StreamChannel:
     """A channel over file descriptors: two pipes, or a socket.
 
-    Memory for a frame is allocated while its bytes arrive, so that an announced size alone costs nothing.
+    Memory for a frame is allocated while its bytes arrive, so a large size in a header does not allocate memory.
 
     Args:
         read_fd: Descriptor to read from.
@@ -77,18 +77,18 @@ class StreamChannel:
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
         """Implement `FrameChannel.send`."""
-        rest: bytes | memoryview = frame
+        position_text: bytes | memoryview = frame
         while True:
             try:
-                written = os.write(self._write_fd, rest)
+                written_bytes = os.write(self._write_fd, position_text)
             except BlockingIOError:
                 _wait(self._writable, deadline_s)
                 continue
             except OSError as error:
                 raise ClosedError("the connection was closed") from error
-            if written == len(rest):
+            if written_bytes == len(position_text):
                 return
-            rest = memoryview(rest)[written:]
+            position_text = memoryview(position_text)[written_bytes:]
 
     def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
         """Implement `FrameChannel.receive`."""
@@ -98,12 +98,12 @@ class StreamChannel:
         header = read_header(data, max_bytes)
         end = HEADER_BYTES + header.size
         if len(data) < end:
-            data = self._read_rest(data, end, deadline_s)
+            data = self._read_until(data, end, deadline_s)
         self._data = data[end:]
         return ProtocolFrame(header, data[HEADER_BYTES:end])
 
-    def _read_rest(self, begin: bytes, end: int, deadline_s: float | None) -> bytes:
-        """Return `begin` and the bytes received after it, at least `end` bytes in total."""
+    def _read_until(self, begin: bytes, end: int, deadline_s: float | None) -> bytes:
+        """Return `begin` and the bytes that are received after it, at least `end` bytes in total."""
         data = bytearray(begin)
         try:
             while len(data) < end:
@@ -118,40 +118,40 @@ class StreamChannel:
             os.close(fd)
         self._fds = set()
 
-    def _read(self, deadline_s: float | None, pending: int = 0) -> bytes:
+    def _read(self, deadline_s: float | None, bytes_before: int = 0) -> bytes:
         """Return the next bytes, at least one.
 
         Args:
             deadline_s: As for `receive`.
-            pending: Number of bytes of the same frame that were read before, for the error.
+            bytes_before: Number of bytes of the same frame that were read before, for the error.
         """
         if not self._fds:
             raise ClosedError("the connection was closed")
         while True:
             _wait(self._readable, deadline_s)
             try:
-                received = os.read(self._read_fd, _CHUNK_BYTES)
+                chunk = os.read(self._read_fd, _CHUNK_BYTES)
             except BlockingIOError:
                 continue
             except OSError as error:
                 raise ClosedError("the connection was closed") from error
-            if not received:
-                rest = f" after {pending} bytes of a frame" if pending else ""
-                raise ClosedError(f"the connection was closed{rest}")
-            return received
+            if not chunk:
+                position_text = f" after {bytes_before} bytes of a frame" if bytes_before else ""
+                raise ClosedError(f"the connection was closed{position_text}")
+            return chunk
 
 
 def _wait(poll: select.poll, deadline_s: float | None) -> None:
     if deadline_s is None:
         poll.poll()
         return
-    left_s = deadline_s - time.monotonic()
-    if left_s <= 0 or not poll.poll(left_s * 1e3):
+    remaining_s = deadline_s - time.monotonic()
+    if remaining_s <= 0 or not poll.poll(remaining_s * 1e3):
         raise DeadlineError("the wait reached its deadline")
 
 
 def socket_channel(connection: socket.socket) -> StreamChannel:
-    """Return a channel over a connected TCP socket, which it owns.
+    """Return a channel over a connected TCP socket; the channel closes the socket.
 
     Small frames are sent immediately (RFC 9293, section 3.7.4, on Nagle's algorithm), and a connection whose other
     side has disappeared is closed after a minute.

@@ -22,16 +22,17 @@ _TAIL_LINES: Final = 10
 
 
 class Child:
-    """A federate that is a child process. Its session is separate, so that Ctrl-C does not end it during a request.
+    """A federate that is a child process.
 
-    It is ended when `close` is called, when this object is collected, or when this process exits.
+    It has a separate session, so that Ctrl-C does not terminate it during a request. It is terminated when `close` is
+    called, when this object is garbage collected, or when this process exits.
 
     Args:
-        command: Its command line, split as a shell does; there is no shell.
+        command: Its command line; it is split as by a shell, but no shell runs.
 
     Attributes:
         channel: The channel to it.
-        pid: Its process.
+        pid: Its process id.
 
     Raises:
         ConfigurationError: It cannot be started.
@@ -44,7 +45,7 @@ class Child:
             raise ConfigurationError(f"{command!r} is not a command: {error}") from error
         if not words:
             raise ConfigurationError("the command of a federate is empty")
-        # A file, because a federate that writes much would block on a pipe without a reader.
+        # Standard error is a file, because a federate that writes much would block on a pipe without a reader.
         self._stderr: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
         try:
             process = subprocess.Popen(
@@ -60,11 +61,11 @@ class Child:
         assert process.stdout is not None
         self._process = process
         self.pid = process.pid
-        # The channel owns duplicates, so that the process object does not close descriptors that are in use again.
+        # The channel has duplicates, because the process object would later close descriptors that may be reused.
         self.channel = StreamChannel(os.dup(process.stdout.fileno()), os.dup(process.stdin.fileno()))
         process.stdin.close()
         process.stdout.close()
-        self._finalizer = weakref.finalize(self, _end, process, self.channel, self._stderr)
+        self._finalizer = weakref.finalize(self, _terminate, process, self.channel, self._stderr)
 
     @property
     def last_output(self) -> list[str]:
@@ -76,7 +77,7 @@ class Child:
         return [line.rstrip() for line in tail.splitlines() if line.strip()][-_TAIL_LINES:]
 
     def exit_text(self, wait_s: float = 0.5) -> str:
-        """Describe how it ended, such as `it has exited with code 1`; empty if it still runs after a short wait."""
+        """Return a text about its exit, such as `it has exited with code 1`; empty if it has not exited in time."""
         deadline_s = time.monotonic() + wait_s
         while not _has_exited(self._process.pid):
             if time.monotonic() > deadline_s:
@@ -88,7 +89,7 @@ class Child:
             info = None
         if info is None or info.si_code == os.CLD_EXITED:
             return "it has exited" if info is None else f"it has exited with code {info.si_status}"
-        return f"it was ended by {signal.Signals(info.si_status).name}"
+        return f"it was terminated by {signal.Signals(info.si_status).name}"
 
     def kill(self) -> None:
         """Kill the process immediately."""
@@ -97,7 +98,7 @@ class Child:
         self._finalizer()
 
     def close(self) -> None:
-        """Close the channel and end the process with all processes of its session's group."""
+        """Close the channel, and terminate the process and all other processes of its process group."""
         self._finalizer()
 
 
@@ -112,7 +113,7 @@ def _has_exited(pid: int) -> bool:
         return True
 
 
-def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[bytes]) -> None:
+def _terminate(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[bytes]) -> None:
     channel.close()
     for number in (None, signal.SIGTERM):
         if number is not None:
@@ -122,7 +123,7 @@ def _end(process: "subprocess.Popen[bytes]", channel: StreamChannel, stderr: IO[
             time.sleep(_POLL_S)
         if _has_exited(process.pid):
             break
-    # SIGKILL to the group also ends processes that the command started, and suspended processes.
+    # SIGKILL to the group also terminates processes that the command started, and suspended processes.
     _signal_group(process.pid, signal.SIGKILL)
     process.wait()
     stderr.close()

@@ -32,13 +32,13 @@ class CompiledProgram:
 
     Attributes:
         name: Its name in messages and file names.
-        source: The file. Its own headers are beside it; headers for all federates are in
+        source: The file. Headers that only it includes are in the same folder; headers for all federates are in
             `sim_backends/federates/cpp`.
         packages: Names of its libraries for pkg-config.
         install: Command that installs the compiler and the libraries.
         flags: Other options of the compiler.
         libraries: Options that link the libraries; None for the options from pkg-config.
-        duration: Usual time of a compilation, for the message: `about 30 s`.
+        duration_text: Usual time of a compilation, for the message: `about 30 s`.
     """
 
     name: str
@@ -47,10 +47,10 @@ class CompiledProgram:
     install: str
     flags: Sequence[str] = ("-O2", "-std=c++17")
     libraries: Sequence[str] | None = None
-    duration: str = "about 30 s"
+    duration_text: str = "about 30 s"
 
     def path(self) -> Path:
-        """Return the path of the program, which is compiled if it does not exist yet for this source and environment.
+        """Return the path of the program; compile it if it does not exist yet for this source and environment.
 
         Raises:
             ConfigurationError: The compiler or a library is not installed, or the compilation failed.
@@ -90,7 +90,7 @@ class CompiledProgram:
         return _output("g++", "--version").stdout.partition("\n")[0], libraries
 
     def _compile(self, program: Path) -> None:
-        sys.stderr.write(f"note: compiling {self.name}, once for these libraries: {self.duration}\n")
+        sys.stderr.write(f"note: compiling {self.name}, once for these libraries: {self.duration_text}\n")
         options = self.libraries
         if options is None:
             arguments = ("--cflags", "--libs", *self.packages)
@@ -99,11 +99,11 @@ class CompiledProgram:
             result = Path(folder) / "program"
             words = ["g++", *self.flags, f"-I{_LIBRARY}", "-o", str(result), str(self.source), *options]
             try:
-                done = _output(*words)
+                compilation = _output(*words)
             except subprocess.TimeoutExpired as error:
                 raise ConfigurationError(f"{self.name} was not compiled within {_LIMIT_S:g} s") from error
-            if done.returncode:
-                lines = done.stderr.splitlines()[:_SHOWN_LINES]
+            if compilation.returncode:
+                lines = compilation.stderr.splitlines()[:_SHOWN_LINES]
                 raise ConfigurationError(
                     "\n".join((f"{self.name} cannot be compiled:", *lines)),
                     where=str(self.source),
@@ -115,7 +115,7 @@ class CompiledProgram:
 def included_files(source: Path) -> list[Path]:
     """Return a C++ file and the headers of fieldkit that it includes, directly or through another header."""
     files = [source.resolve()]
-    for file in files:  # grows in the loop
+    for file in files:  # the loop appends to the list
         for name in _INCLUDE.findall(file.read_text(encoding="utf-8")):
             candidates = ((folder / name).resolve() for folder in (file.parent, _LIBRARY))
             header = next((candidate for candidate in candidates if candidate.is_file()), None)
@@ -136,7 +136,7 @@ def _output(*words: str) -> "subprocess.CompletedProcess[str]":
 
 @contextmanager
 def _locked(path: Path, name: str) -> Iterator[None]:
-    """Hold a lock file, so that processes that start together compile the program once.
+    """Hold the lock of a file, so that only one of several processes compiles the program.
 
     Raises:
         ConfigurationError: Another process held the lock until the timeout.
@@ -150,7 +150,7 @@ def _locked(path: Path, name: str) -> Iterator[None]:
             except BlockingIOError as error:
                 if time.monotonic() > deadline_s:
                     raise ConfigurationError(
-                        f"another process has compiled {name} for {_LIMIT_S:g} s", where=str(path)
+                        f"another process has been compiling {name} for {_LIMIT_S:g} s", where=str(path)
                     ) from error
                 time.sleep(_POLL_S)
         yield

@@ -3,14 +3,14 @@
 Agents have indices from 0 in the order of their announcement, first the agents in `hello`. A later agent gets the
 next index in the first message that mentions it, for this copy and its copies.
 
-- **Handshake.** The coordinator sends hello, the federate answers with welcome or error. `welcome` repeats the
+- **Handshake.** The coordinator sends hello; the federate answers with welcome or error. `welcome` repeats the
   configuration hash, the SHA-256 of the JSON. `name` names the scenario or the federate. The side that accepts a
   connection checks the token of join or hello.
 - **Transports.** Welcome lists the values of a packet's `protocol` that the network carries: `udp`, `tcp`, `topic`,
   `ros1`; an empty list means all. The network refuses others with an error. [Real programs](lab-cosim.md) send `ip`,
   whose size includes the IP header, and `ip-broadcast`: one packet per receiver, with equal source, number and time.
-  With the key `network.transports: builtin` these two and the capability *next event* suffice: fieldkit's own UDP,
-  TCP, topics and ROS 1 send IP packets.
+  With the key `network.transports: builtin` the network needs only these two and the capability *next event*, because
+  fieldkit's UDP, TCP, topics and ROS 1 send IP packets.
 - **Configuration.** The JSON has `scenario` (keys as in [a scenario file](reference/scenario-file.md)), `world` ([a
   world file](reference/world-file.md)), `robots` (limits of each agent's body, and its radio) and `options`. A simple
   federate ignores it and uses the agents of hello. A network declared with `writes_captures` gets `captures` if the
@@ -18,17 +18,17 @@ next index in the first message that mentions it, for this copy and its copies.
   name: `port` of the destination (0: its own), `ping` (identifier of ICMP echo; 0: none), `reply`.
 - **Physics: states.** `at_ns` is `to_ns` rounded down to a multiple of the `step_ns` in welcome; the states are valid
   at this time. Positions are of the antenna. `heading_rad` is from east towards north, NaN if undefined. `limit_m_s2`
-  is the largest change of velocity per second from now on, infinity if unknown; in requests to a network it has no
-  meaning.
+  is the largest change of velocity per second after this time, infinity if unknown; in requests to a network it has
+  no meaning.
 - **Physics: requests.** The first `to_ns` is 0; it never decreases. Commands apply in the steps that begin at or
-  after `from_ns`, so the states at `from_ns` still have the old velocity. An agent keeps its last command until a new
-  one. A request within one step and without commands is not sent. The federate refuses a type of command that welcome
-  does not list.
+  after `from_ns`, so the states at `from_ns` still have the old velocity. A command applies until the agent gets a
+  new one. The coordinator sends no request without commands for a time within the same step. The federate refuses a
+  type of command that welcome does not list.
 - **Network.** It simulates up to and including `to_ns`, and returns each packet exactly once: as an arrival with
   `enters_ns` <= `at_ns` <= `to_ns`, and `at_ns` not before the previous `to_ns`; or as a drop with its reason. Both
   lists are in order of time. `at_ns` of outcomes is `to_ns`. Packets are in order of `enters_ns`, which may equal the
   previous `to_ns`. In a window of length 0 at the start `to_ns` is -1. Random draws depend on the seed; derive each
-  from the seed, `flow` and `number`, so that runs can be compared.
+  draw from the seed, `flow` and `number`, so that runs can be compared.
 - **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
   `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
   Otherwise agents stay at their positions until the next request.
@@ -131,8 +131,8 @@ def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]
         MalformedFrameError: It is malformed.
     """
     if len(body) >= _STATES_HEAD.size:
-        at_ns, new, count = _STATES_HEAD.unpack_from(body)
-        if not new and len(body) == _STATES_HEAD.size + count * STATE.size:
+        at_ns, new_count, count = _STATES_HEAD.unpack_from(body)
+        if not new_count and len(body) == _STATES_HEAD.size + count * STATE.size:
             return at_ns, unpack_states(body[_STATES_HEAD.size :], HEADER_BYTES + _STATES_HEAD.size, agents)
     reader = FrameReader(body)
     (at_ns,) = reader.unpack(_TIME)
@@ -149,7 +149,7 @@ class AdvanceNetwork(NamedTuple):
         to_ns: Time to advance to.
         states: States of the agents.
         packets: Packets that enter.
-        since_ns: Time of the states; it matters only for dead reckoning.
+        since_ns: Time of the states; only dead reckoning uses it.
         reckoning_ns: Step of dead reckoning; 0 if agents do not move until the next request.
     """
 
@@ -160,7 +160,11 @@ class AdvanceNetwork(NamedTuple):
     reckoning_ns: int = 0
 
     def encode(self, agents: AgentTable) -> bytes:
-        """Return the body of the message; `ValueError` if there are too many agents."""
+        """Return the body of the message.
+
+        Raises:
+            ValueError: There are too many agents.
+        """
         return b"".join(
             (
                 _THREE_TIMES.pack(self.to_ns, self.since_ns, self.reckoning_ns),
@@ -193,7 +197,7 @@ class NetworkOutcomes(NamedTuple):
 
     Attributes:
         at_ns: Time that it has reached.
-        next_event_ns: Time of its next event; `NO_EVENT` for none.
+        next_event_ns: Time of its next event; `NO_EVENT` if there is none.
         arrivals: Packets that arrived.
         drops: Packets that will never arrive.
         delays: Parts of the delay of each arrival; empty if the network does not report them.
@@ -222,8 +226,8 @@ class NetworkOutcomes(NamedTuple):
             MalformedFrameError: It is malformed.
         """
         if len(body) == _NO_OUTCOMES.size:
-            at_ns, next_event_ns, arrivals_and_drops = _NO_OUTCOMES.unpack(body)
-            if not arrivals_and_drops:
+            at_ns, next_event_ns, both_counts = _NO_OUTCOMES.unpack(body)
+            if not both_counts:
                 return NetworkOutcomes(at_ns, next_event_ns, (), ())
         reader = FrameReader(body)
         at_ns, next_event_ns = reader.unpack(_TWO_TIMES)

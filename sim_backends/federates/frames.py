@@ -82,16 +82,16 @@ class MalformedFrameError(ValueError):
 
     Args:
         position: Number of the wrong byte, from the beginning of the frame.
-        what: What is wrong.
+        description: Description of the error.
     """
 
-    def __init__(self, position: int, what: str) -> None:
-        super().__init__(f"byte {position}: {what}")
+    def __init__(self, position: int, description: str) -> None:
+        super().__init__(f"byte {position}: {description}")
         self.position = position
 
 
 class UnknownKindError(MalformedFrameError):
-    """A frame has an unknown kind: the received bytes may be text."""
+    """A frame has an unknown kind; the received bytes may be text that the program printed."""
 
 
 class Header(NamedTuple):
@@ -134,10 +134,10 @@ def encode(kind: MessageKind, request: int, copy: int, body: bytes = b"") -> byt
 
 
 def read_header(data: bytes | bytearray, max_bytes: int = MAX_FRAME_BYTES) -> Header:
-    """Return the header at the beginning of some bytes.
+    """Return the header of a frame.
 
     Args:
-        data: At least `HEADER_BYTES` bytes.
+        data: The first bytes of the frame, at least `HEADER_BYTES`.
         max_bytes: Largest allowed size of the body.
 
     Raises:
@@ -163,17 +163,17 @@ class FrameReader:
 
     def __init__(self, body: bytes) -> None:
         self._body = body
-        self._at = 0
+        self._offset = 0
 
     @property
     def position(self) -> int:
         """Number of the next byte, from the beginning of the frame."""
-        return HEADER_BYTES + self._at
+        return HEADER_BYTES + self._offset
 
     @property
     def remaining_bytes(self) -> int:
         """Number of bytes that have not been read."""
-        return len(self._body) - self._at
+        return len(self._body) - self._offset
 
     def unpack(self, layout: struct.Struct) -> tuple[Any, ...]:
         """Return the next values.
@@ -181,10 +181,10 @@ class FrameReader:
         Raises:
             MalformedFrameError: The frame ends too early.
         """
-        at, self._at = self._at, self._at + layout.size
-        if self._at > len(self._body):
+        offset, self._offset = self._offset, self._offset + layout.size
+        if self._offset > len(self._body):
             self._fail_at_end()
-        return layout.unpack_from(self._body, at)
+        return layout.unpack_from(self._body, offset)
 
     def read_bytes(self, size: int) -> bytes:
         """Return the next bytes.
@@ -192,10 +192,10 @@ class FrameReader:
         Raises:
             MalformedFrameError: The frame ends too early.
         """
-        at, self._at = self._at, self._at + size
-        if self._at > len(self._body):
+        offset, self._offset = self._offset, self._offset + size
+        if self._offset > len(self._body):
             self._fail_at_end()
-        return self._body[at : self._at]
+        return self._body[offset : self._offset]
 
     def text(self) -> str:
         """Return the next text.
@@ -224,7 +224,7 @@ class FrameReader:
         """
         position = self.position
         (count,) = self.unpack(layout)
-        if count * item_bytes > len(self._body) - self._at:
+        if count * item_bytes > len(self._body) - self._offset:
             raise MalformedFrameError(
                 position, f"{count} items of at least {item_bytes} bytes do not fit in the rest of the frame"
             )
@@ -235,20 +235,20 @@ class FrameReader:
         return self.count(item_bytes, _LENGTH)
 
     def end(self) -> None:
-        """Check that nothing follows.
+        """Check that there are no more bytes.
 
         Raises:
             MalformedFrameError: There are more bytes.
         """
-        if self._at != len(self._body):
-            raise MalformedFrameError(self.position, f"{len(self._body) - self._at} bytes follow the message")
+        if self._offset != len(self._body):
+            raise MalformedFrameError(self.position, f"{len(self._body) - self._offset} bytes follow the message")
 
     def _fail_at_end(self) -> None:
         raise MalformedFrameError(HEADER_BYTES + len(self._body), "the frame ends too early")
 
 
 def text_bytes(text: str) -> bytes:
-    """Return a text with its length.
+    """Return a text with its length as bytes.
 
     Raises:
         ValueError: It is too long.
@@ -260,10 +260,10 @@ def text_bytes(text: str) -> bytes:
 
 
 def count_bytes(count: int) -> bytes:
-    """Return a count."""
+    """Return a count as bytes."""
     return _COUNT.pack(count)
 
 
 def short_count_bytes(count: int) -> bytes:
-    """Return a count of two bytes."""
+    """Return a count as two bytes."""
     return _LENGTH.pack(count)

@@ -45,8 +45,8 @@ class FederateCapability(IntFlag):
     Attributes:
         DETERMINISTIC: Equal requests give equal answers.
         FORK: It can be copied in its present state.
-        NEXT_EVENT: Unless a packet enters, nothing arrives or is dropped and no position is used before its
-            `next_event_ns`, which may be too early; -1: never.
+        NEXT_EVENT: Before `next_event_ns`, no packet arrives or is dropped and no position is used, unless a new
+            packet enters. The time may be earlier than the event; -1: there is no event.
         EXTRAPOLATES: It moves agents by dead reckoning.
         AGENTS_APPEAR: Agents that are not in hello may appear.
         AGENTS_DISAPPEAR: Agents may disappear, and return.
@@ -127,7 +127,7 @@ class Hello:
         end_ns: End of the run.
         name: Name of the scenario.
         configuration: JSON with scenario, world and robots.
-        heartbeat_ms: Interval at which a federate that computes sends `busy`.
+        heartbeat_ms: Interval at which a federate sends `busy` while it computes.
         token: Token of a connection between machines.
     """
 
@@ -148,7 +148,7 @@ class Hello:
 
     @property
     def lifetimes(self) -> dict[str, Lifetime]:
-        """The lifetimes in the configuration of agents that do not exist during the whole run."""
+        """The lifetimes of agents that do not exist during the whole run, from the configuration."""
         plans = json.loads(self.configuration).get("scenario", {}).get("agents", {})
         times_ns = {
             name: [round(parse_duration_s(plan[key]) * 1e9) if key in plan else None for key in _LIFETIME_KEYS]
@@ -213,7 +213,7 @@ def _read_agent(reader: FrameReader, table: AgentTable) -> AgentStart:
     flies, antenna_m = reader.unpack(_AGENT)
     if not name or name in table.indices or len(table.names) >= MAX_AGENTS:
         raise MalformedFrameError(
-            position, f"the agent's name {name!r} is empty or not unique, or there are too many"
+            position, f"the agent's name {name!r} is empty or not unique, or there are too many agents"
         )
     table.add([name])
     states = read_states(FrameReader(count_bytes(1) + reader.read_bytes(STATE.size)), table)
@@ -232,8 +232,8 @@ class Welcome:
         configuration_hash: The hash of the configuration that it received.
         software: Name and version of its software, for messages and recordings.
         capabilities: Its optional properties.
-        step_ns: Its step; 0 for a network.
-        next_event_ns: Time of the first event of a network; `NO_EVENT` for none.
+        step_ns: Its time step; 0 for a network.
+        next_event_ns: Time of the first event of a network; `NO_EVENT` if there is none.
         commands: Types of commands that it supports.
         transports: Names of the transports that it supports; empty for any.
         transmitters: Indices of agents that forward or interfere.
@@ -284,13 +284,13 @@ class Welcome:
         reader.end()
         if not all(math.isfinite(sum(position)) for position in emitters_m):
             raise MalformedFrameError(reader.position, "the position of an emitter is not finite")
-        capabilities_known = FederateCapability(bits & int(~FederateCapability(0)))
+        known_capabilities = FederateCapability(bits & int(~FederateCapability(0)))
         return Welcome(
             role,
             name,
             configuration_hash,
             software,
-            capabilities_known,
+            known_capabilities,
             step_ns,
             next_event_ns,
             commands,

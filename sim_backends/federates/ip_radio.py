@@ -28,8 +28,8 @@ from sim_backends.world.motion import State
 class IpRadio:
     """The radio model of a `RadioNetwork` whose packets are carried by a network federate.
 
-    The federate advances from one of its events to the next, because hosts answer packets at the time at which they
-    arrive. It simulates radios, the relay, and the faults of radios itself.
+    The federate advances from one of its events to the next, because hosts answer packets at the time of their
+    arrival. The federate simulates radios, the relay, and the faults of radios.
 
     Args:
         federate: A network with the transports `ip` and `ip-broadcast`, which announces its next event.
@@ -39,12 +39,12 @@ class IpRadio:
     def __init__(self, federate: NetworkFederate, names: Sequence[str]) -> None:
         self._federate = federate
         self._names = tuple(names)
-        self._entering: list[Packet] = []
+        self._entering_packets: list[Packet] = []
         self._in_flight: dict[int, tuple[Fragment, str]] = {}
         self._packets = 0
         self._broadcasts = 0
         self._states: dict[str, State] = {}
-        self._off: Set[str] = frozenset()
+        self._stations_off: Set[str] = frozenset()
         self._parts: dict[int, ArrivalDelay] = {}
         self._log_loss: LossLog | None = None
         log_delays = getattr(federate, "log_arrival_delays", None)
@@ -83,13 +83,13 @@ class IpRadio:
         for receiver in receivers:
             self._packets += 1
             self._in_flight[self._packets] = payload, receiver
-            self._entering.append(
+            self._entering_packets.append(
                 Packet(self._packets, source, receiver, size_bytes, identity, now_ns, now_ns, protocol)
             )
 
     def next_event_ns(self) -> int | None:
         """Implement `RadioModel.next_event_ns`."""
-        return self._entering[0].enters_ns if self._entering else self._federate.next_event_ns()
+        return self._entering_packets[0].enters_ns if self._entering_packets else self._federate.next_event_ns()
 
     def deliveries(self, now_ns: int) -> list[Delivery[Fragment]]:
         """Implement `RadioModel.deliveries`.
@@ -100,9 +100,9 @@ class IpRadio:
         event_ns = self.next_event_ns()
         if event_ns is None or event_ns > now_ns:
             return []
-        entering, self._entering = self._entering, []
-        present = {name: state for name, state in self._states.items() if name not in self._off}
-        arrivals, drops = self._federate.advance(now_ns, entering, present)
+        entering_packets, self._entering_packets = self._entering_packets, []
+        present_states = {name: state for name, state in self._states.items() if name not in self._stations_off}
+        arrivals, drops = self._federate.advance(now_ns, entering_packets, present_states)
         next_ns = self._federate.next_event_ns()
         if next_ns is not None and next_ns <= now_ns:
             raise FederateError(
@@ -116,7 +116,7 @@ class IpRadio:
         return [self._delivery(arrival) for arrival in arrivals]
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Implement `RadioModel.counters`; the federate reports none."""
+        """Implement `RadioModel.counters`; the federate reports no counters."""
         return {}
 
     def use_meter(self) -> None:
@@ -132,13 +132,13 @@ class IpRadio:
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:  # noqa: ARG002 (see RadioModel)
         """Implement `RadioModel.disturb`; stations whose radios are off have no state."""
-        self._off = off
+        self._stations_off = off
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
         """Implement `RadioModel.jam`; the federate has the jammers of the scenario."""
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Implement `RadioModel.log_attempts`; the federate reports none."""
+        """Implement `RadioModel.log_attempts`; the federate reports no attempts."""
 
     def _log_delay(self, arrival: Arrival, parts: ArrivalDelay) -> None:
         self._parts[arrival.packet_id] = parts

@@ -1,4 +1,4 @@
-"""Federates that have a name, for example `mujoco`: installed simulators, found by their entry points."""
+"""Federates that have a name, for example `mujoco`: simulators of installed packages, declared as entry points."""
 
 import re
 import shlex
@@ -25,11 +25,11 @@ class ProgramFederate:
     Attributes:
         role: `PHYSICS` or `NETWORK`.
         command: Returns its command line; it builds the program first if necessary. It raises `ConfigurationError` if
-            something is not installed; the remedy is the command that installs it.
-        summary: What it is, in one line.
+            required software is not installed; the remedy is the command that installs it.
+        summary: Description in one line.
         options: Model of its options in a scenario; None if it has any options, which are not validated.
-        writes_captures: True for a network that writes the captures that `captures` of its configuration describes.
-        is_single_threaded: True if it has one thread, which computes only during requests. It then shares the
+        writes_captures: True for a network that writes captures with the settings `captures` of its configuration.
+        is_single_threaded: True if it has only one thread, and computes only during requests. It then shares the
             processor of the coordinator (`ProcessorSharing`).
     """
 
@@ -48,8 +48,8 @@ class PythonFederate:
     Attributes:
         role: `PHYSICS` or `NETWORK`.
         load: Imports the simulator, and returns the class with its properties. It raises `ConfigurationError` if
-            something is not installed; the remedy is the command that installs it.
-        summary: What it is, in one line.
+            required software is not installed; the remedy is the command that installs it.
+        summary: Description in one line.
         options: As for `ProgramFederate`.
     """
 
@@ -72,35 +72,35 @@ def federates() -> dict[str, NamedFederate]:
     return {point.name: _load(point) for point in plugins.entry_points(plugins.FEDERATES)}
 
 
-def named(where: str, role: int) -> NamedFederate | None:
-    """Return the federate with a name; None if `where` is a command or an address.
+def named_federate(endpoint: str, role: int) -> NamedFederate | None:
+    """Return the federate with a name; None if `endpoint` is a command or an address.
 
     Args:
-        where: A name, command or address.
+        endpoint: A name, command or address.
         role: The expected role.
 
     Raises:
         ConfigurationError: The package of the federate cannot be loaded, or the federate has another role.
     """
-    point = next((point for point in plugins.entry_points(plugins.FEDERATES) if point.name == where), None)
+    point = next((point for point in plugins.entry_points(plugins.FEDERATES) if point.name == endpoint), None)
     if point is None:
         return None
     federate = _load(point)
     if federate.role != role:
         raise ConfigurationError(
-            f"{where} is a {ROLES[federate.role]}, not a {ROLES[role]}",
-            remedy=f"use --{ROLES[federate.role]} {where}",
+            f"{endpoint} is a {ROLES[federate.role]}, not a {ROLES[role]}",
+            remedy=f"use --{ROLES[federate.role]} {endpoint}",
         )
     return federate
 
 
-def default_options(where: str, role: int) -> dict[str, Any]:
-    """Return the default options of the federate with a name; empty if `where` is a command or an address.
+def default_options(endpoint: str, role: int) -> dict[str, Any]:
+    """Return the default options of the federate with a name; empty if `endpoint` is a command or an address.
 
     Raises:
-        ConfigurationError: As for `named`.
+        ConfigurationError: As for `named_federate`.
     """
-    federate = named(where, role)
+    federate = named_federate(endpoint, role)
     return {} if federate is None or federate.options is None else federate.options().to_json()
 
 
@@ -113,32 +113,33 @@ def _load(point: EntryPoint) -> NamedFederate:
     )
 
 
-def is_single_threaded(where: str, role: int) -> bool:
-    """Return True if `where` is the name of a program that declares one thread; False for a command or an address.
+def is_single_threaded(endpoint: str, role: int) -> bool:
+    """Return True if `endpoint` is the name of a program that declares one thread; False for a command or an address.
 
     Raises:
-        ConfigurationError: As for `named`.
+        ConfigurationError: As for `named_federate`.
     """
-    federate = named(where, role)
+    federate = named_federate(endpoint, role)
     return isinstance(federate, ProgramFederate) and federate.is_single_threaded
 
 
-def command_line(where: str, role: int) -> str:
-    """Return the command that starts the federate with a name, or `where` itself if it is a command or an address.
+def command_line(endpoint: str, role: int) -> str:
+    """Return the command that starts the federate with a name, or `endpoint` itself if it is a command or an address.
 
     Raises:
-        ConfigurationError: The federate cannot be used; the remedy states how to install what is missing.
+        ConfigurationError: The federate cannot be used; the remedy states how to install the missing software.
     """
-    federate = named(where, role)
+    federate = named_federate(endpoint, role)
     if isinstance(federate, ProgramFederate):
         return federate.command()
     if isinstance(federate, PythonFederate):
         federate.load()
-        return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates", ROLES[role], where))
-    if _WORD.fullmatch(where) and shutil.which(where) is None:
+        return shlex.join((sys.executable, "-P", "-m", "sim_backends.federates", ROLES[role], endpoint))
+    if _WORD.fullmatch(endpoint) and shutil.which(endpoint) is None:
         names = [point.name for point in plugins.entry_points(plugins.FEDERATES)]
         choices = f"simulators: {', '.join(names)}; or a command, or an address: fieldkit docs federates"
         raise ConfigurationError(
-            f"there is no {ROLES[role]} and no program {where!r}", remedy=did_you_mean(where, names, choices)
+            f"there is no {ROLES[role]} and no program with the name {endpoint!r}",
+            remedy=did_you_mean(endpoint, names, choices),
         )
-    return where
+    return endpoint

@@ -30,7 +30,7 @@ class ProcessorSharing:
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
-        self._allowed = os.sched_getaffinity(0)
+        self._allowed_processors = os.sched_getaffinity(0)
         self._processor: int | None = None
         self._change_at_s = 0.0
 
@@ -42,14 +42,14 @@ class ProcessorSharing:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._processor is not None:
-            os.sched_setaffinity(0, self._allowed)
+            os.sched_setaffinity(0, self._allowed_processors)
         now_s = time.monotonic()
-        if now_s < self._change_at_s or len(self._allowed) < 2:
+        if now_s < self._change_at_s or len(self._allowed_processors) < 2:
             return
         with suppress(ProcessLookupError):  # the child has exited; the exchange reports this
             if self._processor is not None:
                 self._processor = None
-                os.sched_setaffinity(self._pid, self._allowed)
+                os.sched_setaffinity(self._pid, self._allowed_processors)
                 return
             processor = current_processor()
             os.sched_setaffinity(self._pid, (processor,))

@@ -9,7 +9,7 @@ from sim_backends.world.motion import State
 
 
 class FederateError(FieldkitError):
-    """A federate or program failed or gave an impossible answer; the message names it, the time and the request."""
+    """A federate or program failed or returned an invalid answer; the message names it, the time and the request."""
 
 
 class UnansweredError(FederateError):
@@ -53,15 +53,15 @@ def federate_error(error: BaseException, federate: str, request: str) -> Federat
 
 def seconds_text(time_ns: int) -> str:
     """Return a simulated time in seconds as text, with all its digits."""
-    whole, rest = divmod(time_ns, 10**9)
-    return f"{whole}.{rest:09d}".rstrip("0").rstrip(".") + " s"
+    seconds, nanoseconds = divmod(time_ns, 10**9)
+    return f"{seconds}.{nanoseconds:09d}".rstrip("0").rstrip(".") + " s"
 
 
 class PhysicsFederate(Protocol):
     """Moves the agents.
 
     If an attribute `agents_disappear` is True, an agent may be missing in the states: it has disappeared, and may
-    appear again. If it is False, a missing agent ends the run.
+    appear again. Otherwise the run ends with an error if an agent is missing.
 
     If it has an attribute `path_losses_db`, with mean losses in dB by transmitter and receiver, the radio of the
     built-in network uses these instead of the losses of the world.
@@ -69,8 +69,8 @@ class PhysicsFederate(Protocol):
     Attributes:
         step_ns: Time step; there are states at whole steps only.
         limits_m_s2: Largest change of each agent's velocity per second, in m/s^2; `math.inf` if unknown. Only
-            `error_bounded` uses it: a value that is too small breaks the bound, infinity costs exchanges. The mapping
-            is read once; its values may change during the run.
+            `error_bounded` uses it. If a value is too small, errors may exceed the bound; if it is infinity, more
+            exchanges are needed. The mapping is read once; its values may change during the run.
     """
 
     step_ns: int
@@ -81,8 +81,8 @@ class PhysicsFederate(Protocol):
 
         Args:
             to_ns: Time to advance to.
-            commands: Command of each agent's program to its body. It applies from the time of the previous call on;
-                an agent without a command keeps its last command.
+            commands: Command of each agent's program to its body. It applies from the time of the previous call; an
+                agent without a command keeps its last command.
         """
         ...
 
@@ -105,15 +105,15 @@ class NetworkFederate(Protocol):
 
         Args:
             to_ns: Time to advance to.
-            packets: Packets that enter the network up to then, in order of `enters_ns`.
+            packets: Packets that enter the network up to `to_ns`, in order of `enters_ns`.
             states: Positions and velocities of the agents that the network assumes from now on. An agent without a
                 state is absent, and neither sends nor receives; the coordinator drops its packets.
         """
         ...
 
     def next_event_ns(self) -> int | None:
-        """Return a time before which nothing happens without new packets, or None if nothing will happen.
+        """Return a lower bound of the time of the next event without new packets, or None if there is no event.
 
-        Before it, no packet arrives or is dropped, and no position is used. It may be too early.
+        Before this time, no packet arrives or is dropped, and no position is used.
         """
         ...

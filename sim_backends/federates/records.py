@@ -49,7 +49,7 @@ _text_bytes: Final = lru_cache(maxsize=4096)(text_bytes)
 
 
 def commands_bytes(commands: Mapping[str, Any], agents: AgentTable) -> bytes:
-    """Return commands to agents.
+    """Return commands to agents as bytes.
 
     Raises:
         ValueError: A command has no layout, or is for an agent that was not announced.
@@ -99,7 +99,7 @@ def read_commands(reader: FrameReader, agents: AgentTable) -> dict[str, Twist | 
 
 
 def packets_bytes(packets: Iterable[Packet], agents: AgentTable) -> bytes:
-    """Return packets."""
+    """Return packets as bytes."""
     indices, pack = agents.indices, _PACKET.pack
     parts = [
         pack(packet_id, number, size_bytes, sent_ns, enters_ns, indices[source], indices[destination])
@@ -129,7 +129,11 @@ def read_packets(reader: FrameReader, agents: AgentTable) -> list[Packet]:
 
 
 def arrivals_bytes(arrivals: Iterable[Arrival], agents: AgentTable) -> bytes:
-    """Return arrivals; an agent that was not announced raises a KeyError."""
+    """Return arrivals as bytes.
+
+    Raises:
+        KeyError: A receiver was not announced.
+    """
     parts = [
         _ARRIVAL.pack(arrival.packet_id, arrival.at_ns, agents.indices[arrival.receiver], 0) for arrival in arrivals
     ]
@@ -156,7 +160,7 @@ def read_arrivals(reader: FrameReader, agents: AgentTable) -> list[Arrival]:
 
 
 def drops_bytes(drops: Iterable[Drop]) -> bytes:
-    """Return drops."""
+    """Return drops as bytes."""
     parts = [_DROP.pack(drop.packet_id) + text_bytes(drop.reason) for drop in drops]
     return count_bytes(len(parts)) + b"".join(parts)
 
@@ -175,7 +179,7 @@ class ArrivalDelay(NamedTuple):
 
     Attributes:
         queuing_ns: Time in queues.
-        transmission_ns: Time from the first attempt of a frame to the end of the received frame.
+        transmission_ns: Time from the first attempt to transmit a frame until the end of the received frame.
         propagation_ns: Time in the air.
     """
 
@@ -185,7 +189,7 @@ class ArrivalDelay(NamedTuple):
 
 
 def arrival_delays_bytes(delays: Iterable[ArrivalDelay]) -> bytes:
-    """Return the parts of the delay of each arrival."""
+    """Return the parts of the delay of each arrival as bytes."""
     return b"".join(_DELAY_PARTS.pack(*parts) for parts in delays)
 
 
@@ -193,7 +197,7 @@ def read_arrival_delays(reader: FrameReader, count: int) -> list[ArrivalDelay]:
     """Return the parts of the delays of `count` arrivals.
 
     Raises:
-        MalformedFrameError: There are fewer than `count`, or a part is negative.
+        MalformedFrameError: The frame ends too early, or a part is negative.
     """
     begin = reader.position
     delays = [

@@ -44,18 +44,18 @@ class _RemoteFederate:
         self._copy = 0
 
     def close(self) -> None:
-        """End the federate."""
+        """Stop the federate."""
         self.session.close()
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:  # noqa: ANN401 (of the subclass)
-        """Return a remote for a copy of the federate, in its present state.
+        """Copy the federate in its process, in its present state, and return the object that represents the copy.
 
         Raises:
-            FederateError: The federate does not support this, or failed.
+            FederateError: The federate does not support copies, or failed.
         """
         if not self.welcome.capabilities & FederateCapability.FORK:
             raise FederateError(
-                f"{self.session.name} cannot be copied, as it does not support fork",
+                f"{self.session.name} cannot be copied, because it does not support fork",
                 remedy="use another command, or a federate that supports it",
             )
         number = self.session.next_copy()
@@ -65,13 +65,13 @@ class _RemoteFederate:
             encode_fork(number),
             MessageKind.DONE,
             decode=bytes,
-            what=lambda: f"copy itself as copy {number}",
+            describe=lambda: f"copy itself as copy {number}",
         )
-        other = object.__new__(type(self))
-        memo[id(self)] = other
-        other.__dict__.update(copy.deepcopy({**self.__dict__, "_copy": number}, memo))
-        weakref.finalize(other, self.session.release, number).atexit = False
-        return other
+        duplicate = object.__new__(type(self))
+        memo[id(self)] = duplicate
+        duplicate.__dict__.update(copy.deepcopy({**self.__dict__, "_copy": number}, memo))
+        weakref.finalize(duplicate, self.session.release, number).atexit = False
+        return duplicate
 
 
 class RemotePhysics(_RemoteFederate):
@@ -117,12 +117,12 @@ class RemotePhysics(_RemoteFederate):
             encode_advance_physics(to_ns, from_ns, commands, self._agents),
             MessageKind.STATES,
             decode=partial(decode_states, agents=self._agents),
-            what=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
+            describe=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
         )
         if states_ns != at_ns:
             self.session.fail(
                 f"{self.session.name}, requested to advance to {seconds_text(to_ns)}, returned the states at "
-                f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, its last step until then"
+                f"{seconds_text(states_ns)} instead of {seconds_text(at_ns)}, the time of its last step"
             )
         if not states.has_limits_of(self._states):
             self._limits_m_s2.update(states.limits_m_s2)
@@ -151,7 +151,7 @@ class RemoteNetwork(_RemoteFederate):
         super().__init__(session, hello, welcome)
         self.extrapolates = bool(welcome.capabilities & FederateCapability.EXTRAPOLATES)
         if any(index >= len(hello.agents) for index in welcome.transmitters):
-            session.fail(f"{session.name} names a transmitter that is not an agent")
+            session.fail(f"{session.name} listed a transmitter that is not an agent")
         self.transmitters = frozenset(hello.agents[index].name for index in welcome.transmitters)
         self.fixed_emitters_m = tuple(welcome.emitters_m)
         self._next_event_ns = welcome.next_event_ns
@@ -162,7 +162,7 @@ class RemoteNetwork(_RemoteFederate):
         self._log_delay: ArrivalDelayLog | None = None
 
     def log_arrival_delays(self, log: ArrivalDelayLog | None) -> None:
-        """Pass the parts of the delays of later arrivals to `log`, if the network reports them; None stops it."""
+        """Pass the parts of the delays of later arrivals to `log`, if the network reports them; None stops this."""
         self._log_delay = log
 
     def sample_links(self) -> dict[str, LinkSample]:
@@ -179,7 +179,7 @@ class RemoteNetwork(_RemoteFederate):
             b"",
             MessageKind.LINKS,
             decode=partial(decode_links, agents=self._agents, utc_ns=time.time_ns()),
-            what=lambda: "sample the links",
+            describe=lambda: "sample the links",
         )
 
     def advance(
@@ -198,9 +198,9 @@ class RemoteNetwork(_RemoteFederate):
             since_ns, reckoning_ns = states.since_ns, states.step_ns
         if self._last_states is not None:
             # Absent agents are sent at rest, so that they are not extrapolated.
-            absent = [name for name in self._last_states if name not in states]
-            if absent:
-                states = {**states, **{name: State(self._last_states[name].position_m) for name in absent}}
+            absent_names = [name for name in self._last_states if name not in states]
+            if absent_names:
+                states = {**states, **{name: State(self._last_states[name].position_m) for name in absent_names}}
             self._last_states = states
         from_ns, self._last_ns = self._last_ns, to_ns
         outcomes = self.session.request(
@@ -209,7 +209,7 @@ class RemoteNetwork(_RemoteFederate):
             AdvanceNetwork(to_ns, states, packets, since_ns, reckoning_ns).encode(self._agents),
             MessageKind.OUTCOMES,
             decode=partial(NetworkOutcomes.decode, agents=self._agents),
-            what=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
+            describe=lambda: f"advance from {seconds_text(from_ns)} to {seconds_text(to_ns)}",
         )
         if outcomes.at_ns != to_ns:
             self.session.fail(
@@ -233,11 +233,11 @@ class RemoteNetwork(_RemoteFederate):
         return None if self._next_event_ns == NO_EVENT else self._next_event_ns
 
 
-def open_physics(where: str, hello: Hello, deadline_s: float | None) -> RemotePhysics:
-    """Start or connect a physics; arguments and errors as for `open_session`."""
-    return RemotePhysics(*open_session(PHYSICS, where, hello, deadline_s))
+def open_physics(endpoint: str, hello: Hello, deadline_s: float | None) -> RemotePhysics:
+    """Start or connect to a physics; arguments and errors as for `open_session`."""
+    return RemotePhysics(*open_session(PHYSICS, endpoint, hello, deadline_s))
 
 
-def open_network(where: str, hello: Hello, deadline_s: float | None) -> RemoteNetwork:
-    """Start or connect a network; arguments and errors as for `open_session`."""
-    return RemoteNetwork(*open_session(NETWORK, where, hello, deadline_s))
+def open_network(endpoint: str, hello: Hello, deadline_s: float | None) -> RemoteNetwork:
+    """Start or connect to a network; arguments and errors as for `open_session`."""
+    return RemoteNetwork(*open_session(NETWORK, endpoint, hello, deadline_s))

@@ -21,8 +21,8 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
 
     Args:
         make: Called with the `Hello` of each run; returns the federate, for example its class.
-        address: None for standard input and output, which then belong to the protocol: what the federate prints goes
-            to standard error. Otherwise an address of a transport (`transports.transport_table`).
+        address: None for standard input and output, which then carry only frames; everything that the federate prints
+            goes to standard error. Otherwise an address of a transport (`transports.transport_table`).
         runs: Number of runs after which to return; None means one run if this side does not listen, otherwise no
             limit.
         **properties: Other attributes of `FederateService`.
@@ -36,30 +36,30 @@ def serve(make: Make, *, address: str | None = None, runs: int | None = None, **
 
 def serve_service(service: FederateService, *, address: str | None = None, runs: int | None = None) -> None:
     """Serve a federate and its properties; arguments and errors as for `serve`."""
-    parsed = None if address is None else parse_address(address)
-    if address is not None and parsed is None:
+    transport_address = None if address is None else parse_address(address)
+    if address is not None and transport_address is None:
         raise ValueError(f"{address!r} is not one of {', '.join(FORMS)}")
-    if parsed is None:
+    if transport_address is None:
         with closing(_standard_channel()) as channel:
             succeeded = serve_channel(channel, service)
-    elif parsed.listens is not False:
-        succeeded = _listen(parsed, service, runs)
+    elif transport_address.listens is not False:
+        succeeded = _listen(transport_address, service, runs)
     else:
-        succeeded = _connect(parsed, service, 1 if runs is None else runs)
+        succeeded = _connect(transport_address, service, 1 if runs is None else runs)
     if not succeeded:
         raise SystemExit(1)
 
 
 def _listen(address: TransportAddress, service: FederateService, runs: int | None) -> bool:
     token = read_token(address)
-    succeeded, served = True, 0
+    succeeded, finished_runs = True, 0
     try:
         with address.listen() as listener:
-            while runs is None or served < runs:
+            while runs is None or finished_runs < runs:
                 with closing(listener.accept(None)) as channel:
                     succeeded = serve_channel(channel, service, token, _HELLO_S)
-                served += 1
-    except DeadlineError as error:  # no ROS master answers
+                finished_runs += 1
+    except DeadlineError as error:  # the ROS master does not answer
         raise SystemExit(str(error)) from error
     return succeeded
 
@@ -80,7 +80,7 @@ def _connect(address: TransportAddress, service: FederateService, runs: int) -> 
 
 
 def _standard_channel() -> StreamChannel:
-    """Return the channel over standard input and output, which are replaced, so that nothing else uses them.
+    """Return the channel over standard input and output, and redirect both, so that no other code uses the channel.
 
     Raises:
         SystemExit: Standard input is a terminal.

@@ -29,53 +29,53 @@ from sim_backends.federates.transports.joining import accept_federate
 from sim_backends.federates.transports.transport_table import FORMS, parse_address
 
 PATIENCE: Final = 20
-"""A federate that reports that it computes may take this multiple of the deadline for an answer."""
+"""A federate that sends `busy` may take this multiple of the deadline for an answer."""
 _FOREVER_S: Final = 1e9
 _BYE_S: Final = 0.2
 _MAX_SHOWN: Final = 400
-_REQUESTS: Final = 1 << 32
-_LIKE_ADDRESS: Final = re.compile(r"[a-z][a-z0-9+.-]*:\S*")
+_REQUEST_NUMBERS: Final = 1 << 32
+_ADDRESS_PATTERN: Final = re.compile(r"[a-z][a-z0-9+.-]*:\S*")
 
 Answer = TypeVar("Answer")
 
 
 def printable(text: str) -> str:
-    """Return a text of a federate for a message: in one line, without control characters, and not too long."""
-    line = "".join(letter if letter.isprintable() else " " for letter in text)
+    """Return a text of a federate in a form for messages: one line, no control characters, limited length."""
+    line = "".join(character if character.isprintable() else " " for character in text)
     return line if len(line) <= _MAX_SHOWN else f"{line[:_MAX_SHOWN]}..."
 
 
 class FederateSession:
-    """A connection to an external federate. After an error it is closed, and its child process has ended.
+    """A connection to an external federate. After an error it is closed, and the child process has exited.
 
     Args:
         role: `PHYSICS` or `NETWORK`.
-        where: Its command or address, for messages.
+        endpoint: The federate's command or address, for messages.
         channel: The channel.
         deadline_s: Longest wait for a frame, in seconds of wall time; None for no deadline.
-        child: Its process, if this process has started it.
+        child: The process of the federate, if this process has started it.
 
     Attributes:
-        name: Its role, its name if it is known, and its command or address.
-        reached_ns: Last simulated time that it has answered, or None.
+        name: The federate's role, its name if it has sent one, and its command or address.
+        reached_ns: Last simulated time to which the federate has advanced, or None.
         observer: Called with each request and answer, in bytes, or None.
         exchange_context: Context of each request and its answer.
     """
 
     def __init__(
-        self, role: int, where: str, channel: FrameChannel, *, deadline_s: float | None, child: Child | None = None
+        self, role: int, endpoint: str, channel: FrameChannel, *, deadline_s: float | None, child: Child | None = None
     ) -> None:
         self._role = role
-        self._where = where
+        self._endpoint = endpoint
         self._channel = channel
         self._child = child
         self._deadline_s = _FOREVER_S if deadline_s is None else deadline_s
-        self._requests = 0
+        self._request_number = 0
         self._copies = 0
-        self._released: list[int] = []
+        self._released_copies: list[int] = []
         self._busy_ns: int | None = None
         self._is_closed = False
-        self.name = f"{ROLES[role]} ({where})"
+        self.name = f"{ROLES[role]} ({endpoint})"
         self.reached_ns: int | None = None
         self.observer: Callable[[bytes, ProtocolFrame | None], None] | None = None
         self.exchange_context: AbstractContextManager[None] = nullcontext()
@@ -90,20 +90,25 @@ class FederateSession:
 
     def release(self, copy: int) -> None:
         """Release a copy of the federate; the message is sent before the next request."""
-        self._released.append(copy)
+        self._released_copies.append(copy)
 
     def welcome(self, hello: Hello) -> Welcome:
         """Send hello, and return the federate's welcome.
 
         Raises:
-            FederateError: It failed, does not answer, or is not compatible; the message names it.
+            FederateError: The federate failed, did not answer, or is not compatible; the message names it.
         """
-        what = f"begin a run as {ROLES[self._role]}"
+        describe = f"begin a run as {ROLES[self._role]}"
         welcome = self.request(
-            MessageKind.HELLO, 0, hello.encode(), MessageKind.WELCOME, decode=Welcome.decode, what=lambda: what
+            MessageKind.HELLO,
+            0,
+            hello.encode(),
+            MessageKind.WELCOME,
+            decode=Welcome.decode,
+            describe=lambda: describe,
         )
         if welcome.name:
-            self.name = f"{ROLES[self._role]} {printable(welcome.name)} ({self._where})"
+            self.name = f"{ROLES[self._role]} {printable(welcome.name)} ({self._endpoint})"
         if welcome.role != self._role:
             self.fail(f"{self.name} is a {ROLES[welcome.role]}")
         if welcome.configuration_hash != hello.configuration_hash:
@@ -118,7 +123,7 @@ class FederateSession:
         answer: MessageKind,
         *,
         decode: Callable[[bytes], Answer],
-        what: Callable[[], str],
+        describe: Callable[[], str],
     ) -> Answer:
         """Send a request, and return its decoded answer.
 
@@ -128,43 +133,46 @@ class FederateSession:
             body: Body of the request.
             answer: Kind of the answer.
             decode: Decodes the body of the answer.
-            what: Returns a description of the request, for error messages.
+            describe: Returns a description of the request, for error messages.
 
         Raises:
-            UnansweredError: It did not answer within its deadline.
-            FederateError: It failed, closed the connection, or sent a malformed frame.
+            UnansweredError: The federate did not answer within its deadline.
+            FederateError: The federate failed, closed the connection, or sent a malformed frame.
         """
         if self._is_closed:
             raise FederateError(f"the connection to {self.name} is closed")
         try:
-            for number in self._released:
+            for number in self._released_copies:
                 self._channel.send(encode(MessageKind.RELEASE, 0, number), time.monotonic() + self._deadline_s)
-            self._released.clear()
-            self._requests = (self._requests + 1) % _REQUESTS
-            expected = Header(0, answer, self._requests, copy)
+            self._released_copies.clear()
+            self._request_number = (self._request_number + 1) % _REQUEST_NUMBERS
+            expected_header = Header(0, answer, self._request_number, copy)
             with self.exchange_context:
-                frame = self._exchange(encode(kind, self._requests, copy, body), expected)
+                frame = self._exchange(encode(kind, self._request_number, copy, body), expected_header)
             if frame.header.kind is MessageKind.ERROR:
                 text = printable(decode_text(frame.body))
-                self.fail(f"{self.name} failed at the request to {what()}: {text}")
+                self.fail(f"{self.name} failed at the request to {describe()}: {text}")
             return decode(frame.body)
         except MalformedFrameError as error:
             is_text = isinstance(error, UnknownKindError) and self._child is not None
             self.fail(
-                f"{self.name} answered request {self._requests}, to {what()}, with a malformed frame: {error}",
+                f"{self.name} answered request {self._request_number}, to {describe()}, with a malformed frame: "
+                f"{error}",
                 "standard output carries only frames; print to standard error"
                 if is_text
                 else "compare it with the protocol: fieldkit docs federates",
             )
         except DeadlineError:
-            self._fail_unanswered(what())
+            self._fail_unanswered(describe())
         except ClosedError as error:
-            self.fail(f"{self.name} failed at the request to {what()}: {error}{self._progress()}{self._exit_text()}")
+            self.fail(
+                f"{self.name} failed at the request to {describe()}: {error}{self._progress()}{self._exit_text()}"
+            )
 
-    def _exchange(self, request: bytes, expected: Header) -> ProtocolFrame:
-        """Send a request, and return the answer or error; `busy` messages before it extend the wait."""
-        started_s = time.monotonic()
-        limit_s, last_s = started_s + self._deadline_s, started_s + PATIENCE * self._deadline_s
+    def _exchange(self, request: bytes, expected_header: Header) -> ProtocolFrame:
+        """Send a request, and return the answer or the error; each `busy` message extends the wait for it."""
+        start_s = time.monotonic()
+        limit_s, final_limit_s = start_s + self._deadline_s, start_s + PATIENCE * self._deadline_s
         self._busy_ns = None
         if self.observer is not None:
             self.observer(request, None)
@@ -173,35 +181,37 @@ class FederateSession:
             frame = self._channel.receive(limit_s)
             _, kind, number, copy = frame.header
             if kind is MessageKind.BUSY:
-                if number == expected.request:  # otherwise it belongs to an earlier request
+                if number == expected_header.request:  # otherwise it belongs to an earlier request
                     self._busy_ns = decode_number(frame.body)
-                    limit_s = min(time.monotonic() + self._deadline_s, last_s)
+                    limit_s = min(time.monotonic() + self._deadline_s, final_limit_s)
                 continue
             if self.observer is not None:
                 self.observer(request, frame)
-            if number != expected.request or copy != expected.copy:
+            if number != expected_header.request or copy != expected_header.copy:
                 raise MalformedFrameError(
-                    8, f"it is for request {number} and copy {copy}, not {expected.request} and {expected.copy}"
+                    8,
+                    f"it is for request {number} and copy {copy}, not {expected_header.request} and "
+                    f"{expected_header.copy}",
                 )
-            if kind is not expected.kind and kind is not MessageKind.ERROR:
-                raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected.kind.name.lower()}")
+            if kind is not expected_header.kind and kind is not MessageKind.ERROR:
+                raise MalformedFrameError(4, f"it is {kind.name.lower()}, not {expected_header.kind.name.lower()}")
             return frame
 
-    def fail(self, what: str, remedy: str = "") -> NoReturn:
-        """Close the session, end the child process, and raise an error.
+    def fail(self, message: str, remedy: str = "") -> NoReturn:
+        """Close the session, kill the child process, and raise an error.
 
         Raises:
             FederateError: Always.
         """
-        error = FederateError(what, remedy=remedy)
+        error = FederateError(message, remedy=remedy)
         self._end()
         raise error
 
-    def _fail_unanswered(self, what: str) -> NoReturn:
+    def _fail_unanswered(self, request_text: str) -> NoReturn:
         limit_s = self._deadline_s if self._busy_ns is None else PATIENCE * self._deadline_s
-        busy = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
+        busy_text = "" if self._busy_ns is None else f"; it last reported {seconds_text(self._busy_ns)}"
         error = UnansweredError(
-            f"{self.name} has not answered for {limit_s:g} s: request to {what}{self._progress()}{busy}"
+            f"{self.name} has not answered for {limit_s:g} s: request to {request_text}{self._progress()}{busy_text}"
             f"{self._output_text()}",
             remedy="find out why it waits, or set a longer deadline",
         )
@@ -245,7 +255,7 @@ class FederateSession:
             self._channel.receive(deadline_s)
 
     def close(self) -> None:
-        """End the session and its child process; a second call has no effect."""
+        """End the session, and stop the child process; a second call has no effect."""
         if self._is_closed:
             return
         self._is_closed = True
@@ -256,48 +266,48 @@ class FederateSession:
         self._channel.close()
 
 
-def _child(where: str, role: int) -> Child:
+def _child(endpoint: str, role: int) -> Child:
     """Start a federate by its name or its command.
 
     Raises:
-        ConfigurationError: It cannot be started; `where` may be an address of a transport that does not exist.
+        ConfigurationError: It cannot be started; `endpoint` may be an address of a transport that does not exist.
     """
-    command = command_line(where, role)
+    command = command_line(endpoint, role)
     try:
         return Child(command)
     except ConfigurationError as error:
-        if not _LIKE_ADDRESS.fullmatch(where):
+        if not _ADDRESS_PATTERN.fullmatch(endpoint):
             raise
         raise ConfigurationError(
-            f"{where!r} is not an address, and there is no program with this name",
+            f"{endpoint!r} is not an address, and there is no program with this name",
             remedy=f"use {', '.join(FORMS)}, or a command, for example 'python3 carts.py'",
         ) from error
 
 
 def open_session(
-    role: int, where: str, hello: Hello, deadline_s: float | None
+    role: int, endpoint: str, hello: Hello, deadline_s: float | None
 ) -> tuple[FederateSession, Hello, Welcome]:
-    """Start or connect a federate, and return its session with both messages of the handshake.
+    """Start or connect to a federate, and return its session with both messages of the handshake.
 
     Args:
         role: `PHYSICS` or `NETWORK`.
-        where: A name, a command, or an address of a transport (`transports.transport_table`).
-        hello: The hello that it receives; the token is added, and the interval of its heartbeats
-            is reduced to a quarter of the deadline.
+        endpoint: A name, a command, or an address of a transport (`transports.transport_table`).
+        hello: The hello that the federate receives; the token is added, and the interval of heartbeats is limited to
+            a quarter of the deadline.
         deadline_s: Longest wait for the connection and for each frame; None for no deadline.
 
     Raises:
         ConfigurationError: The name, the command or the address cannot be used.
         FederateError: The federate failed, or has not connected or answered in time.
     """
-    address = parse_address(where)
+    address = parse_address(endpoint)
     if deadline_s is not None:
-        # Several heartbeats per deadline, as the federate's machine may be busy.
+        # There are several heartbeats per deadline, because the federate's machine may be busy.
         hello = replace(hello, heartbeat_ms=max(min(hello.heartbeat_ms, round(deadline_s * 250)), 1))
     if address is None:
-        child = _child(where, role)
-        session = FederateSession(role, printable(where), child.channel, deadline_s=deadline_s, child=child)
-        if is_single_threaded(where, role):
+        child = _child(endpoint, role)
+        session = FederateSession(role, printable(endpoint), child.channel, deadline_s=deadline_s, child=child)
+        if is_single_threaded(endpoint, role):
             session.exchange_context = ProcessorSharing(child.pid)
     else:
         token = read_token(address)
@@ -306,9 +316,9 @@ def open_session(
         try:
             channel = accept_federate(address, token, limit_s) if address.listens else address.connect(limit_s)
         except DeadlineError as error:
-            during = "for" if address.listens is False else "within"
+            preposition = "for" if address.listens is False else "within"
             raise UnansweredError(
-                f"{ROLES[role]} ({address}): {error} {during} {deadline_s:g} s",
+                f"{ROLES[role]} ({address}): {error} {preposition} {deadline_s:g} s",
                 remedy="start the federate, or check its address and token",
             ) from error
         session = FederateSession(role, str(address), channel, deadline_s=deadline_s)

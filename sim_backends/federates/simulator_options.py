@@ -9,10 +9,10 @@ from sim_backends.federates.handshake import Hello
 
 
 class SimulatorOptions(Strict):
-    """Base of the options of a simulator, and the options of a simulator that has none.
+    """Base class of the options of simulators; a simulator without options uses it directly.
 
-    Validation, defaults and documentation come from the model: the docstring has the description of the simulator's
-    options, and under `Attributes:` the meaning of each key.
+    Validation, defaults and documentation come from the model: its docstring contains the description of the
+    simulator's options, and under `Attributes:` the meaning of each key.
     """
 
     @classmethod
@@ -20,7 +20,7 @@ class SimulatorOptions(Strict):
         """Return the options of a run.
 
         Raises:
-            ValueError: An option is invalid, which is only possible if the coordinator has not validated it.
+            ValueError: An option is invalid. This is possible only if the coordinator has not validated it.
         """
         return cls.model_validate(json.loads(hello.configuration).get("options", {}))
 
@@ -38,7 +38,7 @@ class SimulatorOptions(Strict):
         yield from ()
 
     def further_configuration(self, configuration: Mapping[str, Any]) -> dict[str, Any]:
-        """Return further keys of the configuration of hello, for a simulator that cannot compute them itself.
+        """Return additional keys for the configuration in hello, for a simulator that cannot compute them.
 
         Args:
             configuration: The configuration with `scenario`, `world`, `robots` and `options`, in JSON values.

@@ -164,7 +164,7 @@ class Federate
 int
 main()
 {
-    std::FILE* output = fieldkit::protocol::TakeStandardOutput();
+    std::FILE* output = fieldkit::protocol::RedirectStandardOutput();
     fieldkit::protocol::Heartbeat heartbeat;
     fieldkit::Federate federate(heartbeat);
     fieldkit::protocol::Serve(stdin, output, heartbeat, [&federate](const fieldkit::protocol::Frame& request) {

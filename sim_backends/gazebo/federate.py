@@ -31,7 +31,7 @@ def adapter() -> CompiledProgram:
     libraries = next((names for names in _LIBRARIES if _are_installed(names)), _LIBRARIES[0])
     flags = ["-O1", "-std=c++17"] if libraries is _LIBRARIES[0] else ["-O1", "-std=c++17", "-DFIELDKIT_GZ"]
     return CompiledProgram(
-        "gazebo-adapter", _SOURCE, (*libraries, "nlohmann_json"), _INSTALL, flags=flags, duration="about 15 s"
+        "gazebo-adapter", _SOURCE, (*libraries, "nlohmann_json"), _INSTALL, flags=flags, duration_text="about 15 s"
     )
 
 

@@ -114,7 +114,10 @@ def world_sdf(
 
 
 def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int, version: Version) -> str:
-    """Return an SDF file with one robot at the origin; Gazebo creates its model from it. Arguments as `world_sdf`."""
+    """Return an SDF file with one robot at the origin; Gazebo creates its model from it.
+
+    The arguments are those of `world_sdf`.
+    """
     root = Element("sdf", version="1.9")
     _add_robot(root, name, SdfRobot(limits, _UPRIGHT, 0.0), version, step_ns)
     return tostring(root, encoding="unicode")

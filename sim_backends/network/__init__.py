@@ -1,1 +1,1 @@
-"""Network federates: they decide which packets arrive, and when."""
+"""Network federates: they determine which packets arrive, and when."""

@@ -17,7 +17,7 @@ BROADCAST: Final = "ip-broadcast"
 
 
 def broadcast_flow(source: str) -> str:
-    """Return the flow that keys the random draws of a source's broadcasts."""
+    """Return the flow from which the random draws of a source's broadcasts are derived."""
     return f"{source} > all"
 
 
@@ -41,8 +41,8 @@ class BareIp:
         """Implement `Transport.receive`."""
         self._wire.deliver(packet.body)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`."""
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.record_loss`."""
         self._wire.drop(packet.body, reason)
 
 
@@ -52,15 +52,15 @@ class _Group:
 
     Attributes:
         packet_ids: Packet number for each receiver that has neither received nor missed the frame.
-        missed: The reason for each receiver that missed the frame before its packet entered the network.
+        miss_reasons: For each receiver that missed the frame before its packet entered the network, the reason.
     """
 
     packet_ids: dict[str, int] = field(default_factory=dict)
-    missed: dict[str, str] = field(default_factory=dict)
+    miss_reasons: dict[str, str] = field(default_factory=dict)
 
 
 class BareBroadcast:
-    """Carries broadcasts. The first packet of a group sends the frame; the other packets only wait for it.
+    """Carries broadcasts. The first packet of a group sends one frame, which carries all packets of the group.
 
     Args:
         wire: The network below.
@@ -68,18 +68,18 @@ class BareBroadcast:
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire
-        self._last: dict[str, tuple[int, _Group]] = {}
+        self._last_groups: dict[str, tuple[int, _Group]] = {}
 
     def send(self, packet: Packet) -> None:
         """Implement `Transport.send`."""
         source, number = packet.source, packet.identity[1]
-        last_number, group = self._last.get(source, (None, None))
+        last_number, group = self._last_groups.get(source, (None, None))
         if group is None or last_number != number:
             group = _Group()
-            self._last[source] = number, group
+            self._last_groups[source] = number, group
             identity = broadcast_flow(source), number
             self._wire.transmit(IpPacket(source, None, BROADCAST, packet.size_bytes, identity, group))
-        if (reason := group.missed.pop(packet.destination, None)) is not None:
+        if (reason := group.miss_reasons.pop(packet.destination, None)) is not None:
             self._wire.drop(packet.packet_id, reason)
         else:
             group.packet_ids[packet.destination] = packet.packet_id
@@ -90,14 +90,14 @@ class BareBroadcast:
         if (packet_id := group.packet_ids.pop(host, None)) is not None:
             self._wire.deliver(packet_id)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`; it is called for packets with one receiver only."""
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.record_loss`; it is called only for packets with one receiver."""
 
-    def missed(self, packet: IpPacket, host: str, reason: str) -> None:
-        """Implement `CountsMisses.missed`."""
+    def record_miss(self, packet: IpPacket, host: str, reason: str) -> None:
+        """Implement `CountsMisses.record_miss`."""
         group: _Group = packet.body
         packet_id = group.packet_ids.pop(host, None)
         if packet_id is None:
-            group.missed[host] = reason
+            group.miss_reasons[host] = reason
         else:
             self._wire.drop(packet_id, reason)

@@ -12,16 +12,16 @@ from sim_backends.network.wire import IpPacket
 from sim_backends.radio.random_streams import PacketIdentity
 
 HEADER_BYTES: Final = 20
-"""RFC 791, 3.1, without options."""
+"""Size of the header without options (RFC 791, 3.1)."""
 
 MAX_PACKET_BYTES: Final = 65535
-"""Maximum of the 16-bit total length, RFC 791, 3.1."""
+"""Maximum of the total length, a field of 16 bits (RFC 791, 3.1)."""
 
 MTU_BYTES: Final = 1500
-"""Linux's default for Wi-Fi and Ethernet."""
+"""Largest IP packet of a frame: Linux's default for Wi-Fi and Ethernet."""
 
 REASSEMBLY_NS: Final = 30 * 10**9
-"""The time for which Linux waits for the other fragments after the first one: net.ipv4.ipfrag_time."""
+"""Time for which Linux waits for the other fragments after the first one (net.ipv4.ipfrag_time)."""
 
 TIMED_OUT: Final = "reassembly timed out"
 
@@ -55,10 +55,10 @@ class Fragment:
 
 
 def fragments(packet: IpPacket, ip_id: int, mtu_bytes: int = MTU_BYTES) -> Iterator[Fragment]:
-    """Yield the fragments of a packet; all but the last have the maximum size, in units of 8 bytes (RFC 791, 3.2).
+    """Yield the fragments of a packet; all but the last have the maximum size, a multiple of 8 bytes (RFC 791, 3.2).
 
     Raises:
-        ConfigurationError: The packet is longer than an IP packet can be.
+        ConfigurationError: The packet is longer than the maximum of an IP packet.
     """
     if packet.size_bytes <= mtu_bytes:
         yield Fragment(packet, ip_id, 0, 1, 0, packet.size_bytes)
@@ -79,13 +79,13 @@ def fragments(packet: IpPacket, ip_id: int, mtu_bytes: int = MTU_BYTES) -> Itera
 
 
 @dataclass(slots=True)
-class _Partial:
+class _PartialPacket:
     """State of a packet at a host: fragments that arrived or were lost, time of the first arrival, and failure."""
 
     packet: IpPacket
-    fragments_counted: int = 0
+    fragment_count: int = 0
     since_ns: int | None = None
-    failed: bool = False
+    has_failed: bool = False
 
 
 class Reassembly:
@@ -97,7 +97,7 @@ class Reassembly:
 
     def __init__(self, on_lost: Callable[[IpPacket, str, str], None]) -> None:
         self._on_lost = on_lost
-        self._partials: dict[tuple[str, str, int], _Partial] = {}
+        self._partials: dict[tuple[str, str, int], _PartialPacket] = {}
 
     def on_arrival(self, now_ns: int, host: str, fragment: Fragment) -> bool:
         """Record a fragment that arrived at a host; return True if its packet is now complete there.
@@ -111,7 +111,7 @@ class Reassembly:
             partial.since_ns = now_ns
         elif now_ns - partial.since_ns >= REASSEMBLY_NS:
             self._fail(host, partial, TIMED_OUT)
-        return partial.fragments_counted == fragment.count and not partial.failed
+        return partial.fragment_count == fragment.count and not partial.has_failed
 
     def on_loss(self, host: str, fragment: Fragment, reason: str) -> None:
         """Record that a fragment will not arrive at a host."""
@@ -126,15 +126,15 @@ class Reassembly:
             if name == host:
                 self._fail(host, partial, reason)
 
-    def _count_fragment(self, host: str, fragment: Fragment) -> _Partial:
+    def _count_fragment(self, host: str, fragment: Fragment) -> _PartialPacket:
         key = host, fragment.packet.source, fragment.ip_id
-        partial = self._partials.pop(key, None) or _Partial(fragment.packet)
-        partial.fragments_counted += 1
-        if partial.fragments_counted < fragment.count:
+        partial = self._partials.pop(key, None) or _PartialPacket(fragment.packet)
+        partial.fragment_count += 1
+        if partial.fragment_count < fragment.count:
             self._partials[key] = partial
         return partial
 
-    def _fail(self, host: str, partial: _Partial, reason: str) -> None:
-        if not partial.failed:
-            partial.failed = True
+    def _fail(self, host: str, partial: _PartialPacket, reason: str) -> None:
+        if not partial.has_failed:
+            partial.has_failed = True
             self._on_lost(partial.packet, host, reason)

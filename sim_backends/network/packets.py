@@ -80,7 +80,7 @@ class Drop(NamedTuple):
     reason: str
 
 
-class Received(NamedTuple):
+class ReceivedDatagram(NamedTuple):
     """A datagram as it is passed to the receiver's program.
 
     Attributes:

@@ -31,7 +31,7 @@ UDP_ONLY: Final[Mapping[str, TransportFactory]] = MappingProxyType({"udp": Udp})
 
 
 class RadioNetwork:
-    """Carries packets of programs by transports, over the internet protocol and a radio model.
+    """Carries packets of programs with transports over the internet protocol and a radio model.
 
     Events are processed in order of time. At the same nanosecond the order is: events of the radio; starts and ends
     of disturbances; timers of transports, in the order in which they were set; entering packets, in the given order.
@@ -42,8 +42,8 @@ class RadioNetwork:
     positions, or move in steps if the coordinator passes dead-reckoned states. The position error therefore depends
     only on the policy. A station without a state is absent: its radio is off.
 
-    `Transport.lost` is called for packets with a single destination only, because each host may miss a broadcast
-    (`CountsMisses`).
+    `Transport.record_loss` is called only for packets with a single destination. For broadcasts, `CountsMisses`
+    records the hosts that miss them.
 
     Args:
         radio: The radio model.
@@ -82,35 +82,35 @@ class RadioNetwork:
         self.transmitters = frozenset({relay or "", *(jammer.agent for jammer in jammers)} - {""})
         self.fixed_emitters_m = tuple(jammer.place_m for jammer in jammers if jammer.place_m is not None)
         self._changes_ns = changes_ns(disturbances)[::-1]
-        self._off: set[str] = set()
-        self._absent: frozenset[str] = frozenset()
+        self._stations_off: set[str] = set()
+        self._absent_stations: frozenset[str] = frozenset()
         self._places_m: dict[str, Vector] = {}
         self._jammers: dict[str, Jammer] = {}
         self._states: Mapping[str, State] = {}
         self._placed_states: Mapping[str, State] | None = None
         self._timers: list[tuple[int, int, str | None, Callable[[], None]]] = []
         # Timer calls of hosts that are off; they run when the host is on again.
-        self._suspended: list[tuple[str, Callable[[], None]]] = []
-        self._timers_set = 0
+        self._suspended_calls: list[tuple[str, Callable[[], None]]] = []
+        self._timer_count = 0
         self._ip_ids = dict.fromkeys(names, 0)
         self._log_ip: IpLog | None = None
         self._log_delay: DelayLog | None = None
         self._reassembly = ip.Reassembly(self._on_packet_lost)
-        self._pending: dict[int, Packet] = {}
+        self._pending_packets: dict[int, Packet] = {}
         self._arrivals: list[Arrival] = []
         self._drops: list[Drop] = []
         self._transports = {name: make(self) for name, make in transports.items()}
         self._counting_misses = {
             name: transport for name, transport in self._transports.items() if isinstance(transport, CountsMisses)
         }
-        radio.log_losses(self._lose)
+        radio.log_losses(self._on_fragment_lost)
 
     def log_ip(self, log: IpLog | None) -> None:
         """Pass every IP packet that a host sends or receives from now on to `log`; None stops logging."""
         self._log_ip = log
 
     def log_delays(self, log: DelayLog | None) -> None:
-        """Pass the delay of every packet or fragment that arrives from now on to `log`; None stops it."""
+        """Pass the delay of every packet or fragment that arrives from now on to `log`; None stops logging."""
         self._log_delay = log
 
     def __getstate__(self) -> dict[str, Any]:
@@ -131,7 +131,7 @@ class RadioNetwork:
             if self._place(packet.enters_ns):
                 self._run(packet.enters_ns)
             self.now_ns = packet.enters_ns
-            self._pending[packet.packet_id] = packet
+            self._pending_packets[packet.packet_id] = packet
             self._transport(packet.protocol).send(packet)
             self._collect()
         self._run(to_ns)
@@ -159,7 +159,7 @@ class RadioNetwork:
                 self._log_ip(now_ns, source, fragment)
             if destination == source:
                 self._schedule(now_ns, None, partial(self._receive, source, fragment))
-            elif source in self._off:
+            elif source in self._stations_off:
                 for name in self._names if destination is None else (destination,):
                     if name != source:
                         self._reassembly.on_loss(name, fragment, RADIO_OFF)
@@ -178,13 +178,13 @@ class RadioNetwork:
 
     def deliver(self, packet_id: int) -> None:
         """Implement `Wire.deliver`."""
-        packet = self._pending.pop(packet_id, None)
+        packet = self._pending_packets.pop(packet_id, None)
         if packet is not None:
             self._arrivals.append(Arrival(packet_id, packet.destination, self.now_ns))
 
     def drop(self, packet_id: int, reason: str) -> None:
         """Implement `Wire.drop`."""
-        if self._pending.pop(packet_id, None) is not None:
+        if self._pending_packets.pop(packet_id, None) is not None:
             self._drops.append(Drop(packet_id, reason))
 
     def _run(self, to_ns: int) -> None:
@@ -203,14 +203,14 @@ class RadioNetwork:
 
     def _schedule(self, at_ns: int, host: str | None, call: Callable[[], None]) -> None:
         """Schedule `call` for `at_ns`; if a host is given, the call waits while the host is off."""
-        self._timers_set += 1
-        heapq.heappush(self._timers, (at_ns, self._timers_set, host, call))
+        self._timer_count += 1
+        heapq.heappush(self._timers, (at_ns, self._timer_count, host, call))
 
     def _fire_timer(self) -> None:
         """Run the next timer's call, or suspend it if its host is off."""
         _, _, host, call = heapq.heappop(self._timers)
-        if host is not None and host in self._off:
-            self._suspended.append((host, call))
+        if host is not None and host in self._stations_off:
+            self._suspended_calls.append((host, call))
         else:
             call()
 
@@ -218,38 +218,38 @@ class RadioNetwork:
         """Pass the positions of the stations at `at_ns`, the time of the next event, to the radio if they changed.
 
         Returns:
-            True if they changed. The next event of the radio may then be a different one.
+            True if the positions changed. The next event of the radio may then be a different one.
         """
         states = self._states.at(at_ns) if isinstance(self._states, DeadReckoned) else self._states
         if states is self._placed_states:
             return False
         self._placed_states = states
-        absent: frozenset[str] = frozenset()
+        absent_stations: frozenset[str] = frozenset()
         try:
             self._places_m = {name: states[name].position_m for name in self._names}
         except KeyError:
-            absent = frozenset(name for name in self._names if name not in states)
-            present_m = {name: states[name].position_m for name in self._names if name not in absent}
+            absent_stations = frozenset(name for name in self._names if name not in states)
+            present_m = {name: states[name].position_m for name in self._names if name not in absent_stations}
             self._places_m = dict.fromkeys(self._names, STILL) | self._places_m | present_m
         self._radio.place(self.now_ns, self._places_m, self._relay)
-        if absent != self._absent:
-            self._absent = absent
-            if self._off_now() != self._off:
+        if absent_stations != self._absent_stations:
+            self._absent_stations = absent_stations
+            if self._current_stations_off() != self._stations_off:
                 self._disturb(at_ns)
         if self._jammers:
             self._jam()
         return True
 
     def _collect(self) -> None:
-        """Pass the packets that the radio delivers now to their hosts, until no immediate consequence is left."""
-        while arrived := self._radio.deliveries(self.now_ns):
-            for _, host, fragment, _, delay in arrived:
+        """Pass the packets that the radio delivers now to their hosts, until it delivers no further packet now."""
+        while deliveries := self._radio.deliveries(self.now_ns):
+            for _, host, fragment, _, delay in deliveries:
                 if self._log_delay is not None:
                     self._log_delay(host, fragment, delay)
                 self._receive(host, fragment)
 
     def _receive(self, host: str, fragment: Fragment) -> None:
-        if host in self._off and host != fragment.packet.source:
+        if host in self._stations_off and host != fragment.packet.source:
             self._reassembly.on_loss(host, fragment, RADIO_OFF)
             return
         if self._log_ip is not None:
@@ -257,35 +257,37 @@ class RadioNetwork:
         if self._reassembly.on_arrival(self.now_ns, host, fragment):
             self._transports[fragment.packet.transport].receive(host, fragment.packet)
 
-    def _lose(self, at_ns: int, fragment: Fragment, host: str, reason: str) -> None:  # noqa: ARG002 (see LossLog)
+    def _on_fragment_lost(self, at_ns: int, fragment: Fragment, host: str, reason: str) -> None:  # noqa: ARG002 (see LossLog)
         self._reassembly.on_loss(host, fragment, reason)
 
     def _on_packet_lost(self, packet: IpPacket, host: str, reason: str) -> None:
         if packet.destination == host:
-            self._transports[packet.transport].lost(packet, reason)
+            self._transports[packet.transport].record_loss(packet, reason)
         elif packet.destination is None and packet.transport in self._counting_misses:
-            self._counting_misses[packet.transport].missed(packet, host, reason)
+            self._counting_misses[packet.transport].record_miss(packet, host, reason)
 
-    def _off_now(self) -> set[str]:
+    def _current_stations_off(self) -> set[str]:
         """Return the stations whose radios are off now."""
         active_now = active(self._disturbances, self.now_ns)
-        return {disturbance.name for disturbance in active_now if isinstance(disturbance, NodeLoss)} | self._absent
+        return {
+            disturbance.name for disturbance in active_now if isinstance(disturbance, NodeLoss)
+        } | self._absent_stations
 
     def _disturb(self, resume_ns: int) -> None:
-        """Apply the disturbances that are active now, after one has started or ended, or a station is absent.
+        """Apply the present disturbances; called when one starts or ends, and when the absent stations change.
 
         Args:
             resume_ns: Time from which the suspended timers of hosts that are on again fire.
         """
         active_now = active(self._disturbances, self.now_ns)
-        off = self._off_now()
-        cut = {(link.first, link.second) for link in active_now if isinstance(link, LinkCut)}
-        newly_off, self._off = off - self._off, off
-        self._radio.disturb(self.now_ns, off, cut)
-        for host in sorted(newly_off):
+        stations_off = self._current_stations_off()
+        cut_links = {(link.first, link.second) for link in active_now if isinstance(link, LinkCut)}
+        newly_off_stations, self._stations_off = stations_off - self._stations_off, stations_off
+        self._radio.disturb(self.now_ns, stations_off, cut_links)
+        for host in sorted(newly_off_stations):
             self._reassembly.discard(host, RADIO_OFF)
-        suspended, self._suspended = self._suspended, []
-        for host, call in suspended:
+        suspended_calls, self._suspended_calls = self._suspended_calls, []
+        for host, call in suspended_calls:
             self._schedule(resume_ns, host, call)
         jammers = {f"jammer {jammer}": jammer for jammer in active_now if isinstance(jammer, Jammer)}
         if jammers or self._jammers:

@@ -30,6 +30,6 @@ class Udp:
         """Implement `Transport.receive`."""
         self._wire.deliver(packet.body)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`."""
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.record_loss`."""
         self._wire.drop(packet.body, reason)

@@ -1,8 +1,8 @@
 """Protocols between transports and the network below: IP packets, timers, and results of the programs' packets.
 
-One transport object holds the state of both ends of a connection, but an end uses only information that it has
+One transport object contains the state of both ends of a connection, but an end uses only information that it has
 received. A transport runs on any implementation of `Wire`: on the radio, or in a test on a link with fixed losses.
-Calls of a wire cannot be cancelled; `WireTimer` can be rescheduled and stopped.
+Scheduled calls of a wire cannot be cancelled; `WireTimer` can be rescheduled and stopped.
 """
 
 from collections.abc import Callable
@@ -68,14 +68,14 @@ class Transport(Protocol):
     """A transport that carries packets of programs in IP packets."""
 
     def send(self, packet: Packet) -> None:
-        """Send a program's packet; its source calls this at the time of sending."""
+        """Send a program's packet; this is called at its source at the time of sending."""
         ...
 
     def receive(self, host: str, packet: IpPacket) -> None:
         """Process an IP packet of this transport that has arrived, complete, at `host` now."""
         ...
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
         """Record, for statistics only, that an IP packet or a fragment of it will not arrive at its destination.
 
         The ends of a real connection do not have this information, so it must not change their behaviour.
@@ -87,16 +87,16 @@ class Transport(Protocol):
 class CountsMisses(Transport, Protocol):
     """A transport that also records which hosts miss a broadcast."""
 
-    def missed(self, packet: IpPacket, host: str, reason: str) -> None:
-        """Record, like `lost`, that a packet without a single destination will not arrive at a host."""
+    def record_miss(self, packet: IpPacket, host: str, reason: str) -> None:
+        """Record, like `record_loss`, that a packet without a single destination will not arrive at a host."""
         ...
 
 
 class WireTimer:
     """Calls a function once at its due time, unless it is stopped or rescheduled before.
 
-    Postponing the timer, as every ACK does, schedules no further call on the wire: the call that is already scheduled
-    schedules the next one when it fires.
+    When the timer is postponed, as by every ACK, no further call is scheduled on the wire. The call that is already
+    scheduled schedules the next one when it fires.
 
     Args:
         wire: The wire that provides the clock.
@@ -115,13 +115,13 @@ class WireTimer:
         self.due_ns: int | None = None
 
     def set(self, at_ns: int) -> None:
-        """Set the due time to `at_ns`, replacing an earlier setting."""
+        """Set the due time to `at_ns`, in place of an earlier due time."""
         self.due_ns = at_ns
         if self._scheduled_ns is None or self._scheduled_ns > at_ns:
             self._schedule(at_ns)
 
     def bring_forward(self, at_ns: int) -> None:
-        """Set the due time to `at_ns`, or to now if that is past, unless the timer is due earlier."""
+        """Set the due time to `at_ns`, or to now if that is in the past, unless the timer is due earlier."""
         at_ns = max(at_ns, self._wire.now_ns)
         if self.due_ns is None or at_ns < self.due_ns:
             self.set(at_ns)

@@ -41,7 +41,7 @@ def program(ns3_version: str) -> CompiledProgram:
         flags=("-O2", standard_flag(ns3_version)),
         # pkg-config also lists libgsl. Debian's libns3-dev does not install it, and ns-3 itself links it.
         libraries=tuple(f"-lns3-{module}" for module in _MODULES),
-        duration="about 20 s",
+        duration_text="about 20 s",
     )
 
 

@@ -797,7 +797,7 @@ main(int count, char** words)
     {
         return fieldkit::RunAlone(network, words[3]);
     }
-    std::FILE* output = fieldkit::protocol::TakeStandardOutput();
+    std::FILE* output = fieldkit::protocol::RedirectStandardOutput();
     bool is_complete = fieldkit::protocol::Serve(
         stdin, output, fieldkit::g_heartbeat,
         [&network](const fieldkit::protocol::Frame& request) { return fieldkit::AnswerTo(network, request); });

@@ -61,13 +61,13 @@ class Aggregate(Generic[Payload]):
         frames: The frames, in the order of their sequence numbers.
         size_bytes: Size of the PSDU.
         response_bytes: Size of the Block Ack, or of the ACK to a single frame.
-        decoded: The frames that the receiver decoded; empty until the aggregate ends.
+        decoded_frames: The frames that the receiver decoded; empty until the aggregate ends.
     """
 
     frames: Sequence[Frame[Payload]]
     size_bytes: int
     response_bytes: int
-    decoded: Sequence[Frame[Payload]] = ()
+    decoded_frames: Sequence[Frame[Payload]] = ()
 
 
 class BlockAckSession(Generic[Payload]):
@@ -80,7 +80,7 @@ class BlockAckSession(Generic[Payload]):
     def __init__(self, limits: AmpduLimits) -> None:
         self._limits = limits
         self._next_sequence = 0
-        # The recipient's next sequence number to pass up; frames after it; numbers that were given up.
+        # The next sequence number that the recipient passes up; decoded frames after it; numbers that were given up.
         self._expected = 0
         self._frames_waiting: dict[int, Frame[Payload]] = {}
         self._skipped: set[int] = set()
@@ -98,9 +98,13 @@ class BlockAckSession(Generic[Payload]):
         is_single: bool = False,
         limit_ns: int = MAX_PPDU_NS,
     ) -> Aggregate[Payload]:
-        """Return the aggregate of a queue's first frame and later frames to its receiver, up to the size limits.
+        """Return the aggregate of a queue's first frame and later frames to the same receiver.
 
-        With `is_single` it contains the first frame only; with `limit_ns` later frames are added up to that airtime.
+        Args:
+            queue: The queue.
+            mode: Mode of the aggregate.
+            is_single: True if the aggregate must contain only the first frame.
+            limit_ns: Maximum airtime of the aggregate, unless it contains only the first frame.
         """
         limit_bytes = min(self._limits.max_bytes, _bytes_in(mode, limit_ns))
         frames: list[Frame[Payload]] = []
@@ -128,7 +132,7 @@ class BlockAckSession(Generic[Payload]):
         return Aggregate(frames, size_bytes - (_DELIMITER_BYTES if mode.phy_format == "HT" else 0), ACK_BYTES)
 
     def receive(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
-        """Store decoded frames at the recipient; return those that it passes up now, in order, without duplicates."""
+        """Store decoded frames at the recipient; return the frames that it passes up now, without duplicates."""
         for frame in frames:
             if not frame.is_received:
                 frame.is_received = True
@@ -136,7 +140,7 @@ class BlockAckSession(Generic[Payload]):
         return self._pop_in_order()
 
     def skip(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
-        """Give up frames that were not received; return those that the recipient passes up now."""
+        """Give up frames that were not received; return the frames that the recipient passes up now."""
         self._skipped.update(frame.sequence for frame in frames if frame.sequence >= 0)
         return self._pop_in_order()
 
@@ -150,12 +154,12 @@ class BlockAckSession(Generic[Payload]):
         return frames
 
 
-def remove_frames(queue: deque[Frame[Payload]], done: Set[Frame[Payload]]) -> None:
+def remove_frames(queue: deque[Frame[Payload]], finished_frames: Set[Frame[Payload]]) -> None:
     """Remove frames from a queue that contains all of them; the order of the others does not change."""
-    kept_frames, remaining = [], len(done)
+    kept_frames, remaining = [], len(finished_frames)
     while remaining:
         frame = queue.popleft()
-        if frame in done:
+        if frame in finished_frames:
             remaining -= 1
         else:
             kept_frames.append(frame)

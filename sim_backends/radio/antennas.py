@@ -25,7 +25,7 @@ class RadioSettings(Protocol):
 
     @property
     def sensitivity_dbm(self) -> float:
-        """Weakest frame that it detects."""
+        """Received power of the weakest frame that it detects."""
         ...
 
     @property

@@ -34,7 +34,7 @@ class RadioChannel(Protocol):
         """
         ...
 
-    def linked(self, transmitter: int, receiver: int) -> bool:
+    def are_linked(self, transmitter: int, receiver: int) -> bool:
         """Return True if the stations can be associated; frames are sent only to associated stations."""
         ...
 
@@ -51,7 +51,7 @@ class RadioChannel(Protocol):
         return None
 
     def dscp_mapping(self, station: int) -> DscpMapping | None:  # noqa: ARG002 (a default)
-        """Return how a station maps packets to its access categories; None if it has only one queue."""
+        """Return the mapping of packets to a station's access categories; None if it has only one queue."""
         return None
 
     def power_save_timeout_ns(self, station: int) -> int | None:  # noqa: ARG002 (a default)
@@ -76,7 +76,7 @@ class Emitter:
     """A transmitter of noise in the whole channel.
 
     Attributes:
-        name: Name that stays the same while it sends without a pause.
+        name: Its name, which does not change while it sends without a pause.
         place_m: Current position, metres east, north, up.
         power_dbm: Transmit power.
     """

@@ -132,7 +132,7 @@ class EventQueue:
         self._earliest: _Event | None = None
         self._order = 0
 
-    def at(self, at_ns: int, call: Callable[..., None], *arguments: object) -> None:
+    def schedule(self, at_ns: int, call: Callable[..., None], *arguments: object) -> None:
         """Schedule `call(at_ns, *arguments)` for `at_ns`."""
         self._order += 1
         heapq.heappush(self._heap, (at_ns, self._order, call, arguments))

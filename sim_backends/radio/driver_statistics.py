@@ -55,7 +55,7 @@ class RadioMeter:
             link.rate_bit_s = transmission.mode.rate_bit_s
 
     def on_busy(self, start_ns: int, end_ns: int, stations: Iterable[int]) -> None:
-        """Record that stations find their channel busy from now until a time."""
+        """Record that the channel of stations is busy between two times."""
         busy_ns, busy_until_ns = self._busy_ns, self._busy_until_ns
         for index in stations:
             until_ns = busy_until_ns[index]
@@ -66,17 +66,17 @@ class RadioMeter:
     def on_aggregate(self, transmission: Transmission, receiver: int, frames: Sequence[Frame[Any]]) -> None:
         """Record the frames of an aggregate that starts now, after `on_start`."""
         link = self.link(transmission.transmitter, receiver)
-        new = sum(frame.attempts == 1 for frame in frames)
-        link.frames += new
-        link.retries += len(frames) - new
+        first_attempts = sum(frame.attempts == 1 for frame in frames)
+        link.frames += first_attempts
+        link.retries += len(frames) - first_attempts
         link.rate_bit_s = transmission.mode.rate_bit_s
 
     def on_failed_rts(self, transmitter: int, receiver: int, frames: Sequence[Frame[Any]]) -> None:
         """Record an attempt that ended without CTS, for frames whose data was not sent."""
         link = self.link(transmitter, receiver)
-        new = sum(frame.attempts == 1 for frame in frames)
-        link.frames += new
-        link.retries += len(frames) - new
+        first_attempts = sum(frame.attempts == 1 for frame in frames)
+        link.frames += first_attempts
+        link.retries += len(frames) - first_attempts
 
     def on_failures(self, transmitter: int, receiver: int, packets: int) -> None:
         """Record that packets were given up."""
@@ -87,7 +87,7 @@ class RadioMeter:
         return self._links.setdefault((transmitter, receiver), LinkMeter())
 
     def busy_ns(self, now_ns: int) -> Sequence[int]:
-        """Return the time for which each station found its channel busy until now, by index."""
+        """Return the time for which the channel of each station has been busy, by index."""
         return [busy - max(0, until - now_ns) for busy, until in zip(self._busy_ns, self._busy_until_ns, strict=True)]
 
 
@@ -116,22 +116,22 @@ def link_samples(
     """
     busy_ns = meter.busy_ns(now_ns)
 
-    def associated(index: int) -> Sequence[int]:
+    def peers_of(index: int) -> Sequence[int]:
         """Return the stations to which a station sends frames: all others, or its access point."""
         if cells is not None:
             access_point = cells[index]
             return [] if access_point is None else [access_point]
         return [other for other in (robots if relay in {None, index} else (relay,)) if other not in {None, index}]
 
-    def cell(index: int) -> str | None:
+    def cell_of(index: int) -> str | None:
         access_point = None if cells is None else cells[index]
         return None if access_point is None else channel.names[access_point]
 
     return {
         channel.names[index]: LinkSample(
             utc_ns,
-            tuple(_station_sample(now_ns, channel, meter, peers, (index, other)) for other in associated(index)),
-            cell=cell(index),
+            tuple(_station_sample(now_ns, channel, meter, peers, (index, other)) for other in peers_of(index)),
+            cell=cell_of(index),
             noise_dbm=decibel(channel.noise_mw[index]),
             active_ns=now_ns,
             busy_ns=busy_ns[index],
@@ -147,7 +147,7 @@ def _station_sample(
     sent, reverse, peer = meter.link(index, other), meter.link(other, index), peers.get((other, index))
     return StationSample(
         station=channel.names[other],
-        signal_dbm=decibel(channel.powers_mw(other, now_ns)[index]) if channel.linked(other, index) else None,
+        signal_dbm=decibel(channel.powers_mw(other, now_ns)[index]) if channel.are_linked(other, index) else None,
         tx_rate_bit_s=sent.rate_bit_s,
         rx_rate_bit_s=reverse.rate_bit_s,
         tx_packets=sent.frames,

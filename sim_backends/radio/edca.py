@@ -86,7 +86,7 @@ class CategoryContention(Contention):
         self._has_backoff = False
 
     def arrive(self, now_ns: int) -> None:
-        """Record that a frame arrived at an empty queue: a backoff that has ended does not count for it."""
+        """Record that a frame arrived at an empty queue; it needs a new backoff if the last one has ended."""
         self._count_down(now_ns)
         if not self.slots:
             self._has_backoff = False
@@ -140,7 +140,7 @@ class AccessCategories(Generic[Payload]):
     Args:
         mapping: Mapping of DSCPs.
         band: Band of the station.
-        draw: As for `CategoryQueue`.
+        draw: See `CategoryQueue`.
 
     Attributes:
         active: The category of the current or last exchange.

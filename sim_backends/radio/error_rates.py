@@ -52,8 +52,8 @@ def bit_error(mode: WifiMode, snr: float) -> float:
 
 def decoded_bit_error(mode: WifiMode, snr: float) -> float:
     """Return an upper bound (the union bound) of the share of data bits in error after decoding, at most 1."""
-    raw = bit_error(mode, snr)
-    bhattacharyya = math.sqrt(4 * raw * (1 - raw))
+    coded_error = bit_error(mode, snr)
+    bhattacharyya = math.sqrt(4 * coded_error * (1 - coded_error))
     inputs, free_distance, weights = _SPECTRA[mode.code_rate]
     bound = sum(
         weight * bhattacharyya ** (free_distance + excess_weight) for excess_weight, weight in enumerate(weights)
@@ -73,8 +73,8 @@ def log_success(mode: WifiMode, snr_db: float, bits: float) -> float:
     """Return ln of the probability that `bits` data bits arrive without error at `snr_db`; -inf if it is 0.
 
     The value is interpolated linearly in a table with steps of 0.05 dB, which is within 0.002 dB of the formula.
-    Without interpolation the error would be up to 0.05 dB, which corrupts a tenth more of the frames at the edge of a
-    link's range.
+    Without interpolation the error would be up to 0.05 dB, which increases the number of corrupted frames at the edge
+    of a link's range by a tenth.
     """
     steps = (snr_db - _LOWEST_DB) / _STEP_DB
     if steps <= 0:

@@ -1,13 +1,13 @@
 """Rate control by the firmware of a radio. Real algorithms are not published and differ between versions.
 
 Most robots have such a radio: brcmfmac (FullMAC, Raspberry Pi) and ath10k select rates in firmware, iwlwifi in its
-firmware or its driver. The model contains what these algorithms have in common, with two parameters: margin and
+firmware or its driver. The model contains the common features of these algorithms, with two parameters: margin and
 interval. The firmware measures the signal of the peer's frames. After each interval it selects the fastest mode that
-has at most 10 % of errors at a signal weaker by the margin. If fewer than half of an interval's frames were
+has at most 10 % of errors at a signal that is weaker by the margin. If fewer than half of an interval's frames were
 acknowledged, it selects a mode one step slower; if more than 90 % were acknowledged, it undoes one such step. Each
-further attempt for a frame is one step slower than the last.
+further attempt for a frame is one step slower than the attempt before.
 
-To bound a result, compare a margin of 0 dB and a short interval with 10 dB and a long interval.
+To find bounds of a result, compare a margin of 0 dB and a short interval with 10 dB and a long interval.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,20 +44,20 @@ class FirmwareRate(RateControl):
         margin_db: float,
         interval_ns: int,
     ) -> None:
-        self._ladder = ladder(modes)
-        self._required_db = [required_db(mode) for mode in self._ladder]
+        self._modes = useful_modes(modes)
+        self._required_db = [required_db(mode) for mode in self._modes]
         self._signal_to_noise_db = signal_to_noise_db
         self._margin_db = margin_db
         self._interval_ns = interval_ns
         self._next_ns = 0
-        self._rung = self._steps_down = 0
+        self._mode_index = self._steps_down = 0
         self._frames = self._acknowledged = 0
 
     def choose(self, now_ns: int, packet: PacketIdentity, attempt: int) -> WifiMode:  # noqa: ARG002 (see RateControl)
         """Implement `RateControl.choose`."""
         if attempt == 1 and now_ns >= self._next_ns:
             self._select(now_ns)
-        return self._ladder[max(self._rung - self._steps_down - (attempt - 1), 0)]
+        return self._modes[max(self._mode_index - self._steps_down - (attempt - 1), 0)]
 
     def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:  # noqa: ARG002 (see RateControl)
         """Implement `RateControl.report`."""
@@ -67,7 +67,7 @@ class FirmwareRate(RateControl):
     def _select(self, now_ns: int) -> None:
         self._next_ns = now_ns + self._interval_ns
         usable_db = self._signal_to_noise_db(now_ns) - self._margin_db
-        self._rung = max(sum(required <= usable_db for required in self._required_db) - 1, 0)
+        self._mode_index = max(sum(required <= usable_db for required in self._required_db) - 1, 0)
         if self._frames:
             share = self._acknowledged / self._frames
             self._frames = self._acknowledged = 0
@@ -75,16 +75,16 @@ class FirmwareRate(RateControl):
                 self._steps_down += 1
             elif share > _STEP_UP_ABOVE:
                 self._steps_down -= 1
-        self._steps_down = min(max(self._steps_down, 0), self._rung)
+        self._steps_down = min(max(self._steps_down, 0), self._mode_index)
 
 
-def ladder(modes: Sequence[WifiMode]) -> tuple[WifiMode, ...]:
-    """Return the modes that no other mode equals or exceeds in both rate and robustness, slowest first."""
-    rungs: list[WifiMode] = []
+def useful_modes(modes: Sequence[WifiMode]) -> tuple[WifiMode, ...]:
+    """Return the modes that no other mode matches or exceeds in both rate and robustness, slowest first."""
+    useful: list[WifiMode] = []
     for mode in sorted(modes, key=lambda mode: (required_db(mode), -mode.rate_bit_s)):
-        if not rungs or mode.rate_bit_s > rungs[-1].rate_bit_s:
-            rungs.append(mode)
-    return tuple(rungs)
+        if not useful or mode.rate_bit_s > useful[-1].rate_bit_s:
+            useful.append(mode)
+    return tuple(useful)
 
 
 @cache

@@ -1,6 +1,6 @@
 """Links that behave the same at all positions of the stations: each has a queue, a rate, a delay and a loss.
 
-The model uses no clock and no socket. The caller passes the time, in integer nanoseconds that never decrease: the
+The model uses no clock and no socket. The caller passes the time in integer nanoseconds, which must not decrease: the
 medium reads it from the monotonic clock; tests and co-simulations use virtual time.
 """
 
@@ -40,8 +40,8 @@ class FixedLink:
     """The state of one directed link.
 
     Packets wait in a bounded first-in-first-out queue, are sent one after the other at the link's rate, and arrive
-    after the link's delay. They never overtake each other in spite of jitter, because an 802.11 receiver delivers
-    frames in order (IEEE 802.11-2020, 5.1.3): a packet that drew less jitter than its predecessor waits for it.
+    after the link's delay. Packets never overtake each other, even with jitter, because an 802.11 receiver delivers
+    frames in order (IEEE 802.11-2020, 5.1.3): a packet with less jitter than its predecessor waits for it.
 
     Args:
         transmitter: Name of the sending station.
@@ -61,15 +61,15 @@ class FixedLink:
         self._free_ns = 0
         self._last_arrival_ns = 0
         self._starts_ns: deque[int] = deque()
-        self.use(LinkParameters())
+        self.set_parameters(LinkParameters())
 
-    def use(self, parameters: LinkParameters) -> None:
-        """Use `parameters` for packets from now on; packets in flight are not affected."""
+    def set_parameters(self, parameters: LinkParameters) -> None:
+        """Set the parameters for later packets; packets in flight are not affected."""
         self._parameters = parameters
-        # Few lengths occur, and computing these values per packet costs more than a lookup.
+        # Few sizes occur, and computing these values for each packet costs more than a lookup.
         self._by_size: dict[int, tuple[int, Delay]] = {}
 
-    def offer(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | str:
+    def accept(self, now_ns: int, size_bytes: int, packet: PacketIdentity) -> tuple[int, Delay] | str:
         """Accept a packet at `now_ns`, which never decreases.
 
         Args:
@@ -78,8 +78,8 @@ class FixedLink:
             packet: Identity that keys its random draws.
 
         Returns:
-            Arrival time and delay (the parts add up to the time until the arrival); or the reason why it never
-            arrives.
+            Arrival time and delay (its parts add up to the time until the arrival); or the reason why the packet is
+            lost.
         """
         parameters = self._parameters
         transmission_ns, delay_sum = self._by_size.get(size_bytes) or self._compute_size(size_bytes)
@@ -130,16 +130,16 @@ class FixedLink:
 
     def _enqueue(self, now_ns: int, transmission_ns: int) -> int | None:
         """Return the time that a packet waits before its transmission, in ns, or None if the queue is full."""
-        waiting = self._starts_ns
-        while waiting and waiting[0] <= now_ns:
-            waiting.popleft()
+        starts_ns = self._starts_ns
+        while starts_ns and starts_ns[0] <= now_ns:
+            starts_ns.popleft()
         start_ns = now_ns
         if self._free_ns > now_ns:
-            if len(waiting) >= self._parameters.queue_packets:
+            if len(starts_ns) >= self._parameters.queue_packets:
                 self._queue_dropped += 1
                 return None
             start_ns = self._free_ns
-            waiting.append(start_ns)
+            starts_ns.append(start_ns)
         self._free_ns = start_ns + transmission_ns
         return start_ns - now_ns
 
@@ -150,13 +150,13 @@ class FixedLink:
 
     @property
     def counters(self) -> LinkCounters:
-        """The counters so far."""
+        """The current counters."""
         return LinkCounters(self.sent, self._queue_dropped, self._lost, self.delivered)
 
 
 _LinkPacket = tuple[FixedLink, Payload, int, bool, tuple[str, ...], str, PacketIdentity]
-"""A packet on one link: link, payload, size in bytes, True if the receiver keeps it, stations to which it is
-forwarded, original source, and identity that keys its random draws.
+"""A packet on one link: link, payload, size in bytes, True if it is delivered to the receiver of the link, stations
+to which it is forwarded, original source, and identity that keys its random draws.
 """
 
 
@@ -183,14 +183,14 @@ class FixedLinks(Generic[Payload]):
         self._links: dict[str, dict[str, FixedLink]] = {}
         self._in_flight: list[_InFlight[Payload]] = []
         self._order = 0
-        self._offered: dict[str, int] = {}
-        self._arrived: list[Delivery[Payload]] = []
+        self._packet_counts: dict[str, int] = {}
+        self._deliveries: list[Delivery[Payload]] = []
         self._log_loss: LossLog | None = None
         self._off: Set[str] = frozenset()
         self._cut: Set[Pair] = frozenset()
 
     def connect(self, links: Mapping[Pair, LinkParameters], relay: str | None = None) -> None:
-        """Use `links`, by ordered pair of stations, and `relay` from now on; links that are not named are removed.
+        """Set the links, by ordered pair of stations, and the relay; links that are not named are removed.
 
         Packets in flight are not affected; counters and random streams continue.
         """
@@ -198,7 +198,7 @@ class FixedLinks(Generic[Payload]):
         self._links = {}
         for (transmitter, receiver), parameters in links.items():
             link = self._all_links.get((transmitter, receiver)) or FixedLink(transmitter, receiver, self._seed)
-            link.use(parameters)
+            link.set_parameters(parameters)
             self._all_links[transmitter, receiver] = link
             self._links.setdefault(transmitter, {})[receiver] = link
 
@@ -219,8 +219,8 @@ class FixedLinks(Generic[Payload]):
             self._advance(now_ns)
         links = self._links[source]
         if packet is None:
-            number = self._offered.get(source, 0)
-            self._offered[source] = number + 1
+            number = self._packet_counts.get(source, 0)
+            self._packet_counts[source] = number + 1
             packet = source, number
         relay = self._relay
         if destination is None:
@@ -244,8 +244,8 @@ class FixedLinks(Generic[Payload]):
         """Return the packets that arrived up to `now_ns` and were not returned before, in order of arrival."""
         if self._in_flight and self._in_flight[0][0] <= now_ns:
             self._advance(now_ns)
-        arrived, self._arrived = self._arrived, []
-        return arrived
+        deliveries, self._deliveries = self._deliveries, []
+        return deliveries
 
     def log_losses(self, log: LossLog | None) -> None:
         """Pass every loss from now on to `log`; None stops logging."""
@@ -272,7 +272,7 @@ class FixedLinks(Generic[Payload]):
                 self._in_flight.append(entry)
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return the counters of each link so far."""
+        """Return the current counters of each link."""
         return {pair: link.counters for pair, link in self._all_links.items()}
 
     def use_meter(self) -> None:
@@ -311,7 +311,7 @@ class FixedLinks(Generic[Payload]):
                 link.count_cut()
                 self._lose(now_ns, packet, OUT_OF_RANGE)
                 return
-        result = link.offer(now_ns, size_bytes, identity)
+        result = link.accept(now_ns, size_bytes, identity)
         if isinstance(result, str):
             self._lose(now_ns, packet, result)
             return
@@ -325,13 +325,13 @@ class FixedLinks(Generic[Payload]):
         heapq.heappush(self._in_flight, (at_ns, self._order, packet, delay_sum, before))
 
     def _arrive(self, at_ns: int, packet: _LinkPacket[Payload], delay_sum: Delay) -> None:
-        link, payload, size_bytes, keep, onward, source, identity = packet
+        link, payload, size_bytes, is_for_receiver, forward_to, source, identity = packet
         link.delivered += 1
-        if keep:
-            self._arrived.append((at_ns, link.receiver, payload, source, delay_sum))
-        if onward:
+        if is_for_receiver:
+            self._deliveries.append((at_ns, link.receiver, payload, source, delay_sum))
+        if forward_to:
             links = self._links.get(link.receiver, {})
-            for name in onward:
+            for name in forward_to:
                 # The relay has no link to itself, and a station may have left while the packet was in flight to the
                 # relay.
                 if name in links:
@@ -343,8 +343,8 @@ class FixedLinks(Generic[Payload]):
         """Log that a packet does not pass its link, for each station that it would have reached."""
         if self._log_loss is None:
             return
-        link, payload, _, keep, onward, _, _ = packet
-        for name in dict.fromkeys((link.receiver, *onward) if keep else onward):
+        link, payload, _, is_for_receiver, forward_to, _, _ = packet
+        for name in dict.fromkeys((link.receiver, *forward_to) if is_for_receiver else forward_to):
             self._log_loss(now_ns, payload, name, reason)
 
 

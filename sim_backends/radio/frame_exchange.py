@@ -58,7 +58,7 @@ class FrameExchange(Generic[Payload]):
     Attributes:
         stations: Stations by index.
         events: Scheduled events.
-        delivery: Queues of the stations, and what they have received.
+        delivery: Queues of the stations, and delivered packets.
         reception: The frames on the air.
         rts_cts: RTS and CTS before the frames of stations with a threshold.
         log: Called with every transmission attempt that ends; None without a log.
@@ -104,7 +104,7 @@ class FrameExchange(Generic[Payload]):
         if not _has_frames(station) or station.exchange_id & 1 or station.index in self.events.starts:
             return
         if self.reception.is_jammed(station.index):
-            self.events.at(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
+            self.events.schedule(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
         else:
             station.contention.set_busy_until(now_ns)
             self._contend(now_ns, station)
@@ -116,7 +116,7 @@ class FrameExchange(Generic[Payload]):
         station = self.stations[index]
         station.contention.earliest_start_ns(now_ns)
         if self.reception.is_jammed(index):
-            self.events.at(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
+            self.events.schedule(now_ns + _JAMMED_RETRY_NS, self.retry_when_idle, station)
             return
         if station.categories is not None:
             station.queue = station.categories.select(now_ns)
@@ -161,7 +161,7 @@ class FrameExchange(Generic[Payload]):
         self.reception.start(transmission, reserved_ns)
         if self.meter is not None:
             self.meter.on_start(transmission, frame.receiver)
-        self.events.at(end_ns, self._end_frame, station, peer, frame, transmission)
+        self.events.schedule(end_ns, self._end_frame, station, peer, frame, transmission)
 
     def _end_frame(
         self,
@@ -171,8 +171,8 @@ class FrameExchange(Generic[Payload]):
         frame: Frame[Payload],
         transmission: Transmission,
     ) -> None:
-        addressed = sorted(transmission.receivers) if peer is None else [peer.receiver]
-        received = [index for index in addressed if self.reception.decodes(index, transmission, "data")]
+        receivers = sorted(transmission.receivers) if peer is None else [peer.receiver]
+        received = [index for index in receivers if self.reception.decodes(index, transmission, "data")]
         self.reception.end(now_ns, transmission)
         if self.log is not None:
             self.log(attempt_record(self._names, transmission, frame, received, transmission.size_bytes))
@@ -191,7 +191,7 @@ class FrameExchange(Generic[Payload]):
         for index in received:
             self._receive(now_ns, station, self.delivery.peer(station.index, index), frame)
         self.delivery.count_broadcast(now_ns, station.index, frame, received)
-        self._end_exchange(now_ns, station, None, done=True)
+        self._end_exchange(now_ns, station, None, is_done=True)
 
     def _receive(self, now_ns: int, station: Station[Payload], peer: Peer[Payload], frame: Frame[Payload]) -> None:
         if peer.last_frame is not frame:
@@ -233,7 +233,7 @@ class FrameExchange(Generic[Payload]):
         exchange_ns: int,
         send: Callable[[int], None],
     ) -> None:
-        """Send RTS before a frame or an aggregate, and the data by `send` after the CTS."""
+        """Send RTS before a frame or an aggregate, and call `send` after the CTS to send the data."""
 
         def fail(at_ns: int) -> None:
             if self.meter is not None:
@@ -258,7 +258,7 @@ class FrameExchange(Generic[Payload]):
         if self.meter is not None:
             self.meter.on_start(transmission, None)
             self.meter.on_aggregate(transmission, peer.receiver, aggregate.frames)
-        self.events.at(end_ns, self._end_aggregate, station, peer, aggregate, transmission)
+        self.events.schedule(end_ns, self._end_aggregate, station, peer, aggregate, transmission)
 
     def _end_aggregate(
         self,
@@ -268,7 +268,7 @@ class FrameExchange(Generic[Payload]):
         aggregate: Aggregate[Payload],
         transmission: Transmission,
     ) -> None:
-        decoded = aggregate.decoded = self.reception.decoded_frames(peer.receiver, transmission, aggregate)
+        decoded = aggregate.decoded_frames = self.reception.decode_frames(peer.receiver, transmission, aggregate)
         self.reception.end(now_ns, transmission)
         if self.log is not None:
             for frame in aggregate.frames:
@@ -292,8 +292,8 @@ class FrameExchange(Generic[Payload]):
     ) -> None:
         exchange_id = station.exchange_id
         if is_decoded:
-            self.events.at(now_ns + self._sifs_ns, self._respond, station, peer, transmission, exchange_id)
-        self.events.at(now_ns + self._ack_timeout_ns, self._response_timeout, station, peer, exchange_id)
+            self.events.schedule(now_ns + self._sifs_ns, self._respond, station, peer, transmission, exchange_id)
+        self.events.schedule(now_ns + self._ack_timeout_ns, self._response_timeout, station, peer, exchange_id)
 
     def _respond(
         self,
@@ -317,7 +317,7 @@ class FrameExchange(Generic[Payload]):
         ack_exchange_id = 0
         if station.receiving is ack and station.exchange_id == exchange_id:
             ack_exchange_id = station.exchange_id = exchange_id + 2  # so that the timeout is ignored
-        self.events.at(end_ns, self._end_response, station, peer, ack, ack_exchange_id)
+        self.events.schedule(end_ns, self._end_response, station, peer, ack, ack_exchange_id)
 
     def _end_response(
         self,
@@ -327,12 +327,12 @@ class FrameExchange(Generic[Payload]):
         ack: Transmission,
         exchange_id: int,
     ) -> None:
-        decoded = station.receiving is ack and self.reception.decodes(station.index, ack, "ack")
+        is_decoded = station.receiving is ack and self.reception.decodes(station.index, ack, "ack")
         self.reception.end(now_ns, ack)
         if self.log is not None:
-            self.log(control_record(self._names, ack, station.index, "ACK", decoded=decoded))
+            self.log(control_record(self._names, ack, station.index, "ACK", decoded=is_decoded))
         if exchange_id == station.exchange_id:
-            self._finish_attempt(now_ns, station, peer, acknowledged=decoded)
+            self._finish_attempt(now_ns, station, peer, acknowledged=is_decoded)
 
     def _response_timeout(
         self, now_ns: int, station: Station[Payload], peer: Peer[Payload], exchange_id: int
@@ -349,7 +349,7 @@ class FrameExchange(Generic[Payload]):
         acknowledged: bool,
         is_sent: bool = True,
     ) -> None:
-        """End an attempt; `is_sent` is False if a CTS was missing; the result is then not used for rate control."""
+        """End an attempt. If no CTS arrived, `is_sent` is False, and the result is not used for rate control."""
         if not acknowledged:
             if station.categories is None:
                 station.contention.set_busy_until(now_ns)
@@ -361,21 +361,21 @@ class FrameExchange(Generic[Payload]):
         frame = station.queue[0]
         if is_sent:
             peer.rate.report(peer.mode, acknowledged=acknowledged)
-        done = acknowledged or frame.attempts >= frame.max_attempts
-        if done:
+        is_done = acknowledged or frame.attempts >= frame.max_attempts
+        if is_done:
             is_received = peer.last_frame is frame
             peer.count(delivered=is_received)
             if self.meter is not None and not acknowledged:
                 self.meter.on_failures(station.index, peer.receiver, 1)
             if not is_received:
                 self.delivery.lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
-        self._end_exchange(now_ns, station, peer, done=done)
+        self._end_exchange(now_ns, station, peer, is_done=is_done)
 
     def _end_exchange(
-        self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None, *, done: bool
+        self, now_ns: int, station: Station[Payload], peer: Peer[Payload] | None, *, is_done: bool
     ) -> None:
         station.exchange_id += 1
-        if done:
+        if is_done:
             station.contention.on_success()
             station.queue.popleft()
         else:
@@ -398,25 +398,28 @@ class FrameExchange(Generic[Payload]):
         aggregate = station.aggregate
         assert aggregate is not None
         station.aggregate = None
-        frames, confirmed = aggregate.frames, set(aggregate.decoded if acknowledged else ())
+        frames, acknowledged_frames = aggregate.frames, set(aggregate.decoded_frames if acknowledged else ())
         if is_sent:
-            peer.rate.report(peer.mode, acknowledged=len(confirmed), attempts=len(frames))
+            peer.rate.report(peer.mode, acknowledged=len(acknowledged_frames), attempts=len(frames))
         if acknowledged:
             station.contention.on_success()
             peer.failed_exchanges = 0
         else:
             station.contention.on_failure()
             peer.failed_exchanges += is_sent
-        given_up = {frame for frame in frames if frame not in confirmed and frame.attempts >= frame.max_attempts}
-        lost = [frame for frame in frames if frame in given_up and not frame.is_received]
-        for frame in lost:
+        failed_frames = {
+            frame for frame in frames if frame not in acknowledged_frames and frame.attempts >= frame.max_attempts
+        }
+        lost_frames = [frame for frame in frames if frame in failed_frames and not frame.is_received]
+        for frame in lost_frames:
             self.delivery.lose(now_ns, station.index, frame, RETRIES_EXHAUSTED)
-        peer.count_frames(delivered=len(confirmed) + len(given_up) - len(lost), lost=len(lost))
+        delivered = len(acknowledged_frames) + len(failed_frames) - len(lost_frames)
+        peer.count_frames(delivered=delivered, lost=len(lost_frames))
         if self.meter is not None:
-            self.meter.on_failures(station.index, peer.receiver, len(given_up))
-        if lost:
-            self.delivery.pass_up(now_ns, station.index, peer, session.skip(lost))
-        remove_frames(station.queue, confirmed | given_up)
+            self.meter.on_failures(station.index, peer.receiver, len(failed_frames))
+        if lost_frames:
+            self.delivery.pass_up(now_ns, station.index, peer, session.skip(lost_frames))
+        remove_frames(station.queue, acknowledged_frames | failed_frames)
         station.exchange_id += 1
         if station.categories is not None:
             self._start_next(now_ns, station, station.categories, peer)

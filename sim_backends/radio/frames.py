@@ -110,14 +110,14 @@ def part_success_probability(
     times = sorted(edges)
     length_ns = end_ns - start_ns
     logarithm = 0.0
-    for begin, end in itertools.pairwise(times):
+    for start, end in itertools.pairwise(times):
         interference_mw = sum(
             other.powers_mw[receiver]
             for other in frame.interferers
-            if other.start_ns <= begin and other.end_ns >= end
+            if other.start_ns <= start and other.end_ns >= end
         )
         ratio_db = decibel(signal_mw / (noise_mw + interference_mw))
-        logarithm += log_success(frame.mode, ratio_db, bits * (end - begin) / length_ns)
+        logarithm += log_success(frame.mode, ratio_db, bits * (end - start) / length_ns)
     return math.exp(logarithm)
 
 
@@ -135,13 +135,13 @@ class Frame(Generic[Payload]):
         size_bytes: Size of the packet, without MAC header.
         source: Name of the original sender.
         receiver: Index of the station at the end of this hop; None for a broadcast.
-        onward: Indices of the stations to which the relay forwards it; None for a broadcast.
-        keep: True if the packet is delivered to the receiver of this hop.
+        forward_to: Indices of the stations to which the relay forwards it; None for a broadcast.
+        is_for_receiver: True if the packet is delivered to the receiver of this hop.
         packet: Identity of the packet, from which its random numbers are derived.
         queued_ns: Time at which it entered the transmitter's queue.
         before: Sum of the delays before this hop, in the packed form of `links.Delay`; 0 for none.
         first_attempt_ns: Start of its first attempt.
-        attempts: Number of attempts so far.
+        attempts: Number of attempts that have started.
         sequence: Its number in a Block Ack session; -1 before its first attempt, or without a session.
         is_received: True if the receiver of a Block Ack session has decoded it.
         max_attempts: Number of attempts after which it is given up.
@@ -153,8 +153,8 @@ class Frame(Generic[Payload]):
     size_bytes: int
     source: str
     receiver: int | None
-    onward: tuple[int | None, ...]
-    keep: bool
+    forward_to: tuple[int | None, ...]
+    is_for_receiver: bool
     packet: PacketIdentity
     queued_ns: int
     before: Delay = 0
@@ -167,16 +167,16 @@ class Frame(Generic[Payload]):
     category: int = 0
 
     def total_delay(self, now_ns: int, propagation_ns: int) -> Delay:
-        """Return the delay over all hops so far, for a frame decoded at `now_ns`."""
-        waited_ns, sent_ns = self.first_attempt_ns - self.queued_ns, now_ns - self.first_attempt_ns
-        parts = QUEUING_NS * waited_ns + TRANSMISSION_NS * sent_ns + PROPAGATION_NS * propagation_ns
+        """Return the delay over this and all earlier hops, for a frame that is decoded at `now_ns`."""
+        queuing_ns, transmission_ns = self.first_attempt_ns - self.queued_ns, now_ns - self.first_attempt_ns
+        parts = QUEUING_NS * queuing_ns + TRANSMISSION_NS * transmission_ns + PROPAGATION_NS * propagation_ns
         return parts + (self.before or PACKET)
 
     def for_second_hop(self, now_ns: int, receiver: int | None, before: Delay) -> "Frame[Payload]":
         """Return the packet as a frame of its second hop, which the relay queues at `now_ns`."""
-        onward = Frame(self.payload, self.size_bytes, self.source, receiver, (), True, self.packet, now_ns, before)
-        onward.dscp = self.dscp
-        return onward
+        frame = Frame(self.payload, self.size_bytes, self.source, receiver, (), True, self.packet, now_ns, before)
+        frame.dscp = self.dscp
+        return frame
 
 
 @dataclass(frozen=True)

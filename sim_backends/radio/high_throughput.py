@@ -66,7 +66,7 @@ _HE_LTF_NS: Final = {800: 7_200, 1600: 8_000, 3200: 16_000}
 
 @dataclass(frozen=True)
 class PhyCapability:
-    """What a station of 802.11n or later can send and receive.
+    """The capability of a station of 802.11n or later.
 
     Attributes:
         amendment: Its amendment of 802.11.
@@ -78,7 +78,7 @@ class PhyCapability:
         firmware_margin_db: Margin of `firmware` below the measured signal.
         firmware_interval_ns: Time between two selections of `firmware`.
         rts_threshold_bytes: Largest size of a frame or aggregate that it sends without RTS; None for any size.
-        access_categories: How it maps packets to its access categories; None if it sends all as best effort.
+        access_categories: Mapping of packets to its access categories; None if it sends all packets as best effort.
         power_save_timeout_ns: Time from its last frame until it dozes; None if it never dozes.
         packet_time_ns: Time that its bus and driver need per packet before the queue of the radio.
     """
@@ -136,7 +136,7 @@ def capability_of(standard: str, phy: WifiPhy | None) -> PhyCapability | None:
 
 @dataclass(frozen=True)
 class _Common:
-    """What two stations of one band have in common: format, width, number of streams, shortest guard interval."""
+    """Common properties of two stations of one band: format, width, number of streams, shortest guard interval."""
 
     phy_format: HighThroughput
     width_mhz: int
@@ -262,6 +262,6 @@ def mode_names() -> tuple[str, ...]:
 
 
 def mode_named(name: str, band: Band) -> WifiMode | None:
-    """Return the mode of this name in a band, or None if there is none."""
+    """Return the mode of this name in a band, or None if no mode has the name."""
     legacy = (*G_MODES, *N_MODES) if band is BAND_2_4 else OFDM_MODES[band.name]
     return next((mode for mode in (*legacy, *_format_modes(band)) if mode.name == name), None)

@@ -15,18 +15,18 @@ class LinkRow:
         mean_mw: Received power of the station at each other station, without fading, in mW.
 
     Attributes:
-        linked: True for each station that receives it and is received by it, without fading; None before the first
-            use.
+        is_linked: For each station, True if the two stations receive each other without fading; None before the
+            first use.
         slot: Number of the time slot (of the validity of a gain) for which `powers_mw` was computed; -1 for none.
         powers_mw: Received power of the station at each other station in that slot; without fading if `slot` is -1.
     """
 
-    __slots__ = ("linked", "mean_mw", "powers_mw", "revision", "slot")
+    __slots__ = ("is_linked", "mean_mw", "powers_mw", "revision", "slot")
 
     def __init__(self, revision: int, mean_mw: Floats) -> None:
         self.revision = revision
         self.mean_mw = mean_mw
-        self.linked: list[bool] | None = None
+        self.is_linked: list[bool] | None = None
         self.slot = -1
         self.powers_mw: list[float] = mean_mw.tolist()
 

@@ -3,7 +3,7 @@
 The module can be imported without the models that use it. Delays have the four parts of the paper's eq. 2, in
 nanoseconds: processing, queuing, transmission and propagation. A `Delay` is one integer with five fields of 64 bits
 (584 years each): a number of packets, and the sum of each part. Delays are added with `+`. Updating the delay of a
-packet costs 45 ns; five separate counters cost 100 ns, and the medium has only 4 us per packet.
+packet takes 45 ns; updating five separate counters takes 100 ns, and the medium has only 4 us per packet.
 """
 
 from collections.abc import Callable
@@ -23,8 +23,8 @@ class LinkParameters:
     Attributes:
         rate_bit_s: Serialization rate in bit/s; None means unlimited.
         delay_ns: Delay in addition to queuing and serialization, in ns.
-        jitter_ns: Width of the uniform extra delay, in ns.
-        loss: Share of packets lost, independent of their length.
+        jitter_ns: Width of the uniformly distributed extra delay, in ns.
+        loss: Share of lost packets, independent of their length.
         queue_packets: Maximum number of queued packets, without the one on the air.
     """
 
@@ -41,9 +41,9 @@ class LinkParameters:
 
 @dataclass(frozen=True)
 class LinkCounters:
-    """Counters of one directed link, so far.
+    """Counters of one directed link.
 
-    A packet offered to the link is sent or dropped by its queue; a sent packet is lost, delivered or still in flight.
+    A packet is sent on the link or dropped by its queue; a sent packet is lost, delivered or still in flight.
 
     Attributes:
         sent: Packets that were transmitted.
@@ -82,7 +82,7 @@ Payload = TypeVar("Payload")
 Delivery = tuple[int, str, Payload, str, Delay]
 """Arrival time in ns, receiver, payload, source, and total delay over all hops.
 
-A plain tuple, because one is created per packet.
+It is a plain tuple, because one is created for each packet.
 """
 
 # The lowest bit of each field of a `Delay`; multiply it by the number of nanoseconds, or of packets.

@@ -1,13 +1,14 @@
 """Minstrel-HT: the rate control of Linux for radios of 802.11n and later whose driver is a SoftMAC.
 
 The algorithm is from `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
-width, guard interval and number of streams. Each mode has a smoothed share of acknowledged frames, updated every
-50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At most
-every 20 ms a frame tries another mode once before the second mode of the chain.
+width, guard interval and number of streams. Each mode has a smoothed_share share of acknowledged frames, updated
+every 50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At
+most every 20 ms a frame tries another mode once before the second mode of the chain.
 
-Four things differ. Rates of 802.11a/b/g are not used. Linux has no groups of 802.11ax; here they follow the same
-rules. After its chain, a frame is tried in the robust mode up to the retry limit; Linux gives up a single frame at
-the end of its chain. Linux fills the chains of drivers that permit four modes with the third fastest mode.
+The model differs from Linux in four ways. It does not use the rates of 802.11a/b/g. It applies the same rules to
+groups of 802.11ax, which Linux does not have. After its chain, a frame is tried in the robust mode up to the retry
+limit; Linux gives up a single frame at the end of its chain. For drivers that permit four modes, Linux adds the third
+fastest mode to the chain.
 `benchmarks.minstrel_vs_kernel` compares the selected modes with those of Linux 6.1.
 """
 
@@ -55,7 +56,7 @@ class _Statistics:
         group: Index of its group.
         duration_ns: Duration of the symbols of an aggregate of 16 frames of 1200 bytes, divided by 16.
         frames: Frames sent since the last update.
-        acknowledged: How many of them were acknowledged.
+        acknowledged: Number of these frames that were acknowledged.
         is_measured: True if the mode was used before the last update.
         share: Smoothed share of acknowledged frames. A mode that was not used has at least the highest share of the
             faster modes of its group.
@@ -71,15 +72,17 @@ class _Statistics:
     previous_share: float = 0.0
 
     def update(self) -> None:
-        """Include the frames since the last update in the share."""
+        """Update the share with the frames since the last update."""
         if not self.frames:
             return
-        measured = max(self.acknowledged / self.frames, _SMALLEST_SHARE)
+        measured_share = max(self.acknowledged / self.frames, _SMALLEST_SHARE)
         if not self.share:
-            self.share = self.previous_share = measured
+            self.share = self.previous_share = measured_share
         else:
-            smoothed = _NEW_WEIGHT * measured + _LAST_WEIGHT * self.share + _SECOND_WEIGHT * self.previous_share
-            self.previous_share, self.share = self.share, min(max(smoothed, _SMALLEST_SHARE), 1.0)
+            smoothed_share = (
+                _NEW_WEIGHT * measured_share + _LAST_WEIGHT * self.share + _SECOND_WEIGHT * self.previous_share
+            )
+            self.previous_share, self.share = self.share, min(max(smoothed_share, _SMALLEST_SHARE), 1.0)
         self.is_measured = True
         self.frames = self.acknowledged = 0
 
@@ -88,8 +91,8 @@ class MinstrelHt(RateControl):
     """Rate control of one link.
 
     Args:
-        groups: Modes of each group, slowest first; groups ordered by width, then guard interval (longest first), then
-            number of streams.
+        groups: Modes of each group, slowest first. The groups are ordered by width, then guard interval (longest
+            first), then number of streams.
         draws: Random draws that order the sampled modes.
 
     Attributes:
@@ -114,7 +117,7 @@ class MinstrelHt(RateControl):
         self._orders: list[list[WifiMode]] = [[] for _ in self._groups]
         self._best = self._second = self._robust = self._groups[0][0]
         self._fallback: list[WifiMode] = []
-        self._chain = self._default_chain = _padded([self._best])
+        self._chain = self._default_chain = _fill_chain([self._best])
         self.is_probing = False
         self._update(0)
 
@@ -129,7 +132,7 @@ class MinstrelHt(RateControl):
                 self._sample_from_ns = now_ns + _SAMPLE_NS
                 if samples := self._samples[next(self._sample_types)]:
                     self.is_probing = True
-                    self._chain = _padded([samples.pop(0), *self._fallback])
+                    self._chain = _fill_chain([samples.pop(0), *self._fallback])
         return self._chain[attempt - 1]
 
     def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
@@ -163,8 +166,8 @@ class MinstrelHt(RateControl):
     def _lower_group(self, group: int) -> int | None:
         """Return the closest earlier group that has at most as many streams as this one; None if there is none."""
         streams = self._groups[group][0].streams
-        lower = (number for number in range(group - 1, -1, -1) if self._groups[number][0].streams <= streams)
-        return next(lower, None)
+        lower_groups = (number for number in range(group - 1, -1, -1) if self._groups[number][0].streams <= streams)
+        return next(lower_groups, None)
 
     def _rank(self, mode: WifiMode) -> tuple[float, float]:
         """Return the expected throughput of a mode, in frames per ns, and its share."""
@@ -218,13 +221,13 @@ class MinstrelHt(RateControl):
         best = self._statistics[self._best]
         robust, group_robust = self._groups[0][0], []
         for group in self._groups:
-            of_group = group[0]
+            best_of_group = group[0]
             for mode in group:
                 statistics = self._statistics[mode]
                 if statistics.duration_ns < best.duration_ns and statistics.share < best.share:
                     continue
-                robust, of_group = self._more_robust(robust, mode), self._more_robust(of_group, mode)
-            group_robust.append(of_group)
+                robust, best_of_group = self._more_robust(robust, mode), self._more_robust(best_of_group, mode)
+            group_robust.append(best_of_group)
         throughput = 0.0
         for mode in group_robust:
             if mode.streams < self._best.streams and self._rank(mode)[0] > throughput:
@@ -241,7 +244,7 @@ class MinstrelHt(RateControl):
         self._fallback = []
         for mode in (self._second, self._robust):
             self._fallback += [mode] * self._count_tries(mode)
-        self._default_chain = _padded([self._best] * self._count_tries(self._best) + self._fallback)
+        self._default_chain = _fill_chain([self._best] * self._count_tries(self._best) + self._fallback)
 
     def _count_tries(self, mode: WifiMode) -> int:
         """Return the number of tries of a mode in the chain: as many as fit into 6 ms, with mean backoffs."""
@@ -326,6 +329,6 @@ def _duration_ns(mode: WifiMode) -> int:
     return symbols * mode.symbol_ns // _REFERENCE_FRAMES
 
 
-def _padded(modes: list[WifiMode]) -> tuple[WifiMode, ...]:
+def _fill_chain(modes: list[WifiMode]) -> tuple[WifiMode, ...]:
     """Return the mode of each attempt: the modes of the chain, then its last mode up to the retry limit."""
     return tuple((modes + modes[-1:] * SHORT_RETRY_LIMIT)[:SHORT_RETRY_LIMIT])

@@ -27,7 +27,7 @@ PathLosses = Callable[[], Mapping[Pair, float]]
 
 
 class RadioModel(Protocol[Payload]):
-    """A radio model: it delivers packets at computed times, in ns; the caller passes non-decreasing times."""
+    """A radio model, which delivers packets at computed times, in ns. Times passed to it must not decrease."""
 
     def place(
         self,
@@ -85,7 +85,7 @@ class RadioModel(Protocol[Payload]):
         ...
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return the counters of each link so far."""
+        """Return the current counters of each link."""
         ...
 
     def use_meter(self) -> None:
@@ -93,11 +93,11 @@ class RadioModel(Protocol[Payload]):
         ...
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:
-        """Return each station's driver statistics of its links since `use_meter`, with the timestamp `utc_ns`."""
+        """Return the driver statistics of each station since `use_meter`, with the timestamp `utc_ns`."""
         ...
 
     def log_losses(self, log: LossLog | None) -> None:
-        """Pass every loss from now on to `log`; None stops logging."""
+        """Pass every later loss to `log`; None stops logging."""
         ...
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:
@@ -111,7 +111,7 @@ class RadioModel(Protocol[Payload]):
         ...
 
     def jam(self, now_ns: int, emitters: Sequence[Emitter]) -> None:
-        """Set the jammers that send noise from now on, replacing earlier ones.
+        """Set the jammers that send noise until the next call.
 
         Raises:
             ConfigurationError: There are jammers, and the model does not support noise.
@@ -119,7 +119,7 @@ class RadioModel(Protocol[Payload]):
         ...
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Pass every transmission attempt that ends from now on to `log`; None stops it; fixed links report none."""
+        """Pass every later transmission attempt to `log`; None stops logging. Fixed links have no attempts."""
         ...
 
 
@@ -147,7 +147,7 @@ class WifiInWorld(Wifi[Payload]):
         self._infrastructure: Infrastructure | None = None
         make_delivery: type[PacketDelivery[Payload]] = PacketDelivery
         if options.has_infrastructure and antennas:
-            # Other radios import none of it.
+            # Radios without infrastructure do not import these modules.
             from sim_backends.radio.infrastructure import infrastructure, managed_delivery  # noqa: PLC0415
 
             make_delivery = managed_delivery.ManagedDelivery
@@ -182,7 +182,7 @@ class WifiInWorld(Wifi[Payload]):
 
     @override
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Implement `RadioModel.log_attempts`; frames of stations themselves are omitted."""
+        """Implement `RadioModel.log_attempts`; management frames are omitted."""
         infrastructure = self._infrastructure
         super().log_attempts(
             log if log is None or infrastructure is None else partial(infrastructure.log_packet, log)

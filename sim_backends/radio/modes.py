@@ -24,7 +24,7 @@ BITS_PER_SUBCARRIER: Final[dict[Modulation, int]] = {
 }
 
 SLOT_NS: Final = 9_000
-"""Tables 17-21 and 18-5, short slot: there is no 802.11b station."""
+"""Tables 17-21 and 18-5, short slot, because there is no 802.11b station."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ _HT_PREAMBLE_NS: Final = 36_000
 
 @dataclass(frozen=True, eq=False)
 class WifiMode:
-    """A combination of modulation and coding; one object exists for each, so comparing and hashing use the identity.
+    """A combination of modulation and coding. Each mode is one object, so comparing and hashing use its identity.
 
     Attributes:
         name: `g54`, `n7` or `vht80-mcs9-2ss-400ns`.
@@ -122,7 +122,7 @@ class WifiMode:
         return self
 
     @property
-    def ht(self) -> bool:
+    def is_high_throughput(self) -> bool:
         """True for a mode of 802.11n or later."""
         return self.phy_format != "OFDM"
 
@@ -223,7 +223,7 @@ def control_mode(mode: WifiMode) -> WifiMode:
     rate (10.6.11).
     """
     reference, modes = mode, OFDM_MODES[mode.band.name]
-    if mode.ht:
+    if mode.is_high_throughput:
         matches = [
             ofdm_mode
             for ofdm_mode in modes

@@ -33,7 +33,7 @@ class PacketDelivery(Generic[Payload]):
 
     Attributes:
         peers: State of each link that was used, by indices of transmitter and receiver.
-        arrived: Delivered packets, in order of arrival.
+        deliveries: Delivered packets, in order of arrival.
         log_loss: Called for every loss; None without a log.
         power_save: The dozing stations; None if no station uses power save.
     """
@@ -51,7 +51,7 @@ class PacketDelivery(Generic[Payload]):
         self._queue_packets = queue_packets
         self.peers: dict[tuple[int, int], Peer[Payload]] = {}
         self._category_peers: dict[tuple[int, int, int], CategoryPeer[Payload]] = {}
-        self.arrived: list[Delivery[Payload]] = []
+        self.deliveries: list[Delivery[Payload]] = []
         self.log_loss: LossLog | None = None
         self.power_save: PowerSave[Payload] | None = None
 
@@ -67,7 +67,7 @@ class PacketDelivery(Generic[Payload]):
             frame.category = category_of(frame.dscp, station.categories.mapping)
             queue = station.categories.queue_of(frame)
         peer = None if frame.receiver is None else self.peer(station.index, frame.receiver)
-        if peer is not None and not self._channel.linked(station.index, peer.receiver):
+        if peer is not None and not self._channel.are_linked(station.index, peer.receiver):
             peer.count(delivered=False)
             self.lose(now_ns, station.index, frame, OUT_OF_RANGE)
             return
@@ -104,21 +104,21 @@ class PacketDelivery(Generic[Payload]):
         receiver = peer.receiver
         propagation_ns = self._channel.delay_ns(transmitter, receiver)
         for frame in frames:
-            delay_so_far = frame.total_delay(now_ns, propagation_ns)
-            if frame.keep:
-                self._events.at(
-                    now_ns + propagation_ns, self._deliver, receiver, frame.payload, frame.source, delay_so_far
+            delay = frame.total_delay(now_ns, propagation_ns)
+            if frame.is_for_receiver:
+                self._events.schedule(
+                    now_ns + propagation_ns, self._deliver, receiver, frame.payload, frame.source, delay
                 )
-            for onward in frame.onward:
-                self.enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, onward, delay_so_far))
+            for next_receiver in frame.forward_to:
+                self.enqueue(now_ns, self._stations[receiver], frame.for_second_hop(now_ns, next_receiver, delay))
 
-    def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, delay_so_far: Delay) -> None:
+    def _deliver(self, now_ns: int, receiver: int, payload: Payload, source: str, delay: Delay) -> None:
         name = self._channel.names[receiver]
         if name != source:  # an access point also repeats a broadcast to its sender
-            self.arrived.append((now_ns, name, payload, source, delay_so_far))
+            self.deliveries.append((now_ns, name, payload, source, delay))
 
     def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
-        """Count a broadcast on the link to each station, and log for which stations it was lost."""
+        """Count a broadcast on the link to each station, and log its loss for each station that did not decode it."""
         self.count_receptions(now_ns, transmitter, frame, received, range(len(self._channel.names)))
 
     def count_receptions(
@@ -129,17 +129,17 @@ class PacketDelivery(Generic[Payload]):
         received: Sequence[int],
         addressed: Iterable[int],
     ) -> None:
-        """Count a broadcast on the link to each addressed station, and log for which of them it was lost."""
+        """Count a broadcast on the link to each addressed station, and log its loss for stations that missed it."""
         for index in addressed:
             name = self._channel.names[index]
-            linked, missed = self._channel.linked(transmitter, index), index not in received
-            if linked:
-                self.peer(transmitter, index).count(delivered=not missed)
-            if missed and index != transmitter and self.log_loss is not None and name != frame.source:
-                self.log_loss(now_ns, frame.payload, name, NOT_DECODED if linked else OUT_OF_RANGE)
+            is_linked, is_missed = self._channel.are_linked(transmitter, index), index not in received
+            if is_linked:
+                self.peer(transmitter, index).count(delivered=not is_missed)
+            if is_missed and index != transmitter and self.log_loss is not None and name != frame.source:
+                self.log_loss(now_ns, frame.payload, name, NOT_DECODED if is_linked else OUT_OF_RANGE)
 
     def lose(self, now_ns: int, transmitter: int, frame: Frame[Payload], reason: str) -> None:
-        """Log that a frame was not delivered beyond `transmitter`, for each station that it would have reached."""
+        """Log the loss of a frame at `transmitter`, for each station that it would have reached."""
         if self.log_loss is None:
             return
         for name in self._intended_receivers(transmitter, frame):
@@ -147,7 +147,7 @@ class PacketDelivery(Generic[Payload]):
 
     def _intended_receivers(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:
         names = self._channel.names
-        ends = frame.onward or (frame.receiver,)
+        ends = frame.forward_to or (frame.receiver,)
         if ends == (None,):
             return [name for name in names if name not in {frame.source, names[transmitter]}]
         return [names[index] for index in ends if index is not None]

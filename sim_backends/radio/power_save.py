@@ -3,8 +3,8 @@
 A station dozes when it has sent and received nothing for a time. The access point buffers frames for it until the
 next beacon, which wakes the station. A frame from the station also ends its doze, and the access point then sends the
 buffered frames immediately: pings to a Raspberry Pi are slow, pings from it are not. Broadcasts wait for the next
-DTIM as long as any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every beacon is
-received, and waking takes no time.
+DTIM if any station uses power save. Beacons, null frames and PS-Polls take no airtime here, every beacon is received,
+and a station wakes up in no time.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -53,7 +53,7 @@ class PowerSave(Generic[Payload]):
         self.access_points: Collection[int] = ()
 
     def buffer(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> bool:
-        """Buffer a frame that its transmitter must not send yet; return False if it may be sent."""
+        """Buffer a frame if its transmitter must not send it yet; return False if the frame may be sent now."""
         if not self.access_points:
             return False
         if station.index not in self.access_points:
@@ -63,19 +63,19 @@ class PowerSave(Generic[Payload]):
         if receiver is not None and now_ns < self._awake_until_ns.get(receiver, now_ns + 1):
             self._wake(now_ns, receiver)
             return False
-        waiting = self._buffers.setdefault(receiver, [])
-        waiting.append((station, frame))
-        if len(waiting) == 1:
-            self._events.at(
+        buffered = self._buffers.setdefault(receiver, [])
+        buffered.append((station, frame))
+        if len(buffered) == 1:
+            self._events.schedule(
                 self._beacon_ns(now_ns, DTIM_PERIOD if receiver is None else 1), self._on_beacon, receiver
             )
         return True
 
     def discard(self, station: Station[Payload]) -> Sequence[Frame[Payload]]:
-        """Return the frames that a station has buffered, and remove them."""
-        frames = [frame for waiting in self._buffers.values() for holder, frame in waiting if holder is station]
-        for receiver, waiting in self._buffers.items():
-            self._buffers[receiver] = [entry for entry in waiting if entry[0] is not station]
+        """Remove and return the frames that a station has buffered."""
+        frames = [frame for buffered in self._buffers.values() for holder, frame in buffered if holder is station]
+        for receiver, buffered in self._buffers.items():
+            self._buffers[receiver] = [entry for entry in buffered if entry[0] is not station]
         return frames
 
     def withdraw(self, receiver: int) -> Sequence[tuple[Station[Payload], Frame[Payload]]]:

@@ -1,4 +1,4 @@
-"""Propagation: mean path loss in the open, for many paths together, and fading of links.
+"""Propagation: mean path loss in the open, for arrays of paths, and fading of links.
 
 Fast fading is caused by multipath while the ends or the scatterers move; slow fading is caused by shadowing.
 """
@@ -72,7 +72,7 @@ _WAVES: Final = 256
 
 
 class Fading:
-    """Power gains of links by the positions of their ends, with mean 1: Rician with line of sight, Rayleigh without.
+    """Power gains of links for positions of their ends: Rician with line of sight, Rayleigh without. Their mean is 1.
 
     A gain is the sum of 12 multipath components (echoes), each with its own directions of departure and arrival, and
     a constant component of K times their power. When an end moves, the phase of each echo changes with the distance
@@ -103,16 +103,16 @@ class Fading:
         self._rad_per_m = 2 * math.pi / wavelength_m
         self._stir_m_s = stir_m_s
         count = ends.shape[1]
-        self._drawn = np.zeros(count, dtype=bool)
+        self._is_drawn = np.zeros(count, dtype=bool)
         # East and north components of each echo's direction at its first end, then at its second.
         self._directions = np.empty((count, 4, _ECHOES))
         self._stir_cosines, self._initial_rad = np.empty((2, count, _ECHOES))
 
     def echoes(self, links: NDArray[np.int64]) -> "Echoes":
         """Return the echoes of the links with these indices."""
-        undrawn = links[~self._drawn[links]]
-        if len(undrawn):
-            self._draw(np.unique(undrawn))
+        new_links = links[~self._is_drawn[links]]
+        if len(new_links):
+            self._draw(np.unique(new_links))
         return Echoes(
             self._rad_per_m,
             self._directions[links],
@@ -136,7 +136,7 @@ class Fading:
         )
         self._stir_cosines[links] = np.cos(_angles(7 * sector, stir))
         self._initial_rad[links] = 2 * math.pi * phase
-        self._drawn[links] = True
+        self._is_drawn[links] = True
 
 
 @dataclass(frozen=True)

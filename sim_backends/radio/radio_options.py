@@ -29,7 +29,7 @@ from sim_backends.radio.modes import G_MODES, N_MODES
 UNLIMITED: Final = "unlimited"
 
 INFRASTRUCTURE: Final = ("access_points", "neighbours", "microwave_ovens")
-"""Keys of stations and sources of noise besides the robots."""
+"""Keys of stations and sources of noise that are not robots."""
 
 _RATE: Final = "54Mbit/s"
 _HOP_S: Final = 0.0002
@@ -38,14 +38,14 @@ _HOP_S: Final = 0.0002
 _MODES: Final = f"{', '.join(mode.name for mode in (*G_MODES, *N_MODES))}, a6 to a54, he80-mcs11-2ss-800ns"
 
 
-def _checked_mode(name: str) -> str:
+def _check_mode(name: str) -> str:
     names = mode_names()
     if name not in names:
         raise schema.validation_error(f"there is no mode {name!r}; {did_you_mean(name, names, f'modes: {_MODES}')}")
     return name
 
 
-def _checked_rate(text: str) -> str:
+def _check_rate(text: str) -> str:
     if text == UNLIMITED:
         return text
     try:
@@ -63,11 +63,11 @@ StationName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,30}$")]
 
 
 class RadioOptions(Strict):
-    """The radio of an emulated lab: Wi-Fi in its world, or links that behave the same everywhere.
+    """The radio of an emulated lab: Wi-Fi in its world, or links that do not depend on positions.
 
     With `loss`, `delay`, `rate` or `jitter` every link is fixed for all positions: no robot is out of range,
     robots do not contend for the channel, and of the other options only `queue_packets` applies. In a master topology
-    a packet between two stations crosses two links, and each of the four applies twice.
+    a packet between two stations crosses two links, and each of these four options applies twice.
 
     Attributes:
         propagation: Mean path loss in the open: `log-distance`, `free-space`, or `two-ray` over flat ground.
@@ -92,11 +92,11 @@ class RadioOptions(Strict):
             Linux's default.
         access_points: Access points that are not robots, by name: a robot is a station of one of them and
             [roams](method-radio.md#roaming). The topology must be masterless.
-        roaming: When and how robots roam between them.
+        roaming: Roaming of robots between the access points.
         neighbours: Transmitters of other networks in the channel, by name.
         microwave_ovens: Microwave ovens, by name.
-        loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted
-            and one of the next three is given.
+        loss: Fixed links: share of packets lost per link, independently of their length; 0 % if it is omitted and
+            `delay`, `rate` or `jitter` is given.
         delay: Fixed links: delay of a link in addition to queuing and serialization. The default is 0.2 ms, about
             the sum of DIFS, mean first backoff, preamble, SIFS and ACK of 802.11g (28 + 68 + 20 + 10 + 30 us) and the
             host's interrupt.
@@ -112,7 +112,7 @@ class RadioOptions(Strict):
     k_db: Annotated[Number | Int, Field(ge=-20, le=40)] = 6.0
     stir_m_s: Annotated[Number | Int, Field(ge=0, le=100)] = 0.1
     noise_floor_dbm: Annotated[Number | Int, Field(ge=-150, le=50)] = -95.0
-    mode: Annotated[str, AfterValidator(_checked_mode)] | None = None
+    mode: Annotated[str, AfterValidator(_check_mode)] | None = None
     queue_packets: Annotated[Int, Field(ge=0, le=1_000_000)] = 1000
     access_points: dict[StationName, AccessPointOptions] = Field(default_factory=dict)
     roaming: RoamingOptions = RoamingOptions.defaults()
@@ -120,7 +120,7 @@ class RadioOptions(Strict):
     microwave_ovens: dict[StationName, MicrowaveOvenOptions] = Field(default_factory=dict)
     loss: Fraction | None = None
     delay: Annotated[Duration, Field(le=60)] | None = None
-    rate: Annotated[str, AfterValidator(_checked_rate)] | None = None
+    rate: Annotated[str, AfterValidator(_check_rate)] | None = None
     jitter: Annotated[Duration, Field(le=60)] | None = None
 
     @property

@@ -1,8 +1,8 @@
-"""Counter-based random streams: equal names give equal draws, regardless of other draws before or in between.
+"""Counter-based random streams: equal names give equal draws, independently of other draws.
 
-Draws that decide the result of a packet are keyed by the packet's identity, not by the number of draws before. An
-additional packet or attempt therefore changes no other packet's result, and two slightly different runs can be
-compared packet by packet.
+Draws that decide the result of a packet are keyed by the packet's identity, not by the number of earlier draws. An
+additional packet or attempt therefore does not change the result of any other packet, and two slightly different runs
+can be compared packet by packet.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.random import Philox  # otherwise numpy imports it at the first draw, which delays a packet
+from numpy.random import Philox  # numpy would import it at the first draw, which would delay a packet
 from numpy.typing import NDArray
 
 # Most streams are used for a few draws only: there is one per flow, attempt and purpose.
@@ -64,7 +64,7 @@ class RandomStream:
 
 
 def first_draws(seed: int, names: Sequence[Sequence[str]], count: int) -> NDArray[np.float64]:
-    """Return the first draws of `RandomStream(seed, *name)` by name, 3 times faster. Shape (names, count)."""
+    """Return the first draws of `RandomStream(seed, *name)` for many names, shape (names, count); 3 times faster."""
     generator = Philox(key=0)
     initial_state = generator.state
     words = np.empty((len(names), count), dtype=np.uint64)
@@ -88,8 +88,8 @@ class PacketDraws:
     """Draws for packets, for one purpose at one station or on one link.
 
     Args:
-        seed: As for `RandomStream`.
-        name: As for `RandomStream`.
+        seed: See `RandomStream`.
+        name: See `RandomStream`.
     """
 
     def __init__(self, seed: int, *name: str) -> None:

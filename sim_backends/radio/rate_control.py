@@ -29,12 +29,12 @@ class RateControl(Protocol):
         ...
 
     def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
-        """Record how many of the frames of an attempt were acknowledged."""
+        """Record the number of frames of an attempt, and the number of these that were acknowledged."""
         ...
 
 
 class FixedRate(RateControl):
-    """Always uses one mode.
+    """Rate control that always selects the same mode.
 
     Args:
         mode: The mode.
@@ -75,9 +75,9 @@ class Minstrel(RateControl):
     If there is no such mode, a slower mode replaces the second best, which costs nothing while the best succeeds.
     This follows Linux's rc80211_minstrel.c (kernels 2.6.28 to 5.11) and the documentation of mac80211's minstrel.
 
-    Three things differ. The initial shares are computed from the signal-to-noise ratio, like in drivers that start
-    from RSSI. A random draw per frame, and not a counter, selects sampling frames and their modes, so that an
-    additional frame does not change the results of others. The same algorithm selects modes of 802.11n and later.
+    The model differs in three ways. The initial shares are computed from the signal-to-noise ratio, as in drivers
+    that start from RSSI. A random draw per frame, and not a counter, selects sampling frames and their modes, so that
+    an additional frame does not change the results of others. The same algorithm selects modes of 802.11n and later.
     Linux has minstrel_ht for them, which measures the mean length of aggregates; here the length is an argument.
 
     Args:
@@ -103,7 +103,7 @@ class Minstrel(RateControl):
         self._attempts = dict.fromkeys(modes, 0)
         self._acknowledged = dict.fromkeys(modes, 0)
         self._unused_updates = dict.fromkeys(modes, 0)
-        self._samples_left = dict.fromkeys(modes, _SAMPLES)
+        self._remaining_samples = dict.fromkeys(modes, _SAMPLES)
         self._updated_ns = 0
         self._rank()
         self._rate_chain = self._default_chain
@@ -134,10 +134,10 @@ class Minstrel(RateControl):
         for mode, attempts in self._attempts.items():
             self._unused_updates[mode] = 0 if attempts else self._unused_updates[mode] + 1
             if attempts:
-                measured = self._acknowledged[mode] / attempts
-                self._share[mode] = _OLD_WEIGHT * self._share[mode] + (1 - _OLD_WEIGHT) * measured
+                measured_share = self._acknowledged[mode] / attempts
+                self._share[mode] = _OLD_WEIGHT * self._share[mode] + (1 - _OLD_WEIGHT) * measured_share
                 self._attempts[mode] = self._acknowledged[mode] = 0
-            self._samples_left[mode] = _SAMPLES
+            self._remaining_samples[mode] = _SAMPLES
         self._updated_ns = now_ns
         self._rank()
 
@@ -163,11 +163,11 @@ class Minstrel(RateControl):
             others = [mode for mode in self._modes if mode is not self._best]
             return self._build_chain(self._best, others[int(draw * len(others))])
         mode = candidates[int(draw * len(candidates))]
-        self._samples_left[mode] -= 1
+        self._remaining_samples[mode] -= 1
         return self._build_chain(mode, self._best)
 
     def _is_sample_candidate(self, mode: WifiMode) -> bool:
-        if mode is self._best or not (self._samples_left[mode] > 0 or self._is_uncertain(mode)):
+        if mode is self._best or not (self._remaining_samples[mode] > 0 or self._is_uncertain(mode)):
             return False
         return self._time_ns[mode] < self._time_ns[self._best] or self._unused_updates[mode] >= _STALE_UPDATES
 

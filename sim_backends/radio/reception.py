@@ -82,20 +82,28 @@ class Reception(Generic[Payload]):
         station.sending_until_ns = end_ns
         station.contention.set_busy_until(end_ns)
         stations, events, starts = self._stations, self._events, self._events.starts
-        alone, powers_mw, noise_mw = not transmission.interferers, reach.powers_mw, self._channel.noise_mw
+        has_no_interference, powers_mw, noise_mw = (
+            not transmission.interferers,
+            reach.powers_mw,
+            self._channel.noise_mw,
+        )
         add_receiver = transmission.receivers.add
         sensed_ns = now_ns + CCA_TIME_NS
         for index in reach.detected_by:
             neighbour = stations[index]
             if neighbour.receiving is None and neighbour.sending_until_ns <= now_ns:
-                others_mw = 0.0 if alone else sum([other.powers_mw[index] for other in transmission.interferers])
+                others_mw = (
+                    0.0
+                    if has_no_interference
+                    else sum([other.powers_mw[index] for other in transmission.interferers])
+                )
                 if powers_mw[index] >= (noise_mw[index] + others_mw) * _DETECTABLE_RATIO:
                     neighbour.receiving = transmission
                     add_receiver(index)
-            scheduled = starts.get(index)
-            if scheduled is None:
+            scheduled_start = starts.get(index)
+            if scheduled_start is None:
                 neighbour.contention.on_busy(now_ns, reserved_ns)
-            elif scheduled[0] > sensed_ns:
+            elif scheduled_start[0] > sensed_ns:
                 events.schedule_start(neighbour.contention.postpone(now_ns, reserved_ns), index)
         on_air.append(transmission)
 
@@ -115,7 +123,7 @@ class Reception(Generic[Payload]):
             transmission.interferers.clear()
 
     def reserve(self, now_ns: int, transmission: Transmission, until_ns: int) -> None:
-        """Make the receivers of a transmission, which ends now, wait until `until_ns`; call it before `end`."""
+        """Make the receivers of a transmission that ends now wait until `until_ns`. Call it before `end`."""
         if transmission.interferers:
             return
         for index in transmission.receivers:
@@ -125,7 +133,7 @@ class Reception(Generic[Payload]):
                 self._events.schedule_start(contention.earliest_start_ns(now_ns), index)
 
     def abort(self, index: int, now_ns: int) -> None:
-        """Abort the transmission of a station, which then no station decodes, and abort its reception."""
+        """Abort the transmission of a station, so that no station decodes it, and abort the station's reception."""
         station = self._stations[index]
         if station.receiving is not None:
             station.receiving.receivers.discard(index)
@@ -138,7 +146,7 @@ class Reception(Generic[Payload]):
         station.sending_until_ns = min(station.sending_until_ns, now_ns)
 
     def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Set the noise that is on the air from now on, by jammer name; its received powers may change."""
+        """Set the noise on the air until the next call, by jammer name. Received powers of a jammer may change."""
         for name, emission in self._emissions.items():
             if name not in emissions:
                 emission.end_ns = now_ns
@@ -170,7 +178,7 @@ class Reception(Generic[Payload]):
         )
         return draw < success_probability(transmission, index, self._channel.noise_mw[index])
 
-    def decoded_frames(
+    def decode_frames(
         self, index: int, transmission: Transmission, aggregate: Aggregate[Payload]
     ) -> list[Frame[Payload]]:
         """Return the frames that a station decodes of an aggregate that ends now; call it once, before `end`."""
@@ -179,21 +187,21 @@ class Reception(Generic[Payload]):
         noise_mw, draws = self._channel.noise_mw[index], self._link_draws(transmission.transmitter, index, "data")
         start_ns = transmission.start_ns + transmission.mode.preamble_ns
         ns_per_byte = (transmission.end_ns - start_ns) / aggregate.size_bytes
-        decoded, before_bytes = [], 0
+        decoded_frames, before_bytes = [], 0
         probabilities: dict[int, float] = {}
         for frame in aggregate.frames:
             size_bytes = frame.size_bytes + QOS_HEADER_BYTES
             probability = None if transmission.interferers else probabilities.get(size_bytes)
             if probability is None:
-                begin_ns = start_ns + round(before_bytes * ns_per_byte)
-                end_ns = begin_ns + max(round(size_bytes * ns_per_byte), 1)
+                frame_start_ns = start_ns + round(before_bytes * ns_per_byte)
+                end_ns = frame_start_ns + max(round(size_bytes * ns_per_byte), 1)
                 probability = probabilities[size_bytes] = part_success_probability(
-                    transmission, index, noise_mw, (begin_ns, end_ns), 8.0 * size_bytes
+                    transmission, index, noise_mw, (frame_start_ns, end_ns), 8.0 * size_bytes
                 )
             before_bytes += size_bytes
             if draws.draw(frame.packet, frame.attempts) < probability:
-                decoded.append(frame)
-        return decoded
+                decoded_frames.append(frame)
+        return decoded_frames
 
     def _reach(self, transmitter: int, now_ns: int) -> _Reach:
         powers_mw = self._channel.powers_mw(transmitter, now_ns)
@@ -201,7 +209,7 @@ class Reception(Generic[Payload]):
         if reach is not None and reach.powers_mw is powers_mw:
             return reach
         is_detected = map(ge, powers_mw, self._channel.sensitivity_mw)
-        detected_by = [index for index, detected in enumerate(is_detected) if detected and index != transmitter]
+        detected_by = [index for index, is_strong in enumerate(is_detected) if is_strong and index != transmitter]
         reach = self._reaches[transmitter] = _Reach(powers_mw, detected_by)
         return reach
 

@@ -79,10 +79,10 @@ class RtsCts(Generic[Payload]):
         self.meter: RadioMeter | None = None
 
     def start(self, now_ns: int, frame: ProtectedFrame[Payload]) -> None:
-        """Send RTS; the station's exchange has started.
+        """Send RTS, at the start of the station's exchange.
 
-        Stations that receive the RTS wait for the CTS. They stop waiting if the data frame does not start after it
-        (10.3.2.4). The CTS reserves the channel until the end of the response.
+        Stations that receive the RTS wait for the CTS. They stop waiting if no data frame follows (10.3.2.4). The CTS
+        reserves the channel until the end of the response to the data.
         """
         mode = control_mode(frame.mode)
         end_ns = now_ns + mode.airtime_ns(RTS_BYTES)
@@ -92,7 +92,7 @@ class RtsCts(Generic[Payload]):
         self._reception.start(rts, end_ns)
         if self.meter is not None:
             self.meter.on_start(rts, None)
-        self._events.at(end_ns, self._end_rts, frame, rts, is_idle, frame.station.exchange_id)
+        self._events.schedule(end_ns, self._end_rts, frame, rts, is_idle, frame.station.exchange_id)
 
     def _end_rts(
         self, now_ns: int, frame: ProtectedFrame[Payload], rts: Transmission, is_idle: bool, exchange_id: int
@@ -105,9 +105,9 @@ class RtsCts(Generic[Payload]):
         if exchange_id != frame.station.exchange_id:
             return  # aborted: its radio was switched off
         if is_decoded and is_idle:
-            self._events.at(now_ns + self._sifs_ns, self._answer, frame, exchange_id)
+            self._events.schedule(now_ns + self._sifs_ns, self._answer, frame, exchange_id)
         timeout_ns = self._sifs_ns + SLOT_NS + _PHY_START_DELAY_NS
-        self._events.at(now_ns + timeout_ns, self._finish, frame, exchange_id, False)
+        self._events.schedule(now_ns + timeout_ns, self._finish, frame, exchange_id, False)
 
     def _answer(self, now_ns: int, frame: ProtectedFrame[Payload], exchange_id: int) -> None:
         receiver, station = self._stations[frame.receiver], frame.station
@@ -122,14 +122,14 @@ class RtsCts(Generic[Payload]):
         cts_exchange_id = 0
         if station.receiving is cts and station.exchange_id == exchange_id:
             cts_exchange_id = station.exchange_id = exchange_id + 2  # so that the timeout is ignored
-        self._events.at(end_ns, self._end_cts, frame, cts, cts_exchange_id)
+        self._events.schedule(end_ns, self._end_cts, frame, cts, cts_exchange_id)
 
     def _end_cts(self, now_ns: int, frame: ProtectedFrame[Payload], cts: Transmission, exchange_id: int) -> None:
         station = frame.station
         is_decoded = station.receiving is cts and self._reception.decodes(station.index, cts, "cts")
         self._reception.end(now_ns, cts)
         self._log(cts, station.index, "CTS", is_decoded=is_decoded)
-        self._events.at(now_ns + self._sifs_ns, self._finish, frame, exchange_id, is_decoded)
+        self._events.schedule(now_ns + self._sifs_ns, self._finish, frame, exchange_id, is_decoded)
 
     def _finish(self, now_ns: int, frame: ProtectedFrame[Payload], exchange_id: int, is_protected: bool) -> None:
         if exchange_id == frame.station.exchange_id:

@@ -24,7 +24,7 @@ class Station(Generic[Payload]):
         index: Its index in the channel's list of stations.
         draws: Random draws of its backoff.
         ifs_ns: Inter-frame space before its backoff.
-        rts_threshold_bytes: Attribute of the same name.
+        rts_threshold_bytes: See the attribute.
 
     Attributes:
         contention: Its carrier sense and backoff.
@@ -33,7 +33,7 @@ class Station(Generic[Payload]):
         sending_until_ns: End of its last or current frame.
         exchange_id: Number that increases at the start and the end of each exchange of a frame and its ACK; odd
             during an exchange.
-        offered: Number of packets that were passed to it for sending.
+        packet_count: Number of packets that were passed to it for sending.
         aggregate: The aggregate of its current exchange; None if it sends a single frame without a session.
         rts_threshold_bytes: Size of the largest frame or aggregate that it sends without RTS.
         categories: Its access categories (`queue` belongs to the active one); None if it has only one queue.
@@ -48,7 +48,7 @@ class Station(Generic[Payload]):
         "contention",
         "exchange_id",
         "index",
-        "offered",
+        "packet_count",
         "queue",
         "receiving",
         "rts_threshold_bytes",
@@ -69,7 +69,7 @@ class Station(Generic[Payload]):
         self.aggregate: Aggregate[Payload] | None = None
         self.sending_until_ns = 0
         self.rts_threshold_bytes = rts_threshold_bytes
-        self.exchange_id = self.offered = 0
+        self.exchange_id = self.packet_count = 0
 
     def use_categories(self, mapping: DscpMapping, band: Band) -> None:
         """Use the queues and the contention of the access categories instead of the single queue."""
@@ -95,7 +95,7 @@ class Peer(Generic[Payload]):
         session: Block Ack session of the link; None if its frames are not aggregated.
 
     Attributes:
-        failed_exchanges: Number of aggregates without a Block Ack since the last one.
+        failed_exchanges: Number of aggregates without a Block Ack since the last Block Ack.
         last_frame: The last frame that the peer received; a retry after a lost ACK is a duplicate of it.
         mode: Mode of the last attempt.
     """
@@ -140,7 +140,7 @@ class Peer(Generic[Payload]):
 
     @property
     def counters(self) -> LinkCounters:
-        """The counters so far."""
+        """The current counters."""
         return LinkCounters(self.sent, self.queue_dropped, self.lost, self.delivered)
 
 

@@ -1,8 +1,9 @@
 """802.11 stations on one channel: DCF with hidden stations, retries, ACKs, relaying by an access point.
 
-An event-driven engine on integer nanoseconds that uses no clock and no socket; its interface is `model.RadioModel`.
-Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories. Power save delays
-frames to stations of an access point. Only beacons of `access_points` have airtime; fragmentation is not modelled.
+The engine is event-driven, computes with integer nanoseconds, and uses no clock and no socket. It implements
+`model.RadioModel`. Frames between stations with `phy` are aggregated, and may have RTS and CTS and access categories.
+Power save delays frames to stations of an access point. Only beacons of `access_points` have airtime; fragmentation
+is not modelled.
 """
 
 from collections.abc import Callable, Mapping, Sequence, Set
@@ -74,11 +75,11 @@ class Wifi(Generic[Payload]):
             self._delivery.power_save = PowerSave(timeouts_ns, phase_ns, self._events, self._delivery.enqueue_now)
 
     def log_attempts(self, log: Callable[[TransmissionAttempt], None] | None) -> None:
-        """Pass every transmission attempt that ends from now on to `log`; None stops logging."""
+        """Pass every transmission attempt that ends later to `log`; None stops logging."""
         self._exchange.log = self._exchange.rts_cts.log = log
 
     def log_losses(self, log: LossLog | None) -> None:
-        """Pass every loss from now on to `log`; None stops logging."""
+        """Pass every later loss to `log`; None stops logging."""
         self._delivery.log_loss = log
 
     def use_meter(self) -> None:
@@ -113,7 +114,7 @@ class Wifi(Generic[Payload]):
         self._off = frozenset(names)
 
     def set_emissions(self, now_ns: int, emissions: Mapping[str, Emission]) -> None:
-        """Set the jammer noise that is on the air from now on, by jammer name."""
+        """Set the jammer noise on the air until the next call, by jammer name."""
         self.advance(now_ns)
         self._exchange.reception.set_emissions(now_ns, emissions)
         if not emissions:
@@ -121,13 +122,13 @@ class Wifi(Generic[Payload]):
                 self._exchange.retry_when_idle(now_ns, station)
 
     def set_relay(self, name: str | None) -> None:
-        """Set the station that is the access point from now on; None for direct links."""
+        """Set the station that is the access point; None for direct links."""
         self._relay = None if name is None else self._index[name]
         if self._delivery.power_save is not None:
             self._delivery.power_save.access_points = () if self._relay is None else (self._relay,)
 
     def counters(self) -> dict[Pair, LinkCounters]:
-        """Return the counters of each hop so far; a broadcast counts as one frame per station in range."""
+        """Return the current counters of each hop; a broadcast counts as one frame per station in range."""
         names = self._channel.names
         pairs = dict.fromkeys(permutations(self._linked_names, 2), LinkCounters(0, 0, 0, 0))
         for (transmitter, receiver), peer in self._delivery.peers.items():
@@ -153,8 +154,8 @@ class Wifi(Generic[Payload]):
         self.advance(now_ns)
         station = self._stations[self._index[source]]
         receiver = None if destination is None else self._index[destination]
-        identity = packet or (source, station.offered)
-        station.offered += 1
+        identity = packet or (source, station.packet_count)
+        station.packet_count += 1
         relay = self._relay
         if relay is None or relay in {station.index, receiver}:
             frame = Frame(payload, size_bytes, source, receiver, (), True, identity, now_ns, before)
@@ -178,7 +179,7 @@ class Wifi(Generic[Payload]):
             return
         self._bus_free_ns[station.index] = frame.queued_ns = ready_ns
         frame.before = (frame.before or PACKET) + PROCESSING_NS * (ready_ns - now_ns)
-        self._events.at(ready_ns, self._delivery.enqueue, station, frame)
+        self._events.schedule(ready_ns, self._delivery.enqueue, station, frame)
 
     def next_event_ns(self) -> int | None:
         """Return the time of the next event for `deliveries`, or None if no packet is in flight."""
@@ -187,8 +188,8 @@ class Wifi(Generic[Payload]):
     def deliveries(self, now_ns: int) -> list[Delivery[Payload]]:
         """Return the packets that arrived up to `now_ns` and were not returned before, in order of arrival."""
         self.advance(now_ns)
-        arrived, self._delivery.arrived = self._delivery.arrived, []
-        return arrived
+        deliveries, self._delivery.deliveries = self._delivery.deliveries, []
+        return deliveries
 
     def advance(self, now_ns: int) -> None:
         """Run all events up to `now_ns`."""

@@ -34,16 +34,16 @@ from sim_backends.world.world import World
 _GAIN_VALID_PERIODS: Final = 0.02
 _SLOWEST_M_S: Final = 1e-6
 
-# Computing this number of links costs little more than one, about 0.3 ms among trees, and the next sender may need
-# them.
+# Number of links that are computed together. This takes little longer than one link (about 0.3 ms among trees), and
+# the next sender may need the other links.
 _BATCH_LINKS: Final = 100
 
 
 class WorldChannel(RadioChannel):
     """The channel between stations that are placed or move in a world.
 
-    A move is cheap: the links of a station are computed when a frame, or another caller, needs them. The result
-    depends only on the time and the last positions and velocities.
+    A move takes little time, because the links of a station are computed when a frame, or another caller, needs them.
+    The result depends only on the time and the last positions and velocities.
 
     Args:
         seed: Seed of shadowing and fading.
@@ -95,7 +95,7 @@ class WorldChannel(RadioChannel):
         self._velocities: list[Vector] = [STILL] * count
         self._in_motion = False
         self._cut = np.zeros((count, count), dtype=bool)
-        self._given_db: Floats | None = None
+        self._specified_db: Floats | None = None
         self._present = np.zeros(count, dtype=bool)
         self._places_m, self._velocities_m_s = np.zeros((2, count, 3))
         self._moved_ns, self._gain_valid_ns = 0, self._compute_gain_valid_ns()
@@ -110,14 +110,14 @@ class WorldChannel(RadioChannel):
         Stations without a position are out of range of all others. Until the next call, mean powers do not change;
         only fading, which changes within a wavelength, extrapolates with the velocities.
         """
-        moving = velocities_m_s or {}
+        velocities_by_name = velocities_m_s or {}
         places = list(map(places_m.get, self.names))
-        moved = np.array(list(map(ne, places, self._places)), dtype=bool)
+        has_moved = np.array(list(map(ne, places, self._places)), dtype=bool)
         velocities = self._velocities
-        if moving or self._in_motion:
-            velocities = [moving.get(name, STILL) for name in self.names]
-            moved |= list(map(ne, velocities, self._velocities))
-        if not moved.any() and not self._in_motion:
+        if velocities_by_name or self._in_motion:
+            velocities = [velocities_by_name.get(name, STILL) for name in self.names]
+            has_moved |= list(map(ne, velocities, self._velocities))
+        if not has_moved.any() and not self._in_motion:
             return
         if velocities is not self._velocities:
             self._velocities_m_s = np.array(velocities, dtype=np.float64).reshape(-1, 3)
@@ -129,11 +129,11 @@ class WorldChannel(RadioChannel):
         # If no station moves, the result must not depend on the time, not even by rounding.
         self._moved_ns = now_ns if self._in_motion else 0
         self._revision += 1
-        if moved.all():
+        if has_moved.all():
             self._stale[:] = True
         else:
             first, second = self._ends
-            self._stale |= moved[first] | moved[second]
+            self._stale |= has_moved[first] | has_moved[second]
 
     def cut(self, pairs: Iterable[tuple[str, str]]) -> None:
         """Set the pairs of stations that are out of range of each other regardless of their positions."""
@@ -149,25 +149,25 @@ class WorldChannel(RadioChannel):
         """Set the mean losses of some paths, from transmitter to receiver, which replace path loss and obstacles.
 
         Args:
-            losses_db: The losses in dB; others are computed from the positions.
+            losses_db: The losses in dB; losses of other paths are computed from the positions.
         """
         count = len(self.names)
         index = {name: number for number, name in enumerate(self.names)}
-        given_db, before_db = np.full((count, count), np.nan), self._given_db
+        specified_db, previous_db = np.full((count, count), np.nan), self._specified_db
         for (transmitter, receiver), loss_db in losses_db.items():
             if transmitter in index and receiver in index:
-                given_db[index[transmitter], index[receiver]] = loss_db
-        if before_db is None:
-            before_db = np.full((count, count), np.nan)
-        unchanged = (given_db == before_db) | (np.isnan(given_db) & np.isnan(before_db))
-        if unchanged.all():
+                specified_db[index[transmitter], index[receiver]] = loss_db
+        if previous_db is None:
+            previous_db = np.full((count, count), np.nan)
+        is_unchanged = (specified_db == previous_db) | (np.isnan(specified_db) & np.isnan(previous_db))
+        if is_unchanged.all():
             return
-        self._given_db = given_db
+        self._specified_db = specified_db
         self._revision += 1
-        self._stale |= ~(unchanged & unchanged.T)[tuple(self._ends)]
+        self._stale |= ~(is_unchanged & is_unchanged.T)[tuple(self._ends)]
 
     def received_mw(self, place_m: Vector, power_dbm: float) -> list[float]:
-        """Return the mean received power at each station, by index, of another transmitter at a position."""
+        """Return the mean power, by index, that each station receives from another transmitter at a position."""
         to_m = self._places_m
         loss_db = self.loss_db(np.broadcast_to(place_m, to_m.shape), to_m)
         loss_db[~self._present] = np.inf
@@ -239,9 +239,9 @@ class WorldChannel(RadioChannel):
         start, end = self._places_m[first], self._places_m[second]
         obstacles_db = self._obstacles_db(start, end)
         loss_db = reverse_db = self._open_db(start, end) + obstacles_db
-        if self._given_db is not None:
-            given_db = self._given_db[first, second], self._given_db[second, first]
-            loss_db, reverse_db = (np.where(np.isnan(values), loss_db, values) for values in given_db)
+        if self._specified_db is not None:
+            specified_db = self._specified_db[first, second], self._specified_db[second, first]
+            loss_db, reverse_db = (np.where(np.isnan(values), loss_db, values) for values in specified_db)
         out_of_range = ~(self._present[first] & self._present[second]) | self._cut[first, second]
         loss_db[out_of_range] = reverse_db[out_of_range] = np.inf
         # Any obstacle on the path adds loss and removes the constant component.
@@ -285,14 +285,14 @@ class WorldChannel(RadioChannel):
         return row.powers_mw
 
     @override
-    def linked(self, transmitter: int, receiver: int) -> bool:
+    def are_linked(self, transmitter: int, receiver: int) -> bool:
         """Use mean powers, so that a deep fade breaks no association."""
         row = self._row(transmitter)
-        if row.linked is None:
+        if row.is_linked is None:
             reverse_mw = _milliwatts(self._tx_powers_dbm - self._loss_db[:, transmitter])
             sensitivity_mw = self.sensitivity_mw[transmitter]
-            row.linked = ((row.mean_mw >= self.sensitivity_mw) & (reverse_mw >= sensitivity_mw)).tolist()
-        return row.linked[receiver]
+            row.is_linked = ((row.mean_mw >= self.sensitivity_mw) & (reverse_mw >= sensitivity_mw)).tolist()
+        return row.is_linked[receiver]
 
     @override
     def delay_ns(self, transmitter: int, receiver: int) -> int:
@@ -326,7 +326,11 @@ class WorldChannel(RadioChannel):
     @override
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:
         first, second = self._antennas[transmitter], self._antennas[receiver]
-        if first.phy is None or second.phy is None or (self._fixed_mode is not None and not self._fixed_mode.ht):
+        if (
+            first.phy is None
+            or second.phy is None
+            or (self._fixed_mode is not None and not self._fixed_mode.is_high_throughput)
+        ):
             return None
         mode = self._fixed_mode or common_modes(first.phy, second.phy)[0]
         return AMPDU_LIMITS[mode.phy_format]

@@ -19,7 +19,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.remote import agent
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers import topic_logs
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
@@ -63,7 +63,7 @@ class Cable:
 
     def arguments(self, middleware_name: str, host: TestHost, **network: object) -> dict[str, Any]:
         node = f"fieldkit_{host.pid}"
-        topic = topics.describe(shipped(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
+        topic = topics.describe(standard_types(), "/stream", TYPE, PROFILES["default"], domain=3, node=node)
         taking_part = {"address": host.address, "domain": 3, "node": node, **network}
         return {"network": taking_part, "topic": topic, "stream": {"over": middleware_name, **STREAM}}
 
@@ -103,7 +103,7 @@ def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: obj
     assert subscriber.returncode == 0
     left, arrived = topic_logs.rows(sent), topic_logs.rows(received)
     kinds = [row[0] for row in left if row[0] != records.SKIPPED]
-    assert kinds[:3] == [records.ORIGIN, records.BEGUN, records.MATCHED]
+    assert kinds[:3] == [records.ORIGIN, records.DISCOVERY_STARTED, records.MATCHED]
     expected = [row[2:5] for row in left if row[0] == records.SAMPLE]
     assert expected
     assert [row[2:5] for row in arrived if row[0] == records.SAMPLE] == expected

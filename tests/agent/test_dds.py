@@ -11,7 +11,7 @@ from fieldkit.agent.messaging import dds
 from fieldkit.agent.messaging.middleware import MiddlewareError, Network, Quality, Topic
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import MessageTypes, shipped
+from fieldkit.ros.interfaces.types import MessageTypes, standard_types
 from fieldkit.ros.middlewares import tuning
 
 CUSTOM_TYPE = (
@@ -20,12 +20,12 @@ CUSTOM_TYPE = (
 
 
 def topic(name: str, types: MessageTypes | None = None) -> Topic:
-    message_types = types or shipped()
+    message_types = types or standard_types()
     return Topic.from_json(topics.describe(message_types, "/t", name, PROFILES["default"], domain=0, node="n"))
 
 
 def test_serialized_scan_is_that_of_rosbags() -> None:
-    store = shipped().ros2
+    store = standard_types().ros2
     kinds = {name: store.types[f"{name}"] for name in topic("sensor_msgs/LaserScan").members}
     time, header = kinds["builtin_interfaces/msg/Time"](5, 6), kinds["std_msgs/msg/Header"]
     ranges = np.arange(360, dtype=np.float32)
@@ -49,7 +49,7 @@ def test_all_types_of_robots_can_be_built(name: str) -> None:
     empty = bytes((0, 1, 0, 0)) + bytes(2000)
     read = struct.deserialize(empty)  # type: ignore[attr-defined]
     written = read.serialize(use_version_2=False)
-    store = shipped().ros2
+    store = standard_types().ros2
     converted = store.serialize_cdr(store.deserialize_cdr(written, described.type), described.type)
     assert bytes(converted) == written
 

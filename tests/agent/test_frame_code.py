@@ -12,7 +12,7 @@ from PIL import Image
 
 from fieldkit.agent.video.frame_code import BLACK, COLUMNS, MAX_NUMBER, ROWS, WHITE, FrameCode
 from fieldkit.agent.video.image_message import ImageCodec
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 
 WIDTH, HEIGHT, NOISE_ROWS = 160, 96, 16
 SMALL = FrameCode(WIDTH, HEIGHT, NOISE_ROWS)
@@ -95,7 +95,7 @@ def test_message_is_an_image(*, ros1: bool) -> None:
     """Equal to the serialization of rosbags for ROS 1 and ROS 2."""
     at_ns, head = 1_795_000_000_123_456_789, b"head of the sample"
     data = ImageCodec(WIDTH, HEIGHT, ros1=ros1).encode(7, at_ns, head)
-    types, name = shipped(), "sensor_msgs/msg/Image"
+    types, name = standard_types(), "sensor_msgs/msg/Image"
     message = types.ros1.deserialize_ros1(data, name) if ros1 else types.ros2.deserialize_cdr(data, name)
     again = types.ros1.serialize_ros1(message, name) if ros1 else types.ros2.serialize_cdr(message, name)
     assert bytes(again) == data

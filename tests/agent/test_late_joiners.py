@@ -11,7 +11,7 @@ import pytest
 
 from fieldkit.ros.bridging.crossings import parse_qos
 from fieldkit.ros.interfaces import topics
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers.paths import ROOT
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
@@ -25,7 +25,7 @@ LIMIT_S = "90"
 def end(host: TestHost, verb: str, middleware_name: str, file: Path) -> Iterator[subprocess.Popen[str]]:
     """Run a publisher or subscription while the body runs."""
     quality = parse_qos(f"transient_local,depth={DEPTH}")
-    topic = topics.describe(shipped(), "/map", TYPE, quality, domain=0, node=verb)
+    topic = topics.describe(standard_types(), "/map", TYPE, quality, domain=0, node=verb)
     network = {"address": host.address, "node": verb}
     words = (verb, middleware_name, json.dumps(network), json.dumps(topic), str(file))
     inside = ("timeout", "-k", "10", LIMIT_S, "nsenter", "-t", str(host.pid), "-n")
@@ -41,7 +41,7 @@ def end(host: TestHost, verb: str, middleware_name: str, file: Path) -> Iterator
 @pytest.mark.emulated
 @pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
 def test_late_subscription_receives_the_last_samples(middleware_name: str, tmp_path: Path) -> None:
-    store = shipped().ros2
+    store = standard_types().ros2
     published = [bytes(store.serialize_cdr(store.types[TYPE](text), TYPE)).hex() for text in ("one", "two", "three")]
     file = tmp_path / "samples"
     file.write_text("\n".join(published), encoding="ascii")

@@ -14,7 +14,7 @@ from fieldkit.agent.messaging.stream import HEAD, SampleCodec, Stream
 from fieldkit.remote import agent
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers.paths import ROOT
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
@@ -28,7 +28,7 @@ SIZE = 201
 
 
 def arguments(host: TestHost, topic: str, node: str) -> str:
-    described = topics.describe(shipped(), topic, TYPE, PROFILES["default"], domain=DOMAIN, node=node)
+    described = topics.describe(standard_types(), topic, TYPE, PROFILES["default"], domain=DOMAIN, node=node)
     network = {"address": host.address, "domain": DOMAIN, "node": node}
     stream = {"over": "dds", "size_bytes": SIZE, "rate_hz": 20.0, "duration_s": 3.0, "patience_s": 60.0}
     return json.dumps({"network": network, "topic": described, "stream": stream})
@@ -59,7 +59,7 @@ def test_real_node_and_agent_exchange_samples(tmp_path: Path) -> None:
         subscriber.communicate(timeout=30)
     assert completed.returncode == 0, completed.stderr
     report = json.loads(completed.stdout)
-    assert (report["type"], report["hash"]) == (TYPE, shipped().get(TYPE).rihs01)
+    assert (report["type"], report["hash"]) == (TYPE, standard_types().get(TYPE).rihs01)
     assert (report["reliability"], report["depth"]) == ("RELIABLE", PROFILES["default"].depth)
     assert report["subscribers"] == [TYPE]
 

@@ -16,7 +16,7 @@ from fieldkit.agent.messaging import records
 from fieldkit.remote import agent
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers.paths import ROOT
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
@@ -32,7 +32,7 @@ TRIES: Final = 5
 
 def arguments(middleware_name: str, host: TestHost, topic: str, size: int, **quality: object) -> dict[str, Any]:
     node = f"fieldkit_{middleware_name}_{topic}"
-    described = topics.describe(shipped(), f"/{topic}", TYPE, PROFILES["default"], domain=DOMAIN, node=node)
+    described = topics.describe(standard_types(), f"/{topic}", TYPE, PROFILES["default"], domain=DOMAIN, node=node)
     described["quality"] |= quality
     stream = {"over": middleware_name, "size_bytes": size, "rate_hz": 20.0, "duration_s": 1.0, "patience_s": 15.0}
     discovery = "environment" if middleware_name == "ros2" else "multicast"

@@ -170,7 +170,7 @@ def test_silent_odometry_stops_it() -> None:
 def test_stops_at_its_fence_and_after_its_time_limit() -> None:
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], fence_m=2.0))
     stopped_after_s(driver, since_s, robot, renews=True, has_odometry=True)
-    assert driver.stop_reason == "beyond the fence, 2 m from its place"
+    assert driver.stop_reason == "beyond the fence, 2 m from its origin"
     assert math.dist(robot.pose[:2], (7.0, 8.0)) < 2.0 + 2 * TASK.speed_m_s * TICK_S
     driver, robot, since_s = moving(replace(TASK, legs=[(4.0, 0.0)], limit_s=3.0))
     assert stopped_after_s(driver, since_s, robot, renews=True, has_odometry=True) <= 3.0
@@ -238,10 +238,10 @@ def test_constant_odometry_stops_it(leg: tuple[float, float]) -> None:
 @pytest.mark.parametrize(
     ("start", "last", "reason"),
     [
-        ((6.0, 0.0, 0.0), None, "it is 6.00 m from its place, outside its fence of 5 m"),
-        ((0.5, 0.0, 0.0), None, "it is 0.50 m and 0.00 rad from its place"),
-        ((0.0, 0.0, 0.6), None, "it is 0.00 m and 0.60 rad from its place"),
-        ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), "its odometry is 2.00 m and 0.00 rad from where its last motion ended"),
+        ((6.0, 0.0, 0.0), None, "it is 6.00 m from its origin, outside its fence of 5 m"),
+        ((0.5, 0.0, 0.0), None, "it is 0.50 m and 0.00 rad from its origin"),
+        ((0.0, 0.0, 0.6), None, "it is 0.00 m and 0.60 rad from its origin"),
+        ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), "its odometry is 2.00 m and 0.00 rad from the end of its last motion"),
     ],
 )
 def test_robot_that_is_not_at_its_place_does_not_start(

@@ -16,7 +16,7 @@ from fieldkit.agent.messaging import records, stream
 from fieldkit.agent.messaging.middleware import Deliver, Topic
 from fieldkit.agent.messaging.records import Log, LogError
 from fieldkit.agent.messaging.stream import SampleCodec, Stream
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers import topic_logs
 
 TYPE = "std_msgs/msg/UInt8MultiArray"
@@ -30,7 +30,7 @@ def streamed(middleware_name: str = "dds", size: int = 100, *, patience_s: float
 @pytest.mark.parametrize("size", [24, 25, 100, 4097])
 def test_sample_is_a_ros_message(size: int) -> None:
     """Equal to the serialization of rosbags for ROS 1 and ROS 2."""
-    for middleware_name, store in (("dds", shipped().ros2), ("ros1", shipped().ros1)):
+    for middleware_name, store in (("dds", standard_types().ros2), ("ros1", standard_types().ros1)):
         sample = SampleCodec(streamed(middleware_name, size)).encode(7, 123_456_789)
         message = (
             store.deserialize_cdr(sample, TYPE) if middleware_name == "dds" else store.deserialize_ros1(sample, TYPE)

@@ -6,7 +6,7 @@ from fieldkit.analysis import comparable
 from fieldkit.analysis.compare import compare
 from fieldkit.analysis.repeats import Repeats, parse
 from fieldkit.measure.robot_state import state_columns
-from fieldkit.trial.columns import of_robots, trial_columns
+from fieldkit.trial.columns import robot_columns, trial_columns
 
 HEADER = "trial,scenario,topology,protocol,distance_m,repeat,attempt,status,profiles_sha256,procedure_sha256,marks"
 
@@ -14,7 +14,7 @@ HEADER = "trial,scenario,topology,protocol,distance_m,repeat,attempt,status,prof
 def run(name: str, *marks: str) -> Repeats:
     """Return a run with a repeat for each text in the column `marks`."""
     rows = [f"{name},los,master,udp,10,{number},1,valid,aa,bb,{text}" for number, text in enumerate(marks, 1)]
-    return parse("\n".join((HEADER, *rows, "")).encode(), trial_columns(of_robots(())))
+    return parse("\n".join((HEADER, *rows, "")).encode(), trial_columns(robot_columns(())))
 
 
 @pytest.mark.parametrize(

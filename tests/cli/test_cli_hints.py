@@ -80,9 +80,9 @@ def test_every_command_in_a_message_exists_and_accepts_its_options() -> None:
 )
 def test_hints_include_the_options_given(typed_before: str, hint: str, expected: str) -> None:
     top = parser()
-    with hints.completing(top) as options:
+    with hints.adding_options(top) as options:
         options.read(top.parse_args((*typed_before.split(), *OPTIONS)))
-        completed = hints.completed(hint)
+        completed = hints.add_options(hint)
     assert completed == expected.format(given=shlex.join(OPTIONS))
     if completed.split()[0] == "fieldkit" and not any(mark in completed for mark in (" lists", ",", ";")):
         parsed = top.parse_args(shlex.split(completed)[1:])
@@ -92,7 +92,7 @@ def test_hints_include_the_options_given(typed_before: str, hint: str, expected:
 def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture[str]) -> None:
     finding = Finding("a", "lock", Verdict.FAIL, "held", "wait, or end it: fieldkit abort")
     top = parser()
-    with hints.completing(top) as options:
+    with hints.adding_options(top) as options:
         options.read(top.parse_args(("check", "--site", "x.yaml")))
         show_error("held\n  remedy: fieldkit abort")
         show_findings([finding])
@@ -109,7 +109,7 @@ def test_every_output_adds_the_options_to_commands(capsys: pytest.CaptureFixture
 
 def test_without_options_hints_are_unchanged() -> None:
     ((text, _),) = event_words(TrialStopped("trials/a", 1, 2))
-    assert hints.completed(text).endswith("to continue: fieldkit resume trials/a")
+    assert hints.add_options(text).endswith("to continue: fieldkit resume trials/a")
 
 
 @pytest.mark.parametrize(("words", "begin"), [([], "usage: fieldkit [-h]"), (["lab"], "usage: fieldkit lab [-h]")])

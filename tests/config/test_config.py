@@ -107,7 +107,7 @@ def test_error_has_the_line_of_the_key(tmp_path: Path) -> None:
         ("        - transfer: {from: sender", "        - transfer: {form: sender", "did you mean 'from'?"),
         ("- transfer: {from: sender, to: receiver", "- transfer: {from: sender, to: sender", "cannot send to itself"),
         ("- ping: {from: sender, to: receiver", "- ping: {from: sender, to: sender", "cannot ping itself"),
-        ("robot: sender", "robot: boss", "there is no role boss; give its place"),
+        ("robot: sender", "robot: boss", "there is no role boss; add a place for it"),
         ("duration: 15s", "duration: 15", "has no unit"),
         ("duration: 15s", "duration: 0s", "greater than 0"),
         ("topics: [/scan]", "topics: []", "at least 1 item"),
@@ -152,7 +152,7 @@ def test_bags_of_two_robots_need_different_names() -> None:
     recorders = [placed.step for placed in procedure.walk() if isinstance(placed.step, Records)]
     assert {role for step in recorders for role in step.records_on()} == {Role.SENDER, Role.RELAY}
     text = PROCEDURE.replace("\nsteps:", other.replace("NAME", "scan"), 1)
-    with pytest.raises(ConfigurationError, match=r"there is already a file scan\.bag"):
+    with pytest.raises(ConfigurationError, match=r"another step has a file scan\.bag"):
         schema.validate(schema.parse(text, source="los.yaml"), Procedure)
 
 

@@ -26,7 +26,7 @@ def test_access_equals_that_of_the_full_site_file(tmp_path: Path) -> None:
     path.write_text(SITE, encoding="utf-8")
     site, document = load_site(path)
     accesses = robot_access.read_access(document)
-    assert robot_access.backend_of(document) == site.backend
+    assert robot_access.configured_backend(document) == site.backend
     assert list(accesses) == list(site.robots)
     for name, robot in site.robots.items():
         assert [getattr(accesses[name], field) for field in FIELDS] == [getattr(robot, field) for field in FIELDS]

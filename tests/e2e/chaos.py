@@ -286,7 +286,7 @@ def _voids(trial: Path) -> list[VoidAttempt]:
             attempt.started_utc_ns,
             ended_ns_by_attempt[attempt.repeat, attempt.number],
         )
-        for attempt in journal.ended(entries)
+        for attempt in journal.ended_attempts(entries)
         if attempt.status is Status.VOID
     ]
 

@@ -50,7 +50,7 @@ def attempt(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Path, journ
     assert run.code == 0, run.out + run.err
     trial = only_trial(home)
     plan = plans.read_plan(trial)
-    (entry,) = journal.ended(journal.history(trial, plan))
+    (entry,) = journal.ended_attempts(journal.history(trial, plan))
     return plan, store.attempt_folder(trial, entry.folder), entry
 
 
@@ -95,4 +95,4 @@ def test_without_drops_nothing_is_withheld(attempt: tuple[Plan, Path, journal.At
 
 def test_a_transfer_needs_its_whole_capture(attempt: tuple[Plan, Path, journal.Attempt]) -> None:
     problems, _ = with_drops(attempt, "transfer.sender")
-    assert problems == ("transfer: sender capture: dropped 12 packets, its interface 0",)
+    assert problems == ("transfer: sender capture: its kernel dropped 12 packets, its interface 0",)

@@ -47,7 +47,7 @@ def test_a_changed_log_of_a_real_stream_is_detected(tmp_path: Path) -> None:
     assert run.code == 0, run.out + run.err
     trial = only_trial(tmp_path)
     plan = plans.read_plan(trial)
-    (attempt,) = journal.ended(journal.history(trial, plan))
+    (attempt,) = journal.ended_attempts(journal.history(trial, plan))
     folder = store.attempt_folder(trial, attempt.folder)
     for name in ("dds", "zenoh"):
         log = folder / f"{name}.receiver-topic.bin"

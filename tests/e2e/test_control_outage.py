@@ -123,7 +123,7 @@ def run_with_outage(lab_folder: Path, protocol: Protocol, phase: str, is_under_w
     request = TrialRequest(
         load_procedure("quick"), parse_distance("5m"), protocols=(protocol,), repeats=1, record_s=RECORD_S
     )
-    cast = backend.cast(request.chosen_topology)
+    cast = backend.cast(request.effective_topology)
     plan = make_plan(request, backend="emulated", cast=cast, now=datetime.now(UTC))
     observed = Observed()
 

@@ -134,7 +134,9 @@ def test_replay_and_plot_reject_invalid_recordings(lab: Path) -> None:
     cosim(lab, "run", "pass.yaml", "--seeds", "2", "--duration", "100ms", "--out", "sim")
     for words in (("replay", "sim"), ("plot", "sim")):
         rejected = cosim(lab, *words)
-        assert (rejected.code, "name one of them: sim/seed-1" in rejected.err) == (4, True), rejected.err
+        assert (rejected.code, "give the folder of one recording: sim/seed-1" in rejected.err) == (4, True), (
+            rejected.err
+        )
     assert "there is no recording" in cosim(lab, "replay", ".").err
     damaged = next((lab / "sim" / "seed-1" / "packets").iterdir())
     damaged.write_bytes(damaged.read_bytes()[:-1])

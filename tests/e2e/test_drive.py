@@ -26,7 +26,7 @@ from fieldkit.remote import jobs
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.ssh import SshShell
 from sim_backends.emulated.backend import EmulatedBackend
-from sim_backends.emulated.ros.steered import Steered
+from sim_backends.emulated.ros.motion_record import RecordedMotion
 from tests.helpers import texts
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.host import descendants, wait_for_end
@@ -213,8 +213,8 @@ def test_a_robot_of_an_interactive_lab_can_be_driven(tmp_path: Path) -> None:
         assert lab.place_m("robot-1") == pytest.approx(place_m)
 
 
-def receiver_motion(field_robots: FieldRobots) -> Steered | None:
-    return field_robots.testbed.robots[Role.RECEIVER].steered()
+def receiver_motion(field_robots: FieldRobots) -> RecordedMotion | None:
+    return field_robots.testbed.robots[Role.RECEIVER].recorded_motion()
 
 
 @pytest.mark.usefixtures("_short_lease")
@@ -227,7 +227,7 @@ def test_killing_fieldkit_stops_the_robot(field_robots: FieldRobots) -> None:
         process.kill()
         process.communicate(timeout=60)
     wait_for_end({process.pid}, within_s=60.0)
-    wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
+    wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.is_moving, Deadline.after(60))
     shell = field_robots.testbed.shells[Role.RECEIVER]
     text = ("sh", "-c", "cat .fieldkit/*/*/drive.status")
     wait_until(
@@ -262,7 +262,7 @@ def driving(field_robots: FieldRobots, procedure: str = DRIVE) -> "Iterator[subp
 
 def standstill_s(field_robots: FieldRobots, since_ns: int) -> float:
     """Return the time from `since_ns` until the receiver stopped by the true track; it must not move afterwards."""
-    wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
+    wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.is_moving, Deadline.after(60))
     moments = [point for point in track_of(field_robots, Role.RECEIVER) if point.utc_ns >= since_ns]
     moving = [point.utc_ns for point in moments if math.hypot(*point.velocity_m_s) > 0]
     return (max(moving, default=since_ns) - since_ns) / 1e9
@@ -435,7 +435,9 @@ def test_ctrl_c_with_an_unreachable_robot_reports_that_its_lease_stops_it(field_
     with driving(field_robots) as process:
         field_robots.links.cut(Role.RECEIVER)
         process.send_signal(signal.SIGINT)
-        wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
+        wait_until(
+            lambda: (now := receiver_motion(field_robots)) is not None and not now.is_moving, Deadline.after(60)
+        )
         run = finish(process)
     assert run.code == 130
     assert f"no answer from rover-1: it stops automatically within {LEASE_S:g} s" in run.err
@@ -445,7 +447,9 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: Fie
     with driving(field_robots) as process:
         (agent,) = [pid for pid in descendants(os.getpid()) if b"drive" in command_line(pid)]
         os.kill(agent, signal.SIGSTOP)
-        wait_until(lambda: (now := receiver_motion(field_robots)) is not None and not now.moves, Deadline.after(60))
+        wait_until(
+            lambda: (now := receiver_motion(field_robots)) is not None and not now.is_moving, Deadline.after(60)
+        )
         stationary_since_ns = time.time_ns()
         stopped = run_here(field_robots.folder, "stop", "rover-1")
         assert (stopped.code, stopped.out) == (0, "rover-1: stopped (stationary)\n")
@@ -485,7 +489,7 @@ def drives(field_robots: FieldRobots) -> bool:
 
 
 def stationary(field_robots: FieldRobots) -> bool:
-    return (now := receiver_motion(field_robots)) is not None and not now.moves
+    return (now := receiver_motion(field_robots)) is not None and not now.is_moving
 
 
 def motions(trial: Path) -> list[str]:

@@ -55,7 +55,7 @@ def range_m() -> float:
     while far_m - near_m > 1e-3:
         middle_m = (near_m + far_m) / 2
         channel.move(0, {"turtlebot3_burger": (0.0, 0.0, 0.2), "duckiedrone": (middle_m, 0.0, 0.2)})
-        near_m, far_m = (middle_m, far_m) if channel.linked(0, 1) else (near_m, middle_m)
+        near_m, far_m = (middle_m, far_m) if channel.are_linked(0, 1) else (near_m, middle_m)
     return near_m
 
 

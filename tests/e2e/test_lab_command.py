@@ -22,7 +22,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.lab import folder, requests
 from fieldkit.remote import evidence, jobs
 from fieldkit.remote.jobs import Job
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.runs import fieldkit, run_here, start
@@ -115,7 +115,7 @@ def test_stop_reaches_the_robots_of_a_lab(lab: Path) -> None:
     attempt = jobs.work_folder("trial-a", "tcp-01-1")
     argv = ("sh", "-c", DRIVE_SCRIPT, "python3", "../../agent-0123456789ab.pyz", "drive", '{"over": "ros1"}')
     driver = Job(attempt, "drive", argv, WITHIN_S, "drive.log", ready="log:up")
-    with lab_shells.opened(folder.of_directory(lab)) as shells:
+    with lab_shells.open_shells(folder.of_directory(lab)) as shells:
         jobs.install(shells["ground-1"], Deadline.after(WITHIN_S))
         evidence.begin(shells["ground-1"], attempt, "sender", "lo")
         jobs.start(shells["ground-1"], driver)
@@ -179,7 +179,7 @@ def ahead_m(lab: Path) -> float:
     run_plain(lab, "scp", "-F", "ssh.conf", "ground-1:scan.bag", ".")
     with Reader(lab / "scan.bag") as bag:
         scans: list[Any] = [
-            shipped().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan") for *_, data in bag.messages()
+            standard_types().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan") for *_, data in bag.messages()
         ]
     return median(float(scan.ranges[0]) for scan in scans)
 

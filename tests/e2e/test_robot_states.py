@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core.model import Role
+from fieldkit.trial.stored import plans
 from tests.helpers import texts
 from tests.helpers.labs import write_procedure
 from tests.helpers.runs import fieldkit, only_trial, rows
@@ -67,6 +69,10 @@ def test_conditions_of_robots_are_named_and_not_compared(tmp_path: Path) -> None
     assert float(row["receiver_others_airtime_share"]) == pytest.approx(0.05, abs=0.05)
     assert (row["receiver_channel"], row["receiver_other_networks"]) == ("6 (2437 MHz), width 20 MHz", "1")
     assert row["receiver_regulatory_domain"] == "DE"
+    plan = plans.read_plan(only_trial(plain))
+    assert plan.radios == {
+        Role.RECEIVER: {"channel": row["receiver_channel"], "regulatory_domain": row["receiver_regulatory_domain"]}
+    }
     (row,) = rows(only_trial(bad))
     assert row["status"] == "valid"
     names = "wrong clock and under-voltage and throttled and busy channel"
@@ -74,7 +80,7 @@ def test_conditions_of_robots_are_named_and_not_compared(tmp_path: Path) -> None
     for reason in (
         "turtlebot-2 is off by 1.0 s, although chrony has the source 10.9.0.2",
         "turtlebot-2: the supply voltage is too low",
-        "turtlebot-2: its processor is slowed down (throttled)",
+        "turtlebot-2: the processor is throttled (throttled)",
         "turtlebot-2: others use 60 % of the airtime on channel 6",
     ):
         assert reason in row["marks_reason"]

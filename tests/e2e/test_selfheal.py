@@ -110,7 +110,7 @@ def test_a_link_and_a_robot_recover_and_the_rows_contain_the_times(
     run = run_here(tmp_path, "trial", "selfheal", "5m", "--repeats", "1")
     assert run.code == 0, run.err + run.out
     assert "ping recovery after link-down, median" in run.out
-    assert "reboot: gone for " in run.out
+    assert "reboot: no answer for " in run.out
     trial = only_trial(tmp_path)
     (row,) = rows(trial)
     assert row["link_down_recovered"] == row["reboot_recovered"] == "true"
@@ -133,7 +133,7 @@ def test_a_permanent_failure_has_no_times_and_a_failure_during_a_fault_is_a_resu
     run = run_procedure(tmp_path, NEVER)
     assert run.code == 0, run.err + run.out
     assert not began.expired, "the recording of 500 s ended with its robot"
-    assert "kill: did not come back" in run.out
+    assert "kill: did not recover" in run.out
     (row,) = rows(only_trial(tmp_path))
     assert row["status"] == "valid"
     assert (row["kill_recovered"], row["kill_outage_s"], row["kill_recovery_s"]) == ("false", "", "")

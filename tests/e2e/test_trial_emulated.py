@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from fieldkit.core.model import Role
-from fieldkit.trial.columns import of_robots, trial_columns
+from fieldkit.trial.columns import robot_columns, trial_columns
 from tests.helpers.host import NamespaceComparison, descendants, wait_for_end
 from tests.helpers.labs import built_in_ros, copy_shipped
 from tests.helpers.runs import Run, fieldkit, only_trial, rows, run_here, start, wait_for_line
@@ -79,7 +79,7 @@ def test_aggregate_of_one_trial_from_raw_evidence_is_its_summary(lab_copy: Path)
 def test_the_rows_contain_the_results(finished: tuple[Path, Run]) -> None:
     trial = only_trial(finished[0])
     table = rows(trial)
-    declared = [column.name for column in (*trial_columns(), *of_robots((Role.SENDER, Role.RECEIVER)))]
+    declared = [column.name for column in (*trial_columns(), *robot_columns((Role.SENDER, Role.RECEIVER)))]
     assert list(table[0])[: len(trial_columns())] == declared[: len(trial_columns())]
     assert sorted(table[0]) == sorted(declared)
     assert [(row["protocol"], row["repeat"], row["status"]) for row in table] == [

@@ -44,7 +44,7 @@ def edited(path: Path, edit: Callable[[str], str]) -> None:
 
 def test_each_repeat_is_a_case_with_its_time(trial: Path) -> None:
     element, plan = suite(trial), plans.read_plan(trial)
-    assert [case.get("name") for case in element] == [str(repeat) for repeat in plan.order()]
+    assert [case.get("name") for case in element] == [str(repeat) for repeat in plan.repeats_in_order()]
     assert element.get("tests") == str(len(element))
     assert element.get("failures") == element.get("skipped") == "0"
     assert {case.get("classname") for case in element} == {"fieldkit.los.30ft.master"}
@@ -62,7 +62,7 @@ def test_a_repeat_that_failed_is_a_failure_with_its_reason(trial: Path) -> None:
     element = suite(trial)
     (name,) = cases(element, "failure")
     assert element.get("failures") == "1"
-    assert name == str(list(plans.read_plan(trial).order())[-1])
+    assert name == str(list(plans.read_plan(trial).repeats_in_order())[-1])
 
 
 def test_a_repeat_that_has_not_ended_is_skipped(trial: Path) -> None:

@@ -11,7 +11,7 @@ from fieldkit.cli import main
 from fieldkit.core.columns import SCHEMA_VERSION
 from fieldkit.core.model import Role
 from fieldkit.trial import store
-from fieldkit.trial.columns import of_robots, trial_columns
+from fieldkit.trial.columns import robot_columns, trial_columns
 from tests.helpers import recorded
 from tests.helpers.recorded import LOST, PACKETS, SECOND_NS, START_NS
 from tests.helpers.runs import rows
@@ -68,7 +68,7 @@ def test_undeclared_columns_are_kept_as_text(trial: Path, tmp_path: Path, capsys
 
 def test_parquet_has_units_meanings_and_versions(trial: Path) -> None:
     schema = pa.parquet.read_schema(exported(trial, kind="parquet"))
-    for column, field in zip((*trial_columns(), *of_robots((Role.SENDER, Role.RECEIVER))), schema, strict=True):
+    for column, field in zip((*trial_columns(), *robot_columns((Role.SENDER, Role.RECEIVER))), schema, strict=True):
         assert field.name == column.name
         assert field.metadata == {b"unit": column.unit.encode(), b"meaning": column.meaning.encode()}
     assert schema.metadata[b"fieldkit_version"].decode() == __version__

@@ -87,7 +87,7 @@ def _measure_states(data: bytes, place: Path) -> None:
         (place / f"sender-sources-{when}.txt").write_bytes(data)
     evidence, names = AttemptEvidence(place), {Role.SENDER: "rover"}
     measured = attempt_states.measure(evidence, names, Measured())
-    list(attempt_states.problems(evidence, names))
+    list(attempt_states.problems(evidence, names, {}))
     for column in (*state_columns.MARK_COLUMNS, *state_columns.declare_columns("sender")):
         assert column.invalid_value_reason(cell(measured.values.get(column.name))) is None, column.name
 

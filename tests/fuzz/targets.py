@@ -205,7 +205,7 @@ def _tar_seeds() -> tuple[bytes, ...]:
 def _read_replies(data: bytes, place: Path) -> None:
     shells = [AnsweringRobot(place, data, code=code, stderr=data) for code in (0, 1, 28, 75, 76, 255)]
     for shell in shells:
-        for ask in (locks.holder, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
+        for ask in (locks.read_lock, partial(jobs.list_running, deadline=Deadline.after(1)), _call_script):
             with suppress(RobotError):
                 ask(shell)
     robot_clock.parse_date(data.decode("ascii", "replace"))
@@ -221,8 +221,8 @@ def _read_journal(data: bytes, place: Path) -> None:
     for _ in range(2):
         with suppress(EvidenceError):
             result = journal.history(place, _plan())
-            journal.ended(result)
-            journal.interrupted(result)
+            journal.ended_attempts(result)
+            journal.interrupted_attempts(result)
         journal.remove_torn_line(place)
 
 
@@ -243,7 +243,7 @@ def _measure_attempt(name: str, data: bytes, place: Path) -> None:
             view = View(scene, result, placed.within)
             placed.step.measure(view)
             list(placed.step.check(view))
-        for error in result._failed.values():
+        for error in result._errors.values():
             if error.__cause__ is not None and not isinstance(error.__cause__, OSError | ReaderError):
                 raise error.__cause__
 
@@ -342,7 +342,7 @@ def _measure_tlog(path: Path) -> None:
 def _measure_topic_log(path: Path) -> None:
     result = topic_samples.read_log(path)
     flow = TopicTraffic("10.0.0.1", "10.0.0.2", frozenset({1}), frozenset({2}), deadline_s=0.1)
-    plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, on_ports=True)
+    plan = TopicPlan("/stream", 20, 84, 16, reliable=True, depth=10, in_order=True, uses_expected_ports=True)
     list(topic_checks.check_logs(plan, result, result))
     list(topic_captures.check_captures(plan, result, result, CapturedTopic(None, None, complete=False)))
     topic_columns.measure(flow, result, result, None, None)

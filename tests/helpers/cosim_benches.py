@@ -16,10 +16,10 @@ from fieldkit.core.model import Vector
 from sim_backends.emulated.cosimulated.client import CosimulatedClient
 from sim_backends.emulated.cosimulated.simulators import RobotBody, Simulators
 from sim_backends.emulated.emulated_options import SyncOptions
-from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
 from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.emulated.robot.velocity_command import VelocityCommand, VelocityCommandRecord
+from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 from sim_backends.emulated.ros.own_motion import AssignedPath, append_path
-from sim_backends.emulated.ros.steered import Steered, SteeredRecord
 from sim_backends.physics.robot_limits import TURTLEBOT3_BURGER
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
@@ -54,20 +54,20 @@ class Driven:
         """Assign the robot a place, as the lab does."""
         append_path(self.folder / "motion", AssignedPath(time.monotonic_ns(), [place_m], 1.0, facing_rad))
 
-    def motion(self) -> Steered | None:
+    def motion(self) -> RecordedMotion | None:
         """Return the motion that the physics recorded last."""
-        record = SteeredRecord.open(self.folder / "steered")
+        record = MotionRecord.open(self.folder / "steered")
         try:
             return record.read()
         finally:
             record.close()
 
-    def drive(self, forward_m_s: float, seconds: float, turn_rad_s: float = 0.0) -> Steered:
+    def drive(self, forward_m_s: float, seconds: float, turn_rad_s: float = 0.0) -> RecordedMotion:
         """Command a velocity at 20 Hz, and return the last motion."""
-        record = CommandedRecord.open(self.folder / "commanded")
+        record = VelocityCommandRecord.open(self.folder / "commanded")
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
-            record.write(Commanded(time.monotonic_ns(), forward_m_s, turn_rad_s))
+            record.write(VelocityCommand(time.monotonic_ns(), forward_m_s, turn_rad_s))
             time.sleep(0.05)
         record.close()
         motion = self.motion()
@@ -138,6 +138,6 @@ def cosim_bench(
         yield CosimBench(medium, spaces, driven)
 
 
-def distance_m(motion: Steered, place_m: Vector) -> float:
+def distance_m(motion: RecordedMotion, place_m: Vector) -> float:
     """Return the horizontal distance of a motion from a place."""
     return math.dist(motion.place_m[:2], place_m[:2])

@@ -26,7 +26,7 @@ SERVER: Final = CompiledProgram(
     ),
     _INSTALL,
     flags=("-O1", "-std=c++17"),
-    duration="about 20 s",
+    duration_text="about 20 s",
 )
 
 

@@ -11,7 +11,7 @@ from fieldkit.measure.evidence import oracle_delays, outage, ping, tcpdump_log, 
 from fieldkit.measure.transfers import transfer_columns as of_transfers
 from fieldkit.measure.transfers import transfer_measures
 from fieldkit.measure.transfers.transfer_spec import Transfer
-from fieldkit.trial.columns import measures
+from fieldkit.trial.columns import measured_columns
 
 
 class Measures(dict[str, Any]):
@@ -26,7 +26,7 @@ class Measures(dict[str, Any]):
         return self.get(name)
 
 
-COLUMNS = frozenset(column.name for column in measures())
+COLUMNS = frozenset(column.name for column in measured_columns())
 
 
 def all_columns(figures_by_column: Measures) -> dict[str, Any]:
@@ -59,7 +59,7 @@ def measure(folder: Path, transfer: Transfer | None) -> Measures:
 def _captures(evidence: AttemptEvidence) -> Measured:
     measured = Measured()
     for role in (Role.SENDER, Role.RECEIVER):
-        capture = evidence.whole_capture(tcpdump_log.capture_file(role))
+        capture = evidence.undamaged_capture(tcpdump_log.capture_file(role))
         log = evidence.read_or_none(tcpdump_log.read, tcpdump_log.log_file(role))
         frame_count = capture.frames if capture else None
         dropped = log.dropped_by_kernel if log else None

@@ -100,7 +100,7 @@ class MotionTrial:
         if cell.routed:
             self.lab.start_router(craft)
         self._previous_logs = self.lab.logs(craft)
-        with MotionSampler(self.lab.robot(craft).steered, self.lab.place_m(craft)) as sampler:
+        with MotionSampler(self.lab.robot(craft).recorded_motion, self.lab.place_m(craft)) as sampler:
             self._process = start_trial(self.folder)
             try:
                 self._reach(sampler)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple, Self
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.ros.steered import Steered
+from sim_backends.emulated.ros.motion_record import RecordedMotion
 
 PERIOD_S: Final = 0.02
 """Interval between two samples; the base and the autopilot write at this rate while the robot moves."""
@@ -132,11 +132,11 @@ class MotionSampler:
     """Samples the motion of one robot in a thread; a context manager.
 
     Args:
-        record: Returns the motion record of the robot, like `EmulatedRobot.steered`.
+        record: Returns the motion record of the robot, like `EmulatedRobot.recorded_motion`.
         start_m: Present position of the stationary robot: east, north, up.
     """
 
-    def __init__(self, record: Callable[[], Steered | None], start_m: Vector) -> None:
+    def __init__(self, record: Callable[[], RecordedMotion | None], start_m: Vector) -> None:
         self.samples: list[MotionSample] = []
         self._record = record
         self._start_m = start_m
@@ -167,7 +167,7 @@ class MotionSampler:
             else:
                 self.samples.append(self._sample(record.at(now_ns), now_ns))
 
-    def _sample(self, motion: Steered, now_ns: int) -> MotionSample:
+    def _sample(self, motion: RecordedMotion, now_ns: int) -> MotionSample:
         if self._heading_rad is None:
             self._heading_rad = motion.heading_rad
         east_m, north_m, up_m = (

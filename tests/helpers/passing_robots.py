@@ -47,7 +47,7 @@ class ProgressRecorder:
         self._windows = 0
 
     def window(self, window: Window) -> None:
-        for fate in window.entered:
+        for fate in window.entered_fates:
             program_packet = fate.packet
             packet = IpPacket(
                 program_packet.source,

@@ -111,7 +111,7 @@ def _lost_evidence(folder: Path, recorder: VersionRecorder) -> Iterator[str]:
     remaining = visible(folder)
     for path in folder.glob(f"*/{JOURNAL_FILE}"):
         try:
-            entries = journal.ended(journal.read(path.parent))
+            entries = journal.ended_attempts(journal.read(path.parent))
         except EvidenceError as error:
             yield error.what
             continue
@@ -134,11 +134,11 @@ def assert_resumable(out: Path) -> None:
     """Resume a trial after a cut; it must end complete, with all attempts that had ended or were measured."""
     folder = trial_of(out)
     entries = journal.read(folder) if (folder / JOURNAL_FILE).is_file() else []
-    before, evidence = journal.ended(entries), visible(folder / "repeats")
-    measured = [attempt for attempt in journal.interrupted(entries) if attempt.status is Status.MEASURED]
+    before, evidence = journal.ended_attempts(entries), visible(folder / "repeats")
+    measured = [attempt for attempt in journal.interrupted_attempts(entries) if attempt.status is Status.MEASURED]
     resume_trial(folder, IdleTestbed(), lambda _: None)
     assert_complete(out)
-    after = journal.ended(journal.read(folder))
+    after = journal.ended_attempts(journal.read(folder))
     assert after[: len(before)] == before
     assert evidence.items() <= visible(folder / "repeats").items()
     is_valid = {(attempt.repeat, attempt.number): attempt.status is Status.VALID for attempt in after}

@@ -71,7 +71,7 @@ int
 main()
 {
     Heartbeat heartbeat;
-    std::FILE* output = TakeStandardOutput();
+    std::FILE* output = RedirectStandardOutput();
     bool is_complete =
         Serve(stdin, output, heartbeat, [&heartbeat](const Frame& request) { return AnswerTo(request, heartbeat); });
     return is_complete ? 0 : 1;

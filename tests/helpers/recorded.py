@@ -64,7 +64,7 @@ def make_of(
 ) -> Path:
     """Write the folder of a trial; `write_sent` writes the sent file into the folder of an attempt."""
     folder = store.create(out, plan)
-    (repeat,) = plan.order()
+    (repeat,) = plan.repeats_in_order()
     void = Attempt(repeat, 1, START_NS, Status.VOID, "ping.txt is missing")
     valid = Attempt(repeat, 2, START_NS + 10 * SECOND_NS, Status.VALID)
     entries = [JournalEntry(START_NS - SECOND_NS, repeat.protocol, 1, 0, Status.PLANNED)]

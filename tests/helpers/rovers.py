@@ -13,7 +13,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Placement, Role, Scenario, Topology, Vector
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
-from sim_backends.emulated.ros.steered import Steered
+from sim_backends.emulated.ros.motion_record import RecordedMotion
 from tests.helpers import texts
 from tests.helpers.field_robots import FieldRobots, start_field_robots
 from tests.helpers.labs import BOX, replace_text
@@ -72,9 +72,9 @@ class RoverLab:
         return self.field_robots.folder
 
     @property
-    def motion(self) -> Steered | None:
+    def motion(self) -> RecordedMotion | None:
         """Motion of the rover as its base reports it to the lab; None before the first report."""
-        return self.field_robots.testbed.robots[Role.SENDER].steered()
+        return self.field_robots.testbed.robots[Role.SENDER].recorded_motion()
 
     @property
     def drives(self) -> bool:
@@ -84,7 +84,7 @@ class RoverLab:
     @property
     def stationary(self) -> bool:
         """True if the rover has moved before but is now stationary."""
-        return (motion := self.motion) is not None and not motion.moves
+        return (motion := self.motion) is not None and not motion.is_moving
 
     @property
     def place_m(self) -> Vector:

@@ -1,7 +1,6 @@
 """Runs fieldkit like its users: as a command in a separate folder."""
 
 import csv
-import io
 import json
 import os
 import subprocess
@@ -13,8 +12,10 @@ from dataclasses import dataclass
 from io import StringIO
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from fieldkit.cli import main
+from fieldkit.core import executors
 from fieldkit.trial.plan import PLAN_FILE
 
 LIMIT_S = 600.0
@@ -41,10 +42,7 @@ class Run:
 
 def cosim(lab: Path, *words: str) -> Run:
     """Run `fieldkit cosim` in this process, in the folder `lab`."""
-    out, err = io.StringIO(), io.StringIO()
-    with chdir(lab), redirect_stdout(out), redirect_stderr(err):
-        code = main(("cosim", *words))
-    return Run(code, out.getvalue(), err.getvalue())
+    return run_here(lab, "cosim", *words)
 
 
 def start(lab: Path, *arguments: str) -> "subprocess.Popen[str]":
@@ -99,11 +97,12 @@ def fieldkit(lab: Path, *arguments: str) -> Run:
 def run_here(folder: Path, *arguments: str) -> Run:
     """Run `fieldkit` with `arguments` in a folder, in this process, which saves half a second of processor time.
 
-    For tests that need no separate process. Only one thread may run commands, because the working folder and the
-    standard streams belong to the process.
+    For tests that need no separate process. Without `--jobs`, the command starts no workers, as on one processor.
+    Only one thread may run commands, because the working folder and the standard streams belong to the process.
     """
     out, err = StringIO(), StringIO()
-    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+    one_processor = patch.object(executors, "usable_processors", return_value=1)
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err), one_processor:
         code = main(arguments)
     return Run(code, out.getvalue(), err.getvalue())
 

@@ -145,5 +145,5 @@ class ScriptedWire:
             self.at(arrival_ns + extra_ns, receiver, lambda: transport.receive(receiver, packet))
         if not extra_delays_ns:
             reason = "queue full" if is_full else "lost by script"
-            self.at(arrival_ns, receiver, lambda: transport.lost(packet, reason))
+            self.at(arrival_ns, receiver, lambda: transport.record_loss(packet, reason))
         return bool(extra_delays_ns)

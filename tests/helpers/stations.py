@@ -31,7 +31,7 @@ class FixedPowers(RadioChannel):
     def powers_mw(self, transmitter: int, now_ns: int) -> list[float]:
         return self.rows[transmitter]
 
-    def linked(self, transmitter: int, receiver: int) -> bool:
+    def are_linked(self, transmitter: int, receiver: int) -> bool:
         return True
 
     def delay_ns(self, transmitter: int, receiver: int) -> int:

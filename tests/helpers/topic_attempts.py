@@ -27,7 +27,9 @@ SAMPLES: Final = 40
 AHEAD: Final = 3 * SECOND
 """The offset of the subscriber's clock."""
 
-PLAN: Final = TopicPlan("/stream", SAMPLES, BYTES, 16, reliable=True, depth=10, in_order=True, on_ports=True)
+PLAN: Final = TopicPlan(
+    "/stream", SAMPLES, BYTES, 16, reliable=True, depth=10, in_order=True, uses_expected_ports=True
+)
 TRAFFIC: Final = TopicTraffic(SENDER, RECEIVER, frozenset({PORT}), frozenset({17900}), deadline_s=0.2)
 
 Row = tuple[int, int, int, int, int]
@@ -57,7 +59,7 @@ def attempt(*, tcp: bool = False, lost: Sequence[int] = (), plan: TopicPlan = PL
     """A valid attempt; the samples in `lost` are missing in the subscriber's capture and log."""
     start_ns, matched_ns = START - 2 * SECOND, START - 600 * MS
     size = plan.size_bytes + plan.envelope_bytes
-    start_rows = [(records.BEGUN, 0, 0, 0, start_ns), (records.MATCHED, 0, 0, 0, matched_ns)]
+    start_rows = [(records.DISCOVERY_STARTED, 0, 0, 0, start_ns), (records.MATCHED, 0, 0, 0, matched_ns)]
     sent, received = (
         [*start_rows],
         [
@@ -169,7 +171,7 @@ def judge_attempt(topic_attempt: TopicAttempt, folder: Path, *, signed: bool = T
     reasons += [] if reasons else topic_captures.check_captures(topic_attempt.plan, sent, received, captured)
     measured = topic_columns.measure(TRAFFIC, sent, received, *packets)
     arrived = topic_columns.first_arrivals(received)
-    withheld = topic_captures.withheld(
+    withheld = topic_captures.withheld_columns(
         measured.values, arrived, captured, reliable=topic_attempt.plan.reliable, deadline_s=TRAFFIC.deadline_s
     )
     return reasons, measured.without(withheld)

@@ -96,19 +96,19 @@ def test_a_damaged_capture_is_not_counted(tmp_path: Path) -> None:
     (tmp_path / capture_file(Role.SENDER)).write_bytes(data)
     (tmp_path / capture_file(Role.RECEIVER)).write_bytes(data[:-1])
     evidence = AttemptEvidence(tmp_path)
-    frames = evidence.whole_capture(capture_file(Role.SENDER))
+    frames = evidence.undamaged_capture(capture_file(Role.SENDER))
     assert frames is not None
     assert (frames.frames, frames.damage) == (3, None)
     assert (
-        evidence.whole_capture(capture_file(Role.SENDER))
+        evidence.undamaged_capture(capture_file(Role.SENDER))
         is frames
         is evidence.read(pcap.read, capture_file(Role.SENDER))
     )
-    # The damaged capture can still be read explicitly, but not with `whole_capture`.
-    assert evidence.whole_capture(capture_file(Role.RECEIVER)) is None
+    # The damaged capture can still be read explicitly, but not with `undamaged_capture`.
+    assert evidence.undamaged_capture(capture_file(Role.RECEIVER)) is None
     assert evidence.read(pcap.read, capture_file(Role.RECEIVER)).damage
-    assert evidence.whole_capture(capture_file(Role.RELAY)) is None
-    assert evidence.whole_capture(None) is None
+    assert evidence.undamaged_capture(capture_file(Role.RELAY)) is None
+    assert evidence.undamaged_capture(None) is None
 
 
 @pytest.mark.parametrize("error", [RecursionError, OverflowError, struct.error, KeyError])

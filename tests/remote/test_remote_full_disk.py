@@ -157,6 +157,6 @@ def test_lock_that_cannot_be_released_is_reported_and_not_awaited(shell: SmallSh
     (note,) = events
     assert isinstance(note, Note)
     assert NO_SPACE in note.text
-    assert locks.holder(shell) is not None
+    assert locks.read_lock(shell) is not None
     shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
     assert jobs.abort(shell, "bert@two", Deadline.after(30)).locked

@@ -532,7 +532,7 @@ def test_end_of_each_job_is_recorded_with_boot_id_and_clock(shell: LocalShell, t
         "job": (Cause.EXITED, 3),
         "slow": (Cause.LIMIT, 0),
     }
-    lasted_s = after.endings["job"].lasted_s
+    lasted_s = after.endings["job"].duration_s
     assert lasted_s is not None
     assert lasted_s >= 0.28
     assert before.boot == after.boot == evidence.boot_id(shell) == evidence.begin(shell, FOLDER, "sender", "lo")

@@ -18,7 +18,7 @@ from tests.helpers.casts import los_plan
 from tests.remote.test_remote_fuzz import AnsweringRobot, entry
 
 PLAN = los_plan()
-OWNERS = FileOwners.of(PLAN.procedure, PLAN.scene(RepeatId(Protocol.UDP, 1), ""))
+OWNERS = FileOwners.of_procedure(PLAN.procedure, PLAN.scene(RepeatId(Protocol.UDP, 1), ""))
 OF_THE_LAPTOP = (
     *("medium.txt", "track.csv", "link.csv", "lateness.txt", "MANIFEST.sha256", "air.pcap", "air.csv"),
     *("answer-grass.txt", "receiver-unfetched.txt", "positions.json", "trial.yaml", "trial.csv", "journal.jsonl"),

@@ -75,6 +75,31 @@ def test_programs_that_hang_fail_or_flood_give_no_value_and_delay_little(shell: 
     assert all(report.offset_s is None for report in clock_states.reports(taken))
 
 
+def test_a_source_that_hung_is_not_started_again_in_the_trial(shell: LocalShell, tmp_path: Path) -> None:
+    calls = tmp_path / "calls"
+    give(tmp_path, "chronyc", f"echo chronyc >>{shlex.quote(str(calls))}; exec sleep 600")
+    give(tmp_path, "iw", "exec sleep 600")
+    give(tmp_path, "pmc", f"echo pmc >>{shlex.quote(str(calls))}; echo 'code 137'")
+    folders = [FOLDER, jobs.work_folder("trial", "udp-02-1")]
+    for number, folder in enumerate(folders):
+        evidence.begin(shell, folder, "sender", "wlan0")
+        local = tmp_path / f"local-{number}"
+        local.mkdir()
+        fetching.fetch(shell, folder, "sender", "wlan0", local)
+        for name in ("sender-sources-before.txt", "sender-sources-after.txt"):
+            snapshot = snapshots.read(local / name)
+            assert [snapshot[source].failure for source in ("chrony", "iw-info", "ptp")] == [
+                "did not answer in time",
+                "did not answer in time",
+                None,
+            ]
+    # The sampler of the link also starts iw.
+    started = calls.read_text().splitlines()
+    assert (started.count("chronyc"), started.count("pmc")) == (1, 4)
+    evidence.discard(shell, "trial", kept_folders=folders[1:])
+    assert [path.name for path in (shell.home / ".fieldkit" / "trial").iterdir()] == [folders[1].rpartition("/")[2]]
+
+
 def test_a_robot_without_these_programs_reports_its_computer(shell: LocalShell, tmp_path: Path) -> None:
     give(tmp_path, "chronyc", "exit 3")
     (tmp_path / "bin" / "chronyc").chmod(0o644)

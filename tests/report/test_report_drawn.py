@@ -177,7 +177,7 @@ def test_axis_of_a_distribution_is_logarithmic_for_a_wide_range(longest_s: float
 
 
 def test_flag_is_drawn_as_a_share_of_repeats(tmp_path: Path) -> None:
-    columns = trial_columns(outage_columns.declared(FaultKind.REBOOT))
+    columns = trial_columns(outage_columns.fault_columns(FaultKind.REBOOT))
     name = fault_column_name(FaultKind.REBOOT, "recovered")
     rows = [{**row, name: n > 1} for metres in (10, 20) for n, row in enumerate(at(metres, 4))]
     path = tmp_path / "trial.csv"

@@ -3,7 +3,7 @@
 import pytest
 
 from fieldkit.backends.protocols import Robot
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
@@ -50,7 +50,7 @@ def test_commands_of_the_paper_trial(protocol: Protocol) -> None:
     plan = los_plan()
     scene = plan.scene(RepeatId(protocol, 1), ".fieldkit/t/r")
     jobs_planned = [planned for entry in plan.procedure.steps for planned in entry.step.jobs(scene)]
-    assert [(planned.role, in_shell(planned.job)) for planned in jobs_planned] == GOLDEN[protocol]
+    assert [(planned.role, shell_line(planned.job)) for planned in jobs_planned] == GOLDEN[protocol]
 
 
 def test_record_override_changes_only_the_duration() -> None:

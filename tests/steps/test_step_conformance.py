@@ -116,7 +116,7 @@ EXAMPLES: Mapping[str, Example] = {
     ),
     "together": Example(f"[together: {{during: [{SEND}, {PING}]}}]"),
 }
-KINDS = sorted(EXAMPLES.keys() & kinds.shipped())
+KINDS = sorted(EXAMPLES.keys() & kinds.shipped_names())
 TEXT_BYTES = 10_000
 
 SITE = site(emulated="ros: builtin, late_bound: 5s, radio: {loss: 0%, rate: 500kbit/s}")
@@ -155,7 +155,7 @@ def of_kind(kind: str, plan: Plan) -> PlacedStep:
 
 
 def own_jobs(kind: str, plan: Plan) -> list[Planned]:
-    return list(nest.own_jobs(of_kind(kind, plan).step, plan.scene(next(plan.order()), "check")))
+    return list(nest.own_jobs(of_kind(kind, plan).step, plan.scene(next(plan.repeats_in_order()), "check")))
 
 
 @dataclass
@@ -197,7 +197,7 @@ class Bench:
 
     def last_attempt(self, plan: Plan) -> tuple[str, str, Path]:
         folder = self.out / plan.trial
-        attempt = journal.ended(journal.read(folder))[-1]
+        attempt = journal.ended_attempts(journal.read(folder))[-1]
         return attempt.status, attempt.reason, store.attempt_folder(folder, attempt.folder)
 
     def running_jobs(self) -> list[str]:
@@ -257,7 +257,7 @@ def valid(request: pytest.FixtureRequest, bench: Bench) -> Valid:
 
 
 def test_every_builtin_kind_has_an_example() -> None:
-    assert kinds.shipped() <= EXAMPLES.keys()
+    assert kinds.shipped_names() <= EXAMPLES.keys()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -277,7 +277,7 @@ def test_attempt_without_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
     plan, evidence = valid.plan, valid.evidence
     step = of_kind(valid.kind, plan).step
     spare = {step_prefixed(step.prefix, name) for name in EXAMPLES[valid.kind].spare}
-    repeat = next(plan.order())
+    repeat = next(plan.repeats_in_order())
     for name in step.files():
         if name.endswith(".log") or name in spare or not (evidence / name).exists():
             continue
@@ -289,7 +289,7 @@ def test_attempt_without_a_file_is_void(valid: Valid, tmp_path: Path) -> None:
 
 def test_every_column_has_a_value_or_a_reason(valid: Valid) -> None:
     step = of_kind(valid.kind, valid.plan).step
-    measured = gates.judge(valid.plan, next(valid.plan.order()), AttemptEvidence(valid.evidence)).measured
+    measured = gates.judge(valid.plan, next(valid.plan.repeats_in_order()), AttemptEvidence(valid.evidence)).measured
     for column in step.output_columns():
         name = step_prefixed(step.prefix, column.name)
         assert name in measured.values or measured.missing[name]
@@ -367,7 +367,7 @@ def kill_tool(kind: str, role: Role, name: str, bench: Bench, monkeypatch: pytes
     if name in EXAMPLES[kind].brief:
         slow = ("sh", "-c", 'sleep 1; exec "$@"', "sh")
         change(monkeypatch, name, lambda original: replace(original, argv=(*slow, *original.argv)))
-    folder = jobs.work_folder(plan.trial, f"{next(plan.order())}-1")
+    folder = jobs.work_folder(plan.trial, f"{next(plan.repeats_in_order())}-1")
     shell = bench.testbed.shells[role]
     argv = ("sh", "-c", KILL, "sh", f"{folder}/.jobs/{name}")
     session = shell.begin(argv, deadline=Deadline.after(30))

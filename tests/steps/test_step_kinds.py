@@ -12,7 +12,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps import kinds
 from fieldkit.steps.base import StepEntry, step_types
 from fieldkit.steps.kinds.ping import PingStep
-from fieldkit.trial.columns import installed
+from fieldkit.trial.columns import installed_columns
 from tests.helpers.outside_packages import write_package
 
 BUILTIN = ["capture", "transfer", "ping", "fault", "wait", "ask", "together", "run", "iperf3", "soak", "send", "roam"]
@@ -31,7 +31,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         write_package(tmp_path / "installed", "more-steps", f"[{plugins.STEPS}]\n{points}")
         monkeypatch.syspath_prepend(tmp_path / "installed")
 
-    cached_functions = (step_types, installed)
+    cached_functions = (step_types, installed_columns)
     for function in cached_functions:
         function.cache_clear()
     yield entries
@@ -44,7 +44,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 def test_builtin_kinds_are_in_order_and_in_modules_of_their_names(install: Install) -> None:
     install()
     assert list(step_types()) == [*BUILTIN, *MOTION, *ROS]
-    assert kinds.shipped() == {*BUILTIN, *MOTION, *ROS}
+    assert kinds.shipped_names() == {*BUILTIN, *MOTION, *ROS}
     for kind in BUILTIN:
         step = step_types()[kind]
         assert (step.__module__, step.__name__) == (f"fieldkit.steps.kinds.{kind}", f"{kind.capitalize()}Step")
@@ -133,7 +133,7 @@ def test_column_name_that_is_already_used_is_refused(
     with pytest.raises(
         ConfigurationError, match=f"'load' declares a column '{name}', which exists already"
     ) as caught:
-        installed()
+        installed_columns()
     assert caught.value.remedy == "rename it there, or uninstall its package"
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError, RobotError
 from fieldkit.core.model import FIXED_ROLES, Protocol, Role
@@ -36,7 +36,7 @@ def procedure(text: str) -> Procedure:
 
 
 def lines(step: Step, protocol: Protocol) -> list[tuple[Role, str]]:
-    return [(planned.role, in_shell(planned.job)) for planned in step.jobs(Scene(protocol, CAST, "f"))]
+    return [(planned.role, shell_line(planned.job)) for planned in step.jobs(Scene(protocol, CAST, "f"))]
 
 
 SERVER = "iperf3 -s -1 -p 5201 -i 1 --json > receiver-iperf3.json 2> receiver-iperf3.log"

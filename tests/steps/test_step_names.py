@@ -109,7 +109,7 @@ def test_plan_lists_transfers_pings_and_captures() -> None:
         "receiver.pcap": Role.RECEIVER,
     }
     assert planned_evidence.bags(plan) == {Role.SENDER: "scan.bag"}
-    assert [file.name for file in plan.scenes()[0].recorded[Role.SENDER]] == ["scan.bag", "imu.bag"]
+    assert [file.name for file in plan.scenes()[0].recordings[Role.SENDER]] == ["scan.bag", "imu.bag"]
 
 
 def test_step_uses_innermost_capture_around_it(tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_step_uses_innermost_capture_around_it(tmp_path: Path) -> None:
     (tmp_path / "sender.pcap").write_bytes(file_bytes(timed(datagram(1, 8192))))
     (tmp_path / "inner.sender.pcap").write_bytes(file_bytes(timed(datagram(1, 100))))
     view = View(plan_of().scenes()[0], AttemptEvidence(tmp_path), within)
-    assert (view.captured(Role.SENDER, Role.RECEIVER), view.captured(Role.RELAY)) == (True, False)
+    assert (view.has_captures(Role.SENDER, Role.RECEIVER), view.has_captures(Role.RELAY)) == (True, False)
     inner = view.capture(Role.SENDER)
     assert inner is not None
     assert inner.frames == 1
@@ -206,4 +206,4 @@ def test_summary_starts_with_gap_of_ping() -> None:
     outage_s, recovered = (fault_column_name(FaultKind.LINK_DOWN, suffix) for suffix in ("outage_s", "recovered"))
     fault_values = {f"cut.{outage_s}": 7.2, f"cut.{recovered}": True}
     text = rows.describe(plan, {**fault_values, "rtt_gap_s": 3.2, "rtt_gap_lost": 29, "rtt_median_s": 0.0032})
-    assert text == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: gone for 7.2 s"
+    assert text == "longest gap 3.2 s with 29 lost, RTT 3.2 ms, cut: link-down: no answer for 7.2 s"

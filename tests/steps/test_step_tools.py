@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from fieldkit.cli.dry_run import in_shell, print_commands
+from fieldkit.cli.dry_run import print_commands, shell_line
 from fieldkit.config.profiles import RobotProfile
 from fieldkit.core.model import Protocol, RepeatId, Role
 from fieldkit.steps import variants
@@ -48,7 +48,7 @@ def lines(protocol: Protocol, detected: Mapping[Role, Variants], plan: Plan | No
     plan = plan or los_plan()
     scene = plan.scene(RepeatId(protocol, 1), "f", detected)
     jobs = [planned.job for entry in plan.procedure.steps for planned in entry.step.jobs(scene)]
-    return {job.name: in_shell(job) for job in jobs}
+    return {job.name: shell_line(job) for job in jobs}
 
 
 def on_both(**changes: object) -> dict[Role, Variants]:

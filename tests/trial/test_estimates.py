@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from fieldkit.core.model import Protocol, Status, Topology
 from fieldkit.core.units import TimeEstimate, parse_distance
 from fieldkit.trial import estimates
-from fieldkit.trial.estimates import FinishedRepeat, of_repeats, of_trial
+from fieldkit.trial.estimates import FinishedRepeat, estimate_repeats, estimate_trial
 from fieldkit.trial.journal import JournalEntry
 from fieldkit.trial.plan import Plan
 from tests.helpers.casts import los_plan
@@ -23,10 +23,10 @@ def at(distance: str, topology: Topology = LOS.topology) -> Plan:
 
 
 def test_the_first_estimate_assumes_a_good_link_and_has_the_time_with_a_dead_link() -> None:
-    estimate = of_repeats(LOS, TCP, 20, [])
+    estimate = estimate_repeats(LOS, TCP, 20, [])
     assert estimate.likely_s == pytest.approx(20 * LOS.procedure.expected_s(TCP))
     assert estimate.most_s == pytest.approx(estimate.likely_s + 20 * 120.0), "a transfer waits for its limit of 120 s"
-    assert of_trial(LOS, []).likely_s == pytest.approx(
+    assert estimate_trial(LOS, []).likely_s == pytest.approx(
         LOS.repeats * sum(LOS.procedure.expected_s(protocol) for protocol in LOS.protocols)
     )
     assert ", up to 4" in str(estimate)
@@ -40,8 +40,10 @@ def test_finished_repeats_of_the_same_trial_are_preferred() -> None:
         FinishedRepeat(elsewhere, TCP, 9.0),
         FinishedRepeat(condition, UDP, 8.0),
     ]
-    assert of_repeats(condition, TCP, 3, finished) == TimeEstimate(3 * 140.0, 3 * 150.0)
-    assert of_repeats(condition, UDP, 3, finished) == TimeEstimate(24.0, 24.0), "each protocol by its own repeats"
+    assert estimate_repeats(condition, TCP, 3, finished) == TimeEstimate(3 * 140.0, 3 * 150.0)
+    assert estimate_repeats(condition, UDP, 3, finished) == TimeEstimate(24.0, 24.0), (
+        "each protocol by its own repeats"
+    )
 
 
 def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
@@ -55,29 +57,31 @@ def test_a_trial_reports_batteries_that_do_not_last_for_it() -> None:
 
 def test_a_larger_distance_than_any_before_may_have_a_dead_link() -> None:
     finished = [FinishedRepeat(at("10m"), TCP, 9.0), FinishedRepeat(at("20m"), TCP, 12.0)]
-    farther = of_repeats(at("30m"), TCP, 1, finished)
+    farther = estimate_repeats(at("30m"), TCP, 1, finished)
     assert farther.likely_s == 12.0, "as at the farthest place so far"
     assert farther.most_s == estimates.dead_link_s(LOS.procedure, TCP)
-    assert of_repeats(at("15m"), TCP, 1, finished) == TimeEstimate(10.5, 12.0), (
+    assert estimate_repeats(at("15m"), TCP, 1, finished) == TimeEstimate(10.5, 12.0), (
         "between two places, no longer than they took"
     )
-    assert of_repeats(at("5m"), TCP, 1, finished) == TimeEstimate(9.0, 12.0)
+    assert estimate_repeats(at("5m"), TCP, 1, finished) == TimeEstimate(9.0, 12.0)
 
 
 def test_another_topology_is_used_if_the_same_has_no_repeats() -> None:
     other = next(topology for topology in Topology if topology is not LOS.topology)
     finished = [FinishedRepeat(at("10m", other), TCP, 50.0)]
-    assert of_repeats(at("10m"), TCP, 2, finished) == TimeEstimate(100.0, 100.0)
-    assert of_repeats(at("10m"), TCP, 2, [*finished, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(14.0, 14.0)
+    assert estimate_repeats(at("10m"), TCP, 2, finished) == TimeEstimate(100.0, 100.0)
+    assert estimate_repeats(at("10m"), TCP, 2, [*finished, FinishedRepeat(at("10m"), TCP, 7.0)]) == TimeEstimate(
+        14.0, 14.0
+    )
 
 
 def test_finished_repeats_with_a_dead_link_are_used() -> None:
     """A campaign estimated 4 min and took 19: after its first trial with dead links, the rest can be estimated."""
     near_plan, far_plan = at("10m"), at("90m")
-    before = of_trial(far_plan, [FinishedRepeat(near_plan, protocol, 8.0) for protocol in LOS.protocols])
+    before = estimate_trial(far_plan, [FinishedRepeat(near_plan, protocol, 8.0) for protocol in LOS.protocols])
     dead_s = sum(estimates.dead_link_s(LOS.procedure, protocol) for protocol in LOS.protocols) * LOS.repeats
     assert before.most_s == pytest.approx(dead_s)
-    after = of_trial(
+    after = estimate_trial(
         at("80m"),
         [
             FinishedRepeat(near_plan, TCP, 8.0),
@@ -123,13 +127,13 @@ TIMES = st.lists(
 def test_an_upper_end_is_never_below_what_is_expected(
     finished: list[tuple[str, Protocol, float]], distance: str, count: int
 ) -> None:
-    estimate = of_repeats(
+    estimate = estimate_repeats(
         at(distance),
         TCP,
         count,
         [
-            FinishedRepeat(at(trial_distance), trial_protocol, took_s)
-            for trial_distance, trial_protocol, took_s in finished
+            FinishedRepeat(at(trial_distance), trial_protocol, duration_s)
+            for trial_distance, trial_protocol, duration_s in finished
         ],
     )
     assert 0 <= estimate.likely_s <= estimate.most_s * (1 + 1e-9)

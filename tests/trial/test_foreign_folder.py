@@ -241,7 +241,7 @@ def test_a_reason_with_half_a_surrogate_pair_is_stored_with_a_mark(tmp_path: Pat
         reason = "cannot read \udcff\ud800.bag"
         ledger.commit(store.open_attempt(folder, repeat), replace(entry, status=VOID, reason=reason), Measured())
         ledger.summarize()
-        (attempt,) = journal.ended(journal.history(folder, plan))
+        (attempt,) = journal.ended_attempts(journal.history(folder, plan))
         assert attempt.reason == "cannot read ??.bag"
     assert "cannot read ??.bag" in (folder / store.TRIAL_CSV).read_text(encoding="utf-8")
 

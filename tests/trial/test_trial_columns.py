@@ -15,7 +15,15 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.steps import kinds
 from fieldkit.steps.base import step_types
 from fieldkit.trial import frozen, rows
-from fieldkit.trial.columns import IDENTITY, filled_by, installed, measures, of_robots, of_steps, trial_columns
+from fieldkit.trial.columns import (
+    IDENTITY,
+    additional_columns,
+    filled_columns,
+    installed_columns,
+    measured_columns,
+    robot_columns,
+    trial_columns,
+)
 from fieldkit.trial.frozen import freeze
 from fieldkit.trial.procedure import Procedure
 from fieldkit.trial.stored import plans, tables
@@ -92,8 +100,8 @@ def test_common_columns_are_first_independently_of_their_rank() -> None:
 
 def test_the_paper_s_procedure_freezes_only_the_columns_of_robots() -> None:
     plan = los_plan()
-    assert plan.columns == freeze(of_robots(plan.procedure.roles()))
-    assert names(plan.table) == names((*trial_columns(), *of_robots(plan.procedure.roles())))
+    assert plan.columns == freeze(robot_columns(plan.procedure.roles()))
+    assert names(plan.table) == names((*trial_columns(), *robot_columns(plan.procedure.roles())))
 
 
 def test_a_named_column_has_named_figures_and_counts() -> None:
@@ -141,8 +149,8 @@ def test_a_column_that_cannot_be_read_or_shown_is_rejected(column: Column, flaw:
 
 
 def test_columns_of_every_trial_include_those_of_every_shipped_kind() -> None:
-    declared = {column for kind in kinds.shipped() for column in step_types()[kind].columns}
-    assert declared <= set(measures())
+    declared = {column for kind in kinds.shipped_names() for column in step_types()[kind].columns}
+    assert declared <= set(measured_columns())
 
 
 # Steps.
@@ -153,10 +161,10 @@ def meters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """An installed package with `meter`."""
     write_package(tmp_path / "installed", "meters", f"[{plugins.STEPS}]\nmeter = {meter.TARGET}\n")
     monkeypatch.syspath_prepend(tmp_path / "installed")
-    for cached in (step_types, installed):
+    for cached in (step_types, installed_columns):
         cached.cache_clear()
     yield
-    for cached in (step_types, installed):
+    for cached in (step_types, installed_columns):
         cached.cache_clear()
 
 
@@ -175,9 +183,9 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
     parsed_procedure = procedure(
         "meter: {called: b, measures: [x]}", "ping: {from: sender, to: receiver}", "meter: {}"
     )
-    columns = of_steps(placed.step for placed in parsed_procedure.walk())
+    columns = additional_columns(placed.step for placed in parsed_procedure.walk())
     assert names(columns) == ["b.meter_level", "b.x", "meter_level"]
-    filled = names(filled_by(placed.step for placed in parsed_procedure.walk()))
+    filled = names(filled_columns(placed.step for placed in parsed_procedure.walk()))
     assert filled[-3:] == names(columns)
     assert {"status", "rtt_sent", "emulator_late_max_s"} <= set(filled)
     assert not {"ip_loss", "file_loss"} & set(filled)
@@ -188,10 +196,10 @@ def test_columns_of_steps_follow_in_the_order_of_the_procedure() -> None:
 @pytest.mark.parametrize(
     ("steps", "message"),
     [
-        (("meter: {measures: [rtt_sent]}",), "'rtt_sent' is one of fieldkit's"),
-        (("meter: {measures: [status]}",), "'status' is one of fieldkit's"),
-        (("meter: {}", "meter: {}"), "'meter_level' is filled by two steps"),
-        (("meter: {called: a, measures: [x, x]}",), "'a.x' is filled by two steps"),
+        (("meter: {measures: [rtt_sent]}",), "fieldkit has another column 'rtt_sent'"),
+        (("meter: {measures: [status]}",), "fieldkit has another column 'status'"),
+        (("meter: {}", "meter: {}"), "two steps have a column 'meter_level'"),
+        (("meter: {called: a, measures: [x, x]}",), "two steps have a column 'a.x'"),
         (("meter: {measures: [Level]}",), "its name is not made of lower-case letters"),
     ],
 )
@@ -204,7 +212,7 @@ def test_clashing_names_are_rejected_with_the_line_of_their_step(steps: Sequence
 
 @pytest.mark.usefixtures("meters")
 def test_columns_of_other_packages_are_only_in_trials_that_use_them() -> None:
-    assert "meter_level" in names(installed())
+    assert "meter_level" in names(installed_columns())
     assert "meter_level" not in names(trial_columns())
 
 
@@ -222,7 +230,7 @@ def write_trial(folder: Path, name: str, columns: Sequence[Column], *, with_plan
 
 
 def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Path) -> None:
-    actual = tables.declared_in([write_trial(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
+    actual = tables.declared_columns([write_trial(tmp_path, "one", vendor_trials.VENDOR_COLUMNS)])
     assert actual == (
         *trial_columns(),
         *(Column(**{**vars(column), "rank": 100}) for column in vendor_trials.VENDOR_COLUMNS),
@@ -231,7 +239,7 @@ def test_a_table_is_read_by_its_plan_without_the_declaring_package(tmp_path: Pat
 
 def test_different_trials_share_their_common_columns(tmp_path: Path) -> None:
     paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", vendor_trials.NAMED_STEP_COLUMNS)]
-    read = table_files.read(paths, tables.declared_in(paths))
+    read = table_files.read(paths, tables.declared_columns(paths))
     assert [value is None for value in read.column("probe.level")] == [False] * 4 + [True] * 4
     assert [value is None for value in read.column("up.transfer_s")] == [True] * 4 + [False] * 4
 
@@ -240,7 +248,7 @@ def test_without_a_plan_prefixed_columns_are_known_and_others_are_text(tmp_path:
     table = write_trial(
         tmp_path, "one", (*vendor_trials.NAMED_STEP_COLUMNS, *vendor_trials.VENDOR_COLUMNS), with_plan=False
     )
-    actual = {column.name: column for column in tables.declared_in([table])}
+    actual = {column.name: column for column in tables.declared_columns([table])}
     for column in vendor_trials.NAMED_STEP_COLUMNS:
         assert actual[column.name] == column
     for column in vendor_trials.VENDOR_COLUMNS:
@@ -252,7 +260,7 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
         write_trial(tmp_path / "a", "one", OF_TRIAL, with_plan=False),
         write_trial(tmp_path / "b", "two", OF_TRIAL),
     ]
-    (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
+    (level,) = (column for column in tables.declared_columns(paths) if column.name == "probe.level")
     assert level.unit == "dBm"
 
 
@@ -268,7 +276,7 @@ def test_a_table_without_a_plan_is_read_by_the_plan_of_another_trial(tmp_path: P
 def test_plans_with_incompatible_columns_of_one_name_are_rejected(tmp_path: Path, other: Column) -> None:
     paths = [write_trial(tmp_path, "one", OF_TRIAL), write_trial(tmp_path, "two", [other])]
     with pytest.raises(ConfigurationError, match=r"probe\.level is a different column here") as caught:
-        tables.declared_in(paths)
+        tables.declared_columns(paths)
     assert caught.value.where == str(paths[1].with_name("trial.yaml"))
 
 
@@ -276,7 +284,7 @@ def test_plans_may_differ_in_meaning_and_bounds_of_a_column(tmp_path: Path) -> N
     other = Column("probe.level", "dBm", "Level.", bounds=(-90, 0), figure=Figure("signal", Kind.MEDIAN))
     same = Column("probe.level", "dBm", "What it says.", bounds=(-120, -10), figure=Figure("level", Kind.MEDIAN))
     paths = [write_trial(tmp_path, "one", [other]), write_trial(tmp_path, "two", [same])]
-    (level,) = (column for column in tables.declared_in(paths) if column.name == "probe.level")
+    (level,) = (column for column in tables.declared_columns(paths) if column.name == "probe.level")
     assert (level.meaning, level.bounds) == ("Level.", (-120, 0))
 
 
@@ -303,7 +311,7 @@ def test_edited_columns_are_rejected_with_their_location(tmp_path: Path, columns
     path = table.with_name("trial.yaml")
     head, _, _ = path.read_text(encoding="utf-8").partition("columns:\n")
     path.write_text(f"{head}columns:\n{columns}\n", encoding="utf-8")
-    for read in (lambda: tables.declared_in([table]), lambda: plans.read_plan(path.parent)):
+    for read in (lambda: tables.declared_columns([table]), lambda: plans.read_plan(path.parent)):
         with pytest.raises(ConfigurationError) as caught:
             read()
         assert caught.value.where is not None
@@ -316,7 +324,7 @@ def test_a_plan_may_not_redeclare_a_common_column(tmp_path: Path) -> None:
     path = table.with_name("trial.yaml")
     spoiled = path.read_text(encoding="utf-8").replace("name: probe.level", "name: status", 1)
     path.write_text(spoiled, encoding="utf-8")
-    actual = [column for column in tables.declared_in([table]) if column.name in {"status", "probe.level"}]
+    actual = [column for column in tables.declared_columns([table]) if column.name in {"status", "probe.level"}]
     assert actual[0] in IDENTITY
     assert actual[1] == table_files.undeclared("probe.level")
 
@@ -326,4 +334,4 @@ def test_a_plan_that_is_a_link_is_not_read(tmp_path: Path) -> None:
     plan = table.with_name("trial.yaml")
     plan.rename(tmp_path / "elsewhere.yaml")
     plan.symlink_to(tmp_path / "elsewhere.yaml")
-    assert tables.declared_in([table])[-1] == table_files.undeclared("probe.level")
+    assert tables.declared_columns([table])[-1] == table_files.undeclared("probe.level")

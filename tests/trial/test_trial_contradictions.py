@@ -160,7 +160,7 @@ def test_a_connection_that_was_refused(tcp: Attempt, calls: int, *, is_reported:
     for role in ("sender", "receiver"):
         tcp.capture(role, with_reset)
     tcp.file("recv.bag", lambda _: b"")
-    message = "the receiver refused the connection: no program listened when the sender started"
+    message = "the receiver refused the connection: no program was listening when the sender started"
     assert (message in " ".join(tcp.problems())) == is_reported
 
 
@@ -241,7 +241,7 @@ def test_a_file_with_more_than_arrived(attempt: Attempt) -> None:
 
 def test_a_file_with_less_than_tcp_delivered(tcp: Attempt) -> None:
     tcp.file("recv.bag", lambda data: data[:-1])
-    demand(tcp, "although its listener ended normally")
+    demand(tcp, "although its listener exited normally")
 
 
 def test_a_listener_at_its_limit_may_leave_bytes_that_tcp_delivered(tcp: Attempt) -> None:
@@ -357,7 +357,12 @@ def test_a_robot_that_rebooted(attempt: Attempt) -> None:
         ("receiver", "listen itself 0", "listen itself 143", "its job listen was killed by SIGTERM, not by fieldkit"),
         ("sender", "send itself 0", "send itself 137", "its job send was killed by SIGKILL, not by fieldkit"),
         ("sender", "send itself 0 100000 1060.00", "send itself - 100000 -", "its job send was killed"),
-        ("sender", "record itself 0 100000 1001.50", "record itself 0 100000 1000.40", "exited after 0.4 s of 1 s"),
+        (
+            "sender",
+            "record itself 0 100000 1001.50",
+            "record itself 0 100000 1000.40",
+            "exited after 0.4 s instead of 1 s",
+        ),
         ("sender", "ping itself 0", "ping asked 0", "its job ping was stopped by fieldkit before it had finished"),
     ],
 )

@@ -188,7 +188,7 @@ def assert_consistent(folder: Path) -> None:
 def assert_complete(out: Path) -> None:
     """Check the properties of every finished trial."""
     folder = trial_of(out)
-    entries = journal.ended(journal.read(folder))
+    entries = journal.ended_attempts(journal.read(folder))
     valid = Counter(
         (attempt.repeat.protocol, attempt.repeat.number) for attempt in entries if attempt.status == "valid"
     )

@@ -115,24 +115,27 @@ def fewer_frames(folder: Path) -> None:
             text("sender-capture.log", FIRST_LINE_OF_LOG),
             "sender capture: tcpdump ended without its counters",
         ),
-        (text("sender-capture.log", log(dropped=3)), "sender capture: dropped 3 packets, its interface 0"),
+        (text("sender-capture.log", log(dropped=3)), "sender capture: its kernel dropped 3 packets, its interface 0"),
         (
             text("sender-capture.log", f"{log()}2 packets dropped by interface\n"),
-            "sender capture: dropped 0 packets, its interface 2",
+            "sender capture: its kernel dropped 0 packets, its interface 2",
         ),
-        (text("sender-capture.log", log(matched=23)), "sender capture: 23 packets matched, 24 were written"),
+        (text("sender-capture.log", log(matched=23)), "sender capture: 23 packets matched, but 24 were written"),
         (
             text("lateness.txt", "bound 5000000\nlate 5000000 7\nlate 5242880 2\nlate 41943040 1\n"),
             "lateness.txt: 3 packets were delivered too late, by up to 41.9 ms; the bound is 5 ms",
         ),
         (text("track.csv", "utc_ns"), "track.csv: is not a track of robots"),
-        (text("track.csv", track.text([]).replace("lines 0", "lines 1")), "track.csv: has 0 lines of 1: truncated"),
+        (
+            text("track.csv", track.text([]).replace("lines 0", "lines 1")),
+            "track.csv: is truncated: it has 0 of 1 lines",
+        ),
         (text("link.csv", "utc_ns"), "link.csv: is not a file of link samples"),
         (text("lateness.txt", "bound"), "lateness.txt: is not a file of packet lateness"),
         (cut_capture, "receiver capture: ends inside the packet at byte"),
-        (fewer_frames, "receiver capture: the file has 23 packets, tcpdump counted 24"),
+        (fewer_frames, "receiver capture: the file has 23 packets, but tcpdump counted 24"),
         (without("ping.txt"), "ping.txt is missing"),
-        (text("ping.txt", FIRST_LINE_OF_PING), "ping.txt: ping was stopped early, its summary is missing"),
+        (text("ping.txt", FIRST_LINE_OF_PING), "ping.txt: ping was stopped early; its summary is missing"),
         (text("ping.txt", PING.format(sent=7)), "ping.txt: ping sent 7 of 10 requests"),
     ],
 )
@@ -153,7 +156,7 @@ def test_an_exception_while_measuring_makes_the_attempt_failed(folder: Path, mon
     (output_text,) = problems(PLAN, Protocol.UDP, folder)
     reason = "the evidence of the step ping cannot be measured: OverflowError: int too large to convert to float"
     assert re.fullmatch(rf"{reason} \(test_trial_gates.py, line [0-9]+\)", output_text)
-    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
     assert verdict.measured.missing["rtt_loss"] == output_text
     (traceback,) = verdict.step_errors
     assert "in measure" in traceback
@@ -170,7 +173,7 @@ def test_an_exception_of_a_reader_of_an_optional_file_is_logged(
         raise KeyError(path.name)
 
     monkeypatch.setattr(oracle_delays, "read_lateness", read_lateness)
-    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
     (reason,) = verdict.problems
     assert reason.startswith("lateness.txt cannot be read: KeyError: 'lateness.txt' (test_trial_gates.py, line")
     (traceback,) = verdict.step_errors
@@ -186,13 +189,15 @@ def test_an_exception_of_any_method_makes_the_attempt_failed(
         raise KeyError("wlan0")
 
     monkeypatch.setattr(PingStep, method, raise_error)
-    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
     *_, reason = verdict.problems  # the jobs of the capture around it raise too
     assert "the step ping cannot be " in reason
     assert "KeyError: 'wlan0' (test_trial_gates.py, line" in reason
     assert verdict.has_failed
     (folder / "scan.bag").unlink()
-    assert not gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder)).has_failed, "another attempt may help"
+    assert not gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder)).has_failed, (
+        "another attempt may help"
+    )
 
 
 def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
@@ -206,7 +211,7 @@ def test_an_impossible_value_makes_the_attempt_void_and_is_missing(
         return Measured({**result.values, "rtt_loss": -38460.0, "rtt_min_s": float("nan")}, result.missing)
 
     monkeypatch.setattr(PingStep, "measure", impossible)
-    verdict = gates.judge(PLAN, next(PLAN.order()), AttemptEvidence(folder))
+    verdict = gates.judge(PLAN, next(PLAN.repeats_in_order()), AttemptEvidence(folder))
     assert verdict.problems == (
         "the evidence gives rtt_loss as -38460, not from 0 to 1",
         "the evidence gives rtt_min_s as nan, not a number",
@@ -238,7 +243,7 @@ def test_evidence_disturbed_by_a_fault_may_be_incomplete(tmp_path: Path) -> None
 def test_times_are_withheld_if_the_clock_counts_instructions(folder: Path) -> None:
     def measured(simulators: dict[str, str]) -> Measured:
         plan = PLAN.model_copy(update={"simulators": simulators})
-        (repeat, *_) = plan.order()
+        (repeat, *_) = plan.repeats_in_order()
         return gates.judge(plan, repeat, AttemptEvidence(folder)).measured
 
     plain, withheld = measured({}), measured({"wifi": "linux", "clock": "instructions"})

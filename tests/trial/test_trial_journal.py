@@ -64,7 +64,7 @@ def test_ended_attempts_have_the_times_of_their_start(tmp_path: Path) -> None:
         JournalEntry(40, Protocol.UDP, 1, 2, Status.VALID),
         JournalEntry(50, Protocol.UDP, 2, 1, Status.RUNNING),
     )
-    first, second = journal.ended(journal.read(tmp_path))
+    first, second = journal.ended_attempts(journal.read(tmp_path))
     repeat = RepeatId(Protocol.UDP, 1)
     assert first == Attempt(repeat, 1, 10, Status.VOID, "no bag")
     assert second == Attempt(repeat, 2, 30, Status.VALID, "")
@@ -96,7 +96,7 @@ def test_an_attempt_without_an_end_was_interrupted(tmp_path: Path) -> None:
         JournalEntry(40, Protocol.UDP, 3, 1, Status.RUNNING),
         JournalEntry(45, Protocol.UDP, 3, 1, Status.MEASURED),
     )
-    assert journal.interrupted(journal.read(tmp_path)) == [
+    assert journal.interrupted_attempts(journal.read(tmp_path)) == [
         Attempt(RepeatId(Protocol.UDP, 2), 1, 30, Status.RUNNING),
         Attempt(RepeatId(Protocol.UDP, 3), 1, 40, Status.MEASURED),
     ]

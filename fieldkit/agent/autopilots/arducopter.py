@@ -60,7 +60,7 @@ class ArduCopter:
         "FENCE_RADIUS",
         "RTL_ALT|RTL_ALT_M",
     )
-    checks_present_mode = False
+    checks_current_mode = False
 
     def matches(self, autopilot: int, vehicle: int) -> bool:
         """Return True if the autopilot is ArduPilot and the vehicle is a multicopter or helicopter."""
@@ -91,7 +91,7 @@ class ArduCopter:
         return (SET_MODE, CUSTOM_MODE, _GUIDED)
 
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
-        """Return the commands for climb speed and take-off; before 4.1 WPNAV_SPEED_UP sets the climb speed."""
+        """Return the commands for climb speed and take-off; versions before 4.1 use WPNAV_SPEED_UP as climb speed."""
         return (CHANGE_SPEED, _CLIMB_SPEED, climb_m_s), (TAKE_OFF, 0, 0, 0, 0, 0, 0, height_m)
 
     def bring_down_command(self, how: str) -> Command:

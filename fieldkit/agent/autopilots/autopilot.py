@@ -1,4 +1,4 @@
-"""State of a drone's autopilot, and commands to it, over MAVLink, for programs on the drone's computer.
+"""State of a drone's autopilot and commands to it over MAVLink, for programs on the drone's computer.
 
 Messages, commands and their numbers are defined in https://mavlink.io/en/messages/common.html.
 """
@@ -39,7 +39,7 @@ from fieldkit.agent.autopilots.px4 import Px4
 from fieldkit.agent.flying.reports import AutopilotTexts, printable
 
 FRESH_S = 2.0
-"""Maximum age of a report that describes the present state."""
+"""Maximum age of a report that describes the current state."""
 PILOT, GUARD, PREFLIGHT = 191, 192, 193
 """Component ids of fieldkit's programs: MAV_COMP_ID_ONBOARD_COMPUTER and the next two."""
 
@@ -79,7 +79,7 @@ class SystemStatus:
 
 
 class AutopilotCommands:
-    """Sends commands and requests to an autopilot; nothing but heartbeats is sent before its first heartbeat.
+    """Sends commands and requests to an autopilot. Before its first heartbeat, only heartbeats are sent.
 
     Args:
         link: The connection.
@@ -99,7 +99,7 @@ class AutopilotCommands:
         self._link.send(self._writer.heartbeat(_TYPE_ONBOARD))
 
     def request_stream(self, kind: int, rate_hz: float) -> None:
-        """Request a message at a rate while the link is open; 0 Hz ends the request."""
+        """Request a message at this rate while the link is open; 0 Hz cancels the request."""
         self.send(SET_MESSAGE_INTERVAL, kind, 1e6 / rate_hz if rate_hz else 0)
 
     def request_once(self, kind: int) -> None:
@@ -146,7 +146,7 @@ class AutopilotState:
         dialect: The dialect of its family; None for an unknown family, or before its first heartbeat.
         family: Its MAV_AUTOPILOT and MAV_TYPE.
         speed_m_s: Its speed.
-        booted_s: Its boot time by CLOCK_BOOTTIME of this computer, from its last position report.
+        boot_time_s: Its boot time by CLOCK_BOOTTIME of this computer, from its last position report.
         status: Its health and battery; None before its first report.
         estimate: Flags of its position estimate (ESTIMATOR_STATUS_FLAGS); None before its first report.
         has_home: Whether it has reported its home position.
@@ -162,7 +162,7 @@ class AutopilotState:
         self._heartbeat_s = self._position_s = self._attitude_s = self._latitude_longitude_s = -math.inf
         self._position_m = (0.0, 0.0, 0.0)
         self._latitude_longitude = (0.0, 0.0)
-        self._yaw_rad = self.speed_m_s = self.booted_s = 0.0
+        self._yaw_rad = self.speed_m_s = self.boot_time_s = 0.0
         self.mode = 0
         self.armed = self.failsafe = self.has_home = False
         self.dialect: FlightDialect | None = None
@@ -264,7 +264,7 @@ class AutopilotState:
         boot_ms, *values = _TIME_AND_FLOATS.unpack_from(payload)
         if all(map(math.isfinite, values)):
             self._position_m, self._position_s = (values[0], values[1], values[2]), time.monotonic()
-            self.booted_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_ms / 1e3
+            self.boot_time_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_ms / 1e3
             self.speed_m_s = math.hypot(*values[3:])
 
     def _on_global_position(self, payload: bytes) -> None:

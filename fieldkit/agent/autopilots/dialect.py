@@ -43,14 +43,14 @@ class FlightDialect(Protocol):
         guided_mode: Name of the mode in which it follows set-points.
         estimate_message: Id of the message with the flags of its position estimate.
         limit_parameters: Names of the parameters with its limits; `|` separates alternative names of one parameter.
-        checks_present_mode: Whether its arming checks apply to its present mode.
+        checks_current_mode: Whether its arming checks apply to its current mode.
     """
 
     name: str
     guided_mode: str
     estimate_message: int
     limit_parameters: Sequence[str]
-    checks_present_mode: bool
+    checks_current_mode: bool
 
     def matches(self, autopilot: int, vehicle: int) -> bool:
         """Return True if an autopilot belongs to this family, by MAV_AUTOPILOT and MAV_TYPE of its heartbeat."""
@@ -77,7 +77,7 @@ class FlightDialect(Protocol):
         """Return the commands for the take-off of an armed drone; empty if it takes off by set-points."""
 
     def bring_down_command(self, how: str) -> Command:
-        """Return the command to `land` at its present position, or to `return`."""
+        """Return the command to `land` at the current position, or to `return`."""
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
         """Return its limits, from the values of the parameters of `limit_parameters`."""

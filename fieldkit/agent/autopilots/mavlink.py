@@ -1,7 +1,8 @@
 """Record the MAVLink messages of an autopilot, and request messages from it.
 
 The log is a telemetry log (`.tlog`) in the format of QGroundControl, MAVProxy and pymavlink: each received frame
-follows its time of arrival in microseconds since 1970 UTC, 8 bytes, big-endian. Only heartbeats are decoded here.
+is preceded by its time of arrival in microseconds since 1970 UTC, 8 bytes, big-endian. Only heartbeats are decoded
+here.
 """
 
 from __future__ import annotations
@@ -78,10 +79,10 @@ class FlightRecorder:
         self._log = open(path, "wb", buffering=0)  # noqa: SIM115, PTH123 (closed by `end`)
         self._system = recording.system
         self._autopilot: tuple[int, int] | None = None
-        self._requested = {int(kind): interval_us for kind, interval_us in recording.intervals_us.items()}
-        self._missing = {kind for kind, interval_us in self._requested.items() if interval_us > 0}
-        self._refused: dict[int, int] = {}
-        self._slow_s = dict.fromkeys(self._missing, 0.0)
+        self._requested_us = {int(kind): interval_us for kind, interval_us in recording.intervals_us.items()}
+        self._missing_kinds = {kind for kind, interval_us in self._requested_us.items() if interval_us > 0}
+        self._refusals: dict[int, int] = {}
+        self._slow_s = dict.fromkeys(self._missing_kinds, 0.0)
         self._writer = FrameWriter()
         self._frames = self._bytes = self._dropped_frames = self._checksum = 0
         self._next_heartbeat_s = self._next_request_s = 0.0
@@ -91,7 +92,7 @@ class FlightRecorder:
     @property
     def ready(self) -> bool:
         """Whether each requested message was received, or refused by the autopilot."""
-        self._was_ready |= self._autopilot is not None and self._missing <= set(self._refused)
+        self._was_ready |= self._autopilot is not None and self._missing_kinds <= set(self._refusals)
         return self._was_ready
 
     def check(self) -> None:
@@ -101,9 +102,9 @@ class FlightRecorder:
             MissingMessageError: A message has not arrived in time.
         """
         if not self.ready and self._autopilot is not None and time.monotonic() - self._first_heartbeat_s > _TIMEOUT_S:
-            missing = ", ".join(str(kind) for kind in sorted(self._missing - set(self._refused)))
+            missing_ids = ", ".join(str(kind) for kind in sorted(self._missing_kinds - set(self._refusals)))
             raise MissingMessageError(
-                f"the autopilot has not sent the requested message {missing} in {_TIMEOUT_S:g} s "
+                f"the autopilot has not sent the requested message {missing_ids} in {_TIMEOUT_S:g} s "
                 "(ids of https://mavlink.io/en/messages/common.html)"
             )
 
@@ -135,28 +136,28 @@ class FlightRecorder:
             if intact and is_heartbeat and self._system in (0, message.system):
                 self._autopilot, self._first_heartbeat_s = source, time.monotonic()
         elif source == self._autopilot:
-            self._missing.discard(message.kind)
+            self._missing_kinds.discard(message.kind)
 
     def send(self) -> None:
-        """Send heartbeats, and send each request for a message until the link server has it."""
+        """Send heartbeats, and repeat each request for a message until the link server has registered it."""
         now_s = time.monotonic()
         if now_s >= self._next_heartbeat_s:
             self._next_heartbeat_s = now_s + _HEARTBEAT_S
             self._link.send(self._writer.heartbeat())
         if self._autopilot and now_s >= self._next_request_s:
             self._next_request_s = now_s + _REQUEST_S
-            for kind, interval_us in self._requested.items():
+            for kind, interval_us in self._requested_us.items():
                 if kind not in self._link.messages:
                     self._link.send(self._writer.command(self._autopilot, SET_MESSAGE_INTERVAL, kind, interval_us))
         self._update_rates(now_s)
 
     def _update_rates(self, now_s: float) -> None:
-        """Update the refused messages, and for each message the time for which it was too slow after `ready`."""
+        """Update the refusals, and the time during which the rate of each message was too low after `ready`."""
         elapsed_s, self._rates_s = now_s - self._rates_s, now_s
         for kind, rate in self._link.messages.items():
             if rate.result not in (None, ACCEPTED, *RETRY_RESULTS):
-                self._refused[kind] = rate.result
-            elif self.ready and kind in self._slow_s and rate.hz * self._requested[kind] < _MIN_FRACTION * 1e6:
+                self._refusals[kind] = rate.result
+            elif self.ready and kind in self._slow_s and rate.hz * self._requested_us[kind] < _MIN_FRACTION * 1e6:
                 self._slow_s[kind] += elapsed_s
 
     def end(self) -> Mapping[str, Any]:
@@ -169,7 +170,7 @@ class FlightRecorder:
             "crc32": self._checksum,
             "left_out": self._dropped_frames + self._link.dropped_frames,
             "ended_us": time.time_ns() // 1000,
-            "refused": {str(kind): result for kind, result in self._refused.items()},
+            "refused": {str(kind): result for kind, result in self._refusals.items()},
             "slow_s": {str(kind): round(slow_s, 3) for kind, slow_s in self._slow_s.items()},
         }
 

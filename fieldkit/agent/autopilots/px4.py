@@ -37,13 +37,13 @@ _SUB = {
 
 
 class Px4:
-    """Dialect of PX4. It also takes off by set-points, and holds its position without them (COM_OF_LOSS_T)."""
+    """Dialect of PX4. PX4 takes off by set-points too, and holds its position if they are missing (COM_OF_LOSS_T)."""
 
     name = "PX4"
     guided_mode = "OFFBOARD"
     estimate_message = ESTIMATOR_STATUS
     limit_parameters: Sequence[str] = ("GF_MAX_VER_DIST", "GF_MAX_HOR_DIST", "RTL_RETURN_ALT")
-    checks_present_mode = True
+    checks_current_mode = True
 
     def matches(self, autopilot: int, vehicle: int) -> bool:  # noqa: ARG002 (all vehicles have the same modes)
         """Return True if the autopilot is PX4, on any vehicle."""
@@ -54,7 +54,7 @@ class Px4:
         return _mode_parts(mode)[0] == _OFFBOARD
 
     def is_program_controlled(self, mode: int) -> bool:
-        """Return True in OFFBOARD and in AUTO modes for programs. AUTO.LOITER begins after each take-off and move."""
+        """Return True in OFFBOARD and in AUTO modes for programs; AUTO.LOITER follows each take-off and each move."""
         main, sub = _mode_parts(mode)
         return main == _OFFBOARD or (main == _AUTO and sub in (_TAKEOFF, _LOITER, _MISSION))
 

@@ -44,7 +44,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
     """Drive until the robot is back at its origin, a limit stops it, or `stop_event` is set.
 
     Args:
-        middleware: The middleware, which is started.
+        middleware: The started middleware.
         arguments: `command` and `odometry`, the topics; `task`, the `DriveTask`; `orders`, the file that the laptop
             writes; `status`, the file with the progress, which the laptop reads; `stationary`, a file that is
             created when the robot is stationary at the end (optional); `cdr`, True if messages are encoded in CDR as
@@ -162,7 +162,7 @@ def _stop_robot(
         if standstill.stationary and not is_confirmed:
             is_confirmed = True
             if stationary_file:
-                with suppress(OSError):  # zero Twists must also be published if the disk is full
+                with suppress(OSError):  # zero Twists must be published even if the disk is full
                     Path(stationary_file).touch()
         elapsed_s = time.monotonic() - start_s
         if elapsed_s >= _MAX_STOP_S or (is_confirmed and elapsed_s >= _MIN_STOP_S):
@@ -171,9 +171,9 @@ def _stop_robot(
 
 
 def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, status: Path, ended: str = "") -> None:
-    """Write the state of the drive to the status file for the laptop, and during the path also to the log.
+    """Write the state of the drive to the status file for the laptop, and to the log while the robot is on its path.
 
-    The status contains in addition: `pose` in the frame of the odometry; `frame_id`; `ready`, whether the robot is
+    The status also contains `pose` in the frame of the odometry; `frame_id`; `ready`, whether the robot is
     stationary and may start; `refused`, whether it did not start because it is not at the required place.
     """
     relative_pose, pose = driver.relative_pose, driver.pose
@@ -181,7 +181,7 @@ def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, statu
         return  # its origin is not known yet
     line = {
         "utc_ns": time.time_ns(),
-        "at_s": round(driver.lasted_s, 3),
+        "at_s": round(driver.elapsed_s, 3),
         "phase": driver.phase,
         "x_m": round(relative_pose.x_m, 4),
         "y_m": round(relative_pose.y_m, 4),
@@ -196,12 +196,12 @@ def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, statu
         lines.end(line)
     elif driver.phase not in ("waits", "returns"):
         lines.write(line)
-    extra = {
+    status_fields = {
         "pose": [round(value, 6) for value in pose],
         "frame_id": boot_id(),
         "ready": driver.ready,
         "refused": driver.refused,
     }
     new_status = status.with_name(status.name + ".new")
-    new_status.write_text(json.dumps({**line, **extra}) + "\n", encoding="ascii")
+    new_status.write_text(json.dumps({**line, **status_fields}) + "\n", encoding="ascii")
     new_status.replace(status)

@@ -16,7 +16,8 @@ ORDERS = (WAIT, OUT, BACK, END)
 START_M = 0.3
 START_RAD = 0.3
 """Maximum distance and angle between a robot and its origin at a start: larger than the error after a drive back
-(`ARRIVAL_TOLERANCE_M`, `HEADING_TOLERANCE_RAD`, and braking), smaller than if a person has moved the robot."""
+(`ARRIVAL_TOLERANCE_M`, `HEADING_TOLERANCE_RAD`, and braking), smaller than the distance if a person has moved the
+robot."""
 OFF_PATH_M = 1.0
 """A robot that is farther from its path than this does not drive back to its origin automatically."""
 GAP_S = 0.5
@@ -37,7 +38,7 @@ class DriveTask:
     """The path of a robot, and its limits. The robot stops if a limit is exceeded.
 
     Attributes:
-        legs: Distances ahead and to the left per leg, by the heading at the origin, in metres.
+        legs: Distances ahead and to the left per leg, relative to the heading at the origin, in metres.
         speed_m_s: Its speed.
         turn_rad_s: Maximum turn rate.
         acceleration_m_s2: Maximum acceleration.
@@ -45,7 +46,7 @@ class DriveTask:
         lease_s: Maximum time without an order of the laptop.
         odometry_s: Maximum time without odometry.
         limit_s: Maximum time for the path in one direction.
-        origin: Its origin in the frame of its odometry: x and y in m, heading in rad; None for its present pose.
+        origin: Its origin in the frame of its odometry: x and y in m, heading in rad; None for its current pose.
         last: Pose at the end of its last motion, in the format of `origin`; None if unknown.
         frame_id: The boot ID of its computer when the origin was recorded; empty without an origin.
         may_return: Whether it may first drive back to its origin along its path.

@@ -1,9 +1,9 @@
-"""Steer a ground robot along straight legs by its odometry, within limits for all inputs.
+"""Steer a ground robot along straight legs by its odometry, and stop it if a limit is exceeded.
 
-`Driver` has no side effects and uses no clock, middleware or file: its inputs are poses, orders of the laptop and
-times, its output is a velocity. It follows straight lines: the desired heading leads back to the leg within
-`_LOOKAHEAD_M` (Coulter, Implementation of the Pure Pursuit Path Tracking Algorithm, CMU-RI-TR-92-01, with a straight
-path), and before the end of a leg the speed is limited so that half of the acceleration suffices to stop there.
+`Driver` has no side effects and uses no clock, middleware or file. Its inputs are poses, orders of the laptop and
+times; its output is a velocity. The desired heading leads the robot back to the leg within `_LOOKAHEAD_M` (Coulter,
+Implementation of the Pure Pursuit Path Tracking Algorithm, CMU-RI-TR-92-01, for a straight path). Near the end of a
+leg, the speed is limited so that half of the maximum acceleration suffices to stop there.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _LOOKAHEAD_M = 0.5
 _MIN_SPEED_M_S = 0.03
 """Minimum speed at which the motors of a robot turn."""
 _MAX_JUMP_M = 0.5
-"""A larger change between two poses, beyond the possible motion, is an error of the odometry."""
+"""A distance between two poses that exceeds the possible motion by more than this is an error of the odometry."""
 _STILL_M, _STILL_RAD, _STILL_S = 0.05, 0.05, 0.4
 """A robot whose odometry changes by less than this distance and angle during this time is stationary."""
 _WAITS, _RETURNS = "waits", "returns"
@@ -67,14 +67,14 @@ class Driver:
 
     Args:
         task: The path and its limits.
-        now_s: Start time by a monotonic clock; all times that its methods receive are by the same clock.
+        now_s: Start time by a monotonic clock; all times that are passed to its methods are by the same clock.
 
     Attributes:
-        stop_reason: The reason of an early stop; empty before a stop.
-        phase: `waits` until it is stationary and ordered to start; `returns` while it drives to its origin first;
-            then `out`, `there`, `back`, `home`.
+        stop_reason: The reason for an early stop; empty before a stop.
+        phase: `waits` until the robot is stationary and ordered to start; `returns` while it first drives to its
+            origin; then `out`, `there`, `back`, `home`.
         driven_m: Distance since the start of `out`.
-        refused: Whether it stopped because it is not at the required place for a start.
+        refused: Whether the robot did not start because it is not at the required place.
     """
 
     def __init__(self, task: DriveTask, now_s: float) -> None:
@@ -104,17 +104,17 @@ class Driver:
 
     @property
     def relative_pose(self) -> OdometryPose | None:
-        """Its pose relative to its origin; None before the first odometry."""
+        """The robot's pose relative to its origin; None before the first odometry."""
         return None if self._start is None or self._pose is None else _relative_pose(self._start, self._pose)
 
     @property
     def pose(self) -> OdometryPose | None:
-        """Its pose in the frame of its odometry; None before the first odometry."""
+        """The robot's pose in the frame of its odometry; None before the first odometry."""
         return self._pose
 
     @property
     def ready(self) -> bool:
-        """Whether it is stationary at a place where it may start."""
+        """Whether the robot is stationary at a place where it may start."""
         return self._start is not None and self._pose is not None and not self.is_finished and self._is_still
 
     @property
@@ -122,8 +122,8 @@ class Driver:
         return self._odometry_s - self._reference_s >= _STILL_S
 
     @property
-    def lasted_s(self) -> float:
-        """Time from its creation to the last call of `tick`."""
+    def elapsed_s(self) -> float:
+        """Time from the creation of this object to the last call of `tick`."""
         return self._now_s - self._created_s
 
     @property
@@ -133,7 +133,7 @@ class Driver:
 
     @property
     def remaining_m(self) -> float:
-        """Distance to the end of the present path: the origin when it drives back, else the last corner."""
+        """Distance to the end of the current path: the origin when the robot drives back, else the last corner."""
         relative_pose, goal = self.relative_pose, self._corners[0 if self.phase in ("back", "home") else -1]
         return (
             math.inf
@@ -160,7 +160,7 @@ class Driver:
         self._stop(reason)
 
     def _check_start(self, now_s: float, pose: OdometryPose) -> None:
-        """Check that the robot is stationary, and at the required place; the first such pose is its origin."""
+        """Check that the robot is stationary and at the required place; the first such pose is its origin."""
         reference = self._reference
         if (
             reference is None
@@ -175,21 +175,21 @@ class Driver:
             self._start = pose  # the laptop records it
         relative_pose, last = self.relative_pose, task.last
         assert relative_pose is not None
-        distance_m, error_rad = math.hypot(relative_pose.x_m, relative_pose.y_m), abs(relative_pose.yaw_rad)
+        distance_m, angle_rad = math.hypot(relative_pose.x_m, relative_pose.y_m), abs(relative_pose.yaw_rad)
         if last is not None and (
             math.dist(pose[:2], last[:2]) > START_M or abs(wrap_angle(pose.yaw_rad - last[2])) > START_RAD
         ):
             self.refuse(
                 f"its odometry is {math.dist(pose[:2], last[:2]):.2f} m and "
-                f"{abs(wrap_angle(pose.yaw_rad - last[2])):.2f} rad from where its last motion ended"
+                f"{abs(wrap_angle(pose.yaw_rad - last[2])):.2f} rad from the end of its last motion"
             )
         elif distance_m > task.fence_m:
-            self.refuse(f"it is {distance_m:.2f} m from its place, outside its fence of {task.fence_m:g} m")
-        elif distance_m > START_M or error_rad > START_RAD:
+            self.refuse(f"it is {distance_m:.2f} m from its origin, outside its fence of {task.fence_m:g} m")
+        elif distance_m > START_M or angle_rad > START_RAD:
             if not task.may_return:
-                self.refuse(f"it is {distance_m:.2f} m and {error_rad:.2f} rad from its place")
+                self.refuse(f"it is {distance_m:.2f} m and {angle_rad:.2f} rad from its origin")
             elif self._path_home(relative_pose) is None:
-                self.refuse(f"it is {distance_m:.2f} m from its place, and more than {OFF_PATH_M:g} m off its path")
+                self.refuse(f"it is {distance_m:.2f} m from its origin, and more than {OFF_PATH_M:g} m off its path")
 
     def _path_home(self, relative_pose: OdometryPose) -> list[tuple[float, float]] | None:
         """Return the corners of the path back to the origin, or None if the robot is off its path."""
@@ -200,7 +200,7 @@ class Driver:
         return None if nearest_m > OFF_PATH_M else [relative_pose[:2], *reversed(self._corners[: leg_number + 1])]
 
     def _start_driving(self, now_s: float) -> None:
-        """Start to drive out, or first back to the origin if the robot is not there."""
+        """Start to drive out. If the robot is not at its origin, start to drive back to it first."""
         relative_pose = self.relative_pose
         assert relative_pose is not None
         path = self._path_home(relative_pose)
@@ -214,10 +214,10 @@ class Driver:
             ]
             self.phase, self._phase_s = _RETURNS, now_s
         else:
-            self._go_out(now_s)
+            self._drive_out(now_s)
         self._progress_position = (relative_pose.x_m, relative_pose.y_m)
 
-    def _go_out(self, now_s: float) -> None:
+    def _drive_out(self, now_s: float) -> None:
         self._legs = [*zip(self._corners, self._corners[1:])]
         self.phase, self._phase_s, self.driven_m, self._turning = OUT, now_s, 0.0, True
 
@@ -234,7 +234,7 @@ class Driver:
             self._start_driving(now_s)
 
     def tick(self, now_s: float) -> DriveVelocity:
-        """Return the velocity from now on; must be called periodically."""
+        """Return the velocity to command from now on; must be called periodically."""
         elapsed_s, self._now_s = max(now_s - self._now_s, 0.0), now_s
         self._check_limits(now_s, elapsed_s)
         relative_pose = self.relative_pose
@@ -263,7 +263,7 @@ class Driver:
             and self.phase != _WAITS
             and math.hypot(relative_pose.x_m, relative_pose.y_m) > task.fence_m
         ):
-            self._stop(f"beyond the fence, {task.fence_m:g} m from its place")
+            self._stop(f"beyond the fence, {task.fence_m:g} m from its origin")
         elif self._order and self.phase in (_RETURNS, OUT, BACK) and now_s - self._phase_s > task.limit_s:
             self._stop(f"the path was not finished in {task.limit_s:g} s")
         elif relative_pose is not None and not self._makes_progress(relative_pose, elapsed_s):
@@ -289,16 +289,16 @@ class Driver:
         self.stop_reason = self.stop_reason or reason
 
     def _turn_back(self, now_s: float) -> None:
-        """Start to drive back along the passed corners."""
+        """Start to drive back along the corners that the robot has passed."""
         relative_pose = self.relative_pose
-        passed = self._corners[: len(self._corners) - len(self._legs)]
-        if relative_pose is None or self.phase == _WAITS:  # it has not moved
+        passed_corners = self._corners[: len(self._corners) - len(self._legs)]
+        if relative_pose is None or self.phase == _WAITS:  # the robot has not moved
             self.phase = "home"
             return
-        if self.phase == _RETURNS:  # its path leads there already
+        if self.phase == _RETURNS:  # its path already leads to the origin
             self.phase, self._phase_s = BACK, now_s
             return
-        path = [(relative_pose.x_m, relative_pose.y_m), *reversed(passed)]
+        path = [(relative_pose.x_m, relative_pose.y_m), *reversed(passed_corners)]
         self._legs = [
             (leg_start, end)
             for leg_start, end in zip(path, path[1:])
@@ -307,7 +307,7 @@ class Driver:
         self.phase, self._phase_s, self._turning = BACK, now_s, True
 
     def _desired_velocity(self, relative_pose: OdometryPose) -> DriveVelocity:
-        """Return the desired velocity, not yet limited; select the next leg if the present one is finished."""
+        """Return the desired velocity before limits are applied; at the end of a leg, select the next one."""
         if self.phase in (_WAITS, "there", "home"):
             return ZERO_VELOCITY
         while self._legs:
@@ -325,7 +325,7 @@ class Driver:
         if self.phase in (_RETURNS, BACK) and abs(wrap_angle(relative_pose.yaw_rad)) > HEADING_TOLERANCE_RAD:
             return DriveVelocity(0.0, self._turn_rad_s(wrap_angle(-relative_pose.yaw_rad)))
         if self.phase == _RETURNS:
-            self._go_out(self._now_s)
+            self._drive_out(self._now_s)
             return ZERO_VELOCITY
         self.phase = "there" if self.phase == OUT else "home"
         return ZERO_VELOCITY
@@ -366,8 +366,8 @@ def _distance_to_leg_m(
     return math.hypot(offset[0] - fraction * direction[0], offset[1] - fraction * direction[1])
 
 
-def _approach(now: float, desired: float, max_change: float) -> float:
-    return now + _clamp(desired - now, max_change)
+def _approach(current: float, desired: float, max_change: float) -> float:
+    return current + _clamp(desired - current, max_change)
 
 
 def _clamp(value: float, limit: float) -> float:

@@ -25,7 +25,7 @@ _TIMEOUT_S = 5.0
 _OPTIONAL_TIMEOUT_S = 1.5
 """Timeout for reports that only some autopilots send."""
 _ESTIMATE_TIMEOUT_S = 10.0
-"""Timeout for a position estimate: the autopilot may have been switched on just before."""
+"""Timeout for a position estimate: the autopilot may have been switched on only recently."""
 _NO_ESTIMATE = "Need Position Estimate"
 """Text of an ArduCopter whose position estimate is not ready."""
 _RESULT_DELAY_S = 0.3
@@ -51,7 +51,7 @@ _SENSORS = {
 }
 """Bits of MAV_SYS_STATUS_SENSOR for sensors that an operator can repair."""
 _PREFIXES = ("PreArm: ", "Preflight Fail: ")
-"""Prefixes of the texts with which ArduPilot and PX4 explain why they cannot be armed."""
+"""Prefixes of the texts in which ArduPilot and PX4 report why they cannot be armed."""
 
 _ATTITUDE, _HORIZONTAL, _VERTICAL, _ASSUMED = 1, 8 | 16 | 256 | 512, 32 | 64, 128
 """ESTIMATOR_STATUS_FLAGS: attitude; horizontal position, relative or absolute, present or predicted; vertical
@@ -86,7 +86,7 @@ class ArmingCheck:
         self._needs = needs
         self._start_s = time.monotonic()
         self._retry_s = 0.0
-        self._checked_s: float | None = None
+        self._checks_done_s: float | None = None
         drone.status = drone.estimate = None
         drone.texts.clear()
         drone.command_results.pop(PREARM_CHECKS, None)
@@ -94,8 +94,8 @@ class ArmingCheck:
     def request_missing(self) -> None:
         """Request the missing reports; must be called in each iteration of the loop."""
         drone, now_s = self._drone, time.monotonic()
-        if self._checked_s is None and PREARM_CHECKS in drone.command_results:
-            self._checked_s = now_s
+        if self._checks_done_s is None and PREARM_CHECKS in drone.command_results:
+            self._checks_done_s = now_s
         if now_s < self._retry_s or drone.dialect is None:
             return
         self._retry_s = now_s + _RETRY_S
@@ -104,7 +104,7 @@ class ArmingCheck:
                 drone.commands.request_stream(kind, _RATE_HZ)
         if drone.estimate is None:
             drone.commands.request_stream(drone.dialect.estimate_message, _RATE_HZ)
-        if self._checked_s is None:
+        if self._checks_done_s is None:
             drone.commands.send(PREARM_CHECKS)
         if self._needs.returns and not drone.has_home:
             drone.commands.request_once(HOME_POSITION)
@@ -120,13 +120,13 @@ class ArmingCheck:
 
     @property
     def is_starting(self) -> bool:
-        """Whether the position estimate is not ready yet; an autopilot needs about 30 s for it after power-on."""
-        warned = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
-        return self._drone.dialect is not None and (warned or any(True for _ in self._position()))
+        """Whether the position estimate is not ready yet; this takes about 30 s after power-on."""
+        reports_no_estimate = any(_NO_ESTIMATE in text for text in self._drone.texts.warnings)
+        return self._drone.dialect is not None and (reports_no_estimate or any(True for _ in self._position()))
 
     @property
     def is_complete(self) -> bool:
-        """Whether all reports were received, or the time for them has passed."""
+        """Whether all reports were received, or their timeout has expired."""
         drone, elapsed_s = self._drone, time.monotonic() - self._start_s
         if drone.dialect is None or elapsed_s > _TIMEOUT_S:
             return True
@@ -134,9 +134,13 @@ class ArmingCheck:
             return False
         if elapsed_s > _OPTIONAL_TIMEOUT_S:
             return True
-        home = drone.has_home or not self._needs.returns
-        checked = self._checked_s is not None and drone.status.received_s > self._checked_s + _RESULT_DELAY_S
-        return checked and home and drone.estimate is not None and not self._missing_parameters()
+        has_required_home = drone.has_home or not self._needs.returns
+        has_check_result = (
+            self._checks_done_s is not None and drone.status.received_s > self._checks_done_s + _RESULT_DELAY_S
+        )
+        return (
+            has_check_result and has_required_home and drone.estimate is not None and not self._missing_parameters()
+        )
 
     def faults(self) -> Iterator[ArmingFault]:
         """Yield the faults that were detected."""
@@ -164,9 +168,9 @@ class ArmingCheck:
             flags & _ATTITUDE and flags & _HORIZONTAL and flags & _VERTICAL and not flags & _ASSUMED
         ):
             what = f"its position estimate is not valid (flags {flags:#x})"
-            yield ArmingFault(what, "wait for its GPS, camera or flow sensor; do not move it meanwhile")
+            yield ArmingFault(what, "wait for its GPS, camera or flow sensor; do not move the drone meanwhile")
         if self._needs.returns and not drone.has_home:
-            what = "it has no home position, but must return there if the trial is aborted"
+            what = "it has no home position, but it must return home if the trial is aborted"
             yield ArmingFault(what, "wait for its GPS, or write on_abort: land in the procedure")
 
     def _battery(self) -> Iterator[ArmingFault]:
@@ -174,7 +178,7 @@ class ArmingCheck:
         if status is None:
             yield ArmingFault("it does not report its status (SYS_STATUS)", "check which messages its link forwards")
         elif status.charge is not None and status.charge < minimum:
-            what = f"its battery has {status.charge:.0%}, and {minimum:.0%} is the minimum"
+            what = f"its battery charge is {status.charge:.0%}, but the minimum is {minimum:.0%}"
             yield ArmingFault(
                 what, "charge or replace the battery; mavlink.least_charge in its profile sets the minimum"
             )
@@ -193,21 +197,21 @@ class ArmingCheck:
             or drone.texts.warnings
             or [name for bit, name in _SENSORS.items() if unhealthy & bit]
         )
-        what = f"{drone.dialect.name} refuses to be armed: {', '.join(reasons) or 'it gives no reason'}"
-        remedy = "remove the cause; a ground station (QGroundControl, MAVProxy) shows the same"
-        yield ArmingFault(what, remedy, prevents_flight=drone.guided or not drone.dialect.checks_present_mode)
+        what = f"{drone.dialect.name} refuses to arm: {', '.join(reasons) or 'it reports no reason'}"
+        remedy = "remove the cause; a ground station (QGroundControl, MAVProxy) shows the same messages"
+        yield ArmingFault(what, remedy, prevents_flight=drone.guided or not drone.dialect.checks_current_mode)
 
     def _limits(self) -> Iterator[ArmingFault]:
         drone, needs = self._drone, self._needs
         assert drone.dialect is not None
         limits = drone.dialect.limits(drone.parameters)
-        for limit_m, needed_m, what in (
-            (limits.height_m, needs.highest_m, "high"),
-            (limits.radius_m, needs.farthest_m, "far from home"),
+        for limit_m, needed_m, direction in (
+            (limits.height_m, needs.highest_m, "above home"),
+            (limits.radius_m, needs.farthest_m, "from home"),
         ):
             if limit_m is not None and needed_m > limit_m:
                 yield ArmingFault(
-                    f"the fence of its autopilot ends {limit_m:g} m {what}, but the flight needs {needed_m:g} m",
+                    f"the fence of its autopilot ends {limit_m:g} m {direction}, but the flight needs {needed_m:g} m",
                     "shorten the flight in the procedure, or widen the fence: "
                     + ", ".join(drone.dialect.limit_parameters),
                 )
@@ -244,6 +248,6 @@ def check_arming(connection: str, needs: FlightNeeds, stop_event: threading.Even
         json.dumps({"what": fault.what, "remedy": fault.remedy, "grave": fault.prevents_flight})
         for fault in check.faults()
     ]
-    reported = {"autopilot": dialect.name if dialect else "", "charge": status.charge if status else None}
-    sys.stdout.write("\n".join([*lines, json.dumps(reported), ""]))
+    summary = {"autopilot": dialect.name if dialect else "", "charge": status.charge if status else None}
+    sys.stdout.write("\n".join([*lines, json.dumps(summary), ""]))
     return 0

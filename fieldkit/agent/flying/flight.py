@@ -86,7 +86,10 @@ class OffboardPilot:
             self._loop.session.close()
 
     def _abort_flight(self, error: Exception) -> None:
-        """Land the drone after an error unless another party flies it; raises as `bring_down`, and logs an alarm."""
+        """Land the drone after an error unless another party flies it; log an alarm if it does not land.
+
+        Raises the errors of `bring_down`.
+        """
         drone = self._drone
         if isinstance(error, FlightError) and error.code == TAKEN_OVER:
             if drone.armed or not drone.alive:
@@ -152,7 +155,7 @@ class OffboardPilot:
         latitude, longitude = drone.latitude_longitude or (None, None)
         if drone.yaw_rad is None:
             raise FlightError(REFUSED, "it does not report its heading (ATTITUDE)")
-        frame = frame_id(boot_id(), drone.booted_s)
+        frame = frame_id(boot_id(), drone.boot_time_s)
         start = FlightOrigin(FRAME, frame, start_m[0], start_m[1], drone.yaw_rad, latitude, longitude)
         try:
             return resolve_origin(FlightOrigin.from_values(self._plan.origin) if self._plan.origin else None, start)
@@ -164,18 +167,18 @@ class OffboardPilot:
         """Arm the drone if its checks pass, rise vertically, then fly to the first point of the path."""
         loop, drone, start_s = self._loop, self._drone, time.monotonic()
         commands = dialect.take_off_commands(self._plan.height_m, self._plan.climb_m_s)
-        hold_start = None if commands else lambda: start_m
-        if hold_start is not None:
-            loop.run_until(lambda: time.monotonic() - start_s > _SET_POINTS_S, set_point=hold_start)
+        start_set_point = None if commands else lambda: start_m
+        if start_set_point is not None:
+            loop.run_until(lambda: time.monotonic() - start_s > _SET_POINTS_S, set_point=start_set_point)
         loop.command_until(
             lambda: drone.commands.send(*dialect.guided_command()),
             lambda: drone.guided,
             f"the mode {dialect.guided_mode}",
-            hold_start,
+            start_set_point,
         )
         loop.state = FLYING
-        self._require_armable(hold_start)
-        loop.command_until(lambda: drone.commands.send(ARM, 1), lambda: drone.armed, "to arm", hold_start)
+        self._require_armable(start_set_point)
+        loop.command_until(lambda: drone.commands.send(ARM, 1), lambda: drone.armed, "to arm", start_set_point)
         loop.has_armed = True
         self._start_phase("climbing")
         if commands:
@@ -188,14 +191,14 @@ class OffboardPilot:
         self._start_phase("up")
         loop.run_until(lambda: loop.orders.order in (GO, HOME), set_point=lambda: top_m)
 
-    def _require_armable(self, hold_start: Callable[[], Position] | None) -> None:
+    def _require_armable(self, start_set_point: Callable[[], Position] | None) -> None:
         """Run the arming checks.
 
         Raises:
             FlightError: The drone cannot be armed; the message contains reasons and remedies.
         """
         check = ArmingCheck(self._drone, self._plan.needs)
-        for _ in self._loop.iterate(hold_start):
+        for _ in self._loop.iterate(start_set_point):
             check.request_missing()
             if check.is_complete:
                 break
@@ -246,10 +249,10 @@ class OffboardPilot:
     def _fly_to_origin(self, origin: FlightOrigin) -> None:
         """Fly to the point above the origin."""
         drone = self._drone
-        assert drone.last_position_m is not None, "it has risen"
-        here_m = drone.last_position_m
-        above_m, start_s = origin.position_at(0.0, 0.0, here_m[2]), time.monotonic()
-        path_m = [here_m, above_m]
+        assert drone.last_position_m is not None, "the drone has taken off"
+        position_m = drone.last_position_m
+        above_m, start_s = origin.position_at(0.0, 0.0, position_m[2]), time.monotonic()
+        path_m = [position_m, above_m]
         self._start_phase("coming back")
         self._loop.run_until(
             lambda: _is_near(drone.position_m, above_m) and drone.speed_m_s < _SLOW_M_S,

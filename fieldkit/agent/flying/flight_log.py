@@ -29,14 +29,14 @@ class FlightLog:
         self._ground_m = self._start_s = 0.0
         if path:
             with suppress(OSError):  # the laptop detects the missing file
-                self._lines = NumberedLines(open(path, "w", encoding="ascii"))  # noqa: SIM115, PTH123 (for the flight)
+                self._lines = NumberedLines(open(path, "w", encoding="ascii"))  # noqa: SIM115, PTH123 (closed by `end`)
 
     def begin(self, origin: FlightOrigin, ground_m: float) -> None:
-        """Set the reference of all lines, and write the origin.
+        """Set the origin of all positions, and write it.
 
         Args:
             origin: The origin.
-            ground_m: Position of the ground, down, in LOCAL_POSITION_NED.
+            ground_m: Down coordinate of the ground in LOCAL_POSITION_NED.
         """
         self._origin, self._ground_m, self._start_s = origin, ground_m, time.monotonic()
         self._write({"utc_ns": time.time_ns(), "origin": asdict(origin)})

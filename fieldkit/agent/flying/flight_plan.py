@@ -9,7 +9,7 @@ from typing import Any, Mapping, Sequence
 from fieldkit.agent.flying.origin import FlightOrigin, Position
 
 STAY, CLIMB, GO, HOME, LEAVE = "stay", "climb", "go", "home", "leave"
-"""Orders: wait, rise to the height, fly the path, land, and stop the program without a command to the drone."""
+"""Orders: wait, climb to the height, fly the path, land, and stop the program without a command to the drone."""
 
 
 MISPLACED = "misplaced"
@@ -18,7 +18,7 @@ MISPLACED = "misplaced"
 
 @dataclass(frozen=True)
 class FlightNeeds:
-    """Requirements of a flight on an autopilot.
+    """Requirements of a flight that an autopilot must meet.
 
     Attributes:
         highest_m: Maximum height of the flight above the ground at its start.
@@ -46,9 +46,9 @@ class FlightPlan:
         lease_s: Timeout for the first order.
         guards: Whether the program guards the drone instead of flying it.
         rescues: Whether the program only lands the drone, because neither its pilot nor its guard runs.
-        end: End of the flight: `land` at the present position, or `return` at the present height and land there.
+        end: End of the flight: `land` at the current position, or `return` to the origin and land.
         height_m: Height of the take-off.
-        legs: The path after the take-off: metres ahead, to the left and up per leg, by the heading of the origin.
+        legs: The path after the take-off: metres ahead, to the left and up per leg, relative to the origin's heading.
         speed_m_s: Speed along the path.
         climb_m_s: Speed of the take-off.
         ceiling_m: Maximum height above the ground at the start.
@@ -81,7 +81,7 @@ class FlightPlan:
 
     @property
     def needs(self) -> FlightNeeds:
-        """Requirements of the flight on an autopilot."""
+        """Requirements of the flight that an autopilot must meet."""
         corners_m = self.corners_m(FlightOrigin("", "", 0.0, 0.0, 0.0), 0.0)
         return FlightNeeds(
             highest_m=max(-down_m for _, _, down_m in corners_m),
@@ -96,7 +96,7 @@ class FlightPlan:
 
         Args:
             origin: The origin, in the frame of this flight.
-            ground_m: Position of the ground, down.
+            ground_m: Down coordinate of the ground.
         """
         ahead_m, left_m, down_m = 0.0, 0.0, ground_m - self.height_m
         corners_m = [origin.position_at(ahead_m, left_m, down_m)]

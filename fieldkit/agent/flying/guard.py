@@ -91,9 +91,7 @@ class FlightGuard:
                 raise FlightError(CANCELLED, "the job was cancelled")
             self._orders.poll()
             if self._orders.expired:
-                raise FlightError(
-                    LEASE_EXPIRED, "the order was not renewed in time: the laptop does not answer any more"
-                )
+                raise FlightError(LEASE_EXPIRED, "the order was not renewed in time: the laptop no longer answers")
             self._require_pilot()
             if self._first_mode != self._drone.mode:
                 self._first_mode = None
@@ -122,7 +120,7 @@ class FlightGuard:
         return is_program or drone.mode == self._first_mode
 
     def _abort_flight(self, error: FlightError) -> None:
-        """Land the drone if the guard may control it; raises as `bring_down`, with an alarm in the log."""
+        """Land the drone if the guard may control it. Raises the errors of `bring_down` after an alarm in the log."""
         drone = self._drone
         if not drone.armed or not (self._pilot_flies if self._liveness is not None else self._may_command()):
             return

@@ -17,8 +17,8 @@ from fieldkit.agent.autopilots.px4 import Px4
 from fieldkit.agent.flying.session import AutopilotSession
 
 LEASE_EXPIRED, REFUSED, TAKEN_OVER, CANCELLED, PEER_STOPPED, FENCE_BREACHED = 4, 5, 6, 7, 8, 9
-"""Exit codes: the lease expired; the autopilot refused a command or was silent; another party flies the drone; the
-job was cancelled; the other program of the flight stopped; the drone was beyond its fence."""
+"""Exit codes: the lease expired; the autopilot refused a command or did not answer; another party flies the drone;
+the job was cancelled; the other program of the flight stopped; the drone was outside its fence."""
 
 RETRY_S = 0.4
 """Retry interval of a command without an answer."""
@@ -29,7 +29,7 @@ _MODE_WAIT_S = 0.3
 """Maximum wait for a heartbeat before the first command, because the last one may be older than a takeover by a
 person."""
 _LANDING_TIMEOUT_S = 600.0
-"""Time for which a drone whose motors turn is commanded to come down."""
+"""Maximum time between the first command to come down and the stop of the motors."""
 NO_HEARTBEAT_S = 60.0
 """Time for which commands are sent although no heartbeat arrives, because a lost connection may be restored."""
 
@@ -71,20 +71,20 @@ def bring_down(
         FlightError: Another party flies the drone (`TAKEN_OVER`), no heartbeat was received for `NO_HEARTBEAT_S`, or
             its motors still turn after `_LANDING_TIMEOUT_S`.
     """
-    drone, retry_s, start_s, warned = session.drone, 0.0, time.monotonic(), False
+    drone, retry_s, start_s, has_warned = session.drone, 0.0, time.monotonic(), False
     command = (drone.dialect or Px4()).bring_down_command(how)  # other families accept the commands of PX4
-    number = int(command[0])
-    drone.command_results.pop(number, None)
+    command_id = int(command[0])
+    drone.command_results.pop(command_id, None)
     _wait_for_mode(session, each_iteration)
     while drone.armed:
         now_s = time.monotonic()
         if now_s > start_s + _LANDING_TIMEOUT_S:
-            raise FlightError(REFUSED, f"the autopilot reports that its motors turn; it was commanded to {how}")
+            raise FlightError(REFUSED, f"its motors still turn, although it was commanded to {how}")
         if min(drone.heartbeat_age_s, now_s - start_s) > NO_HEARTBEAT_S:
             raise FlightError(REFUSED, f"no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s")
-        if not drone.alive and not warned:
+        if not drone.alive and not has_warned:
             log_line(alarm(drone))
-        warned = not drone.alive
+        has_warned = not drone.alive
         if may_command():
             if how == "return" and drone.alive and now_s > start_s + COMMAND_TIMEOUT_S:
                 log_line(f"land: it does not return ({status_text(drone)})")
@@ -93,12 +93,13 @@ def bring_down(
             if now_s > retry_s:
                 retry_s = now_s + RETRY_S
                 drone.commands.send(*command)
-                if drone.command_results.get(number, ACCEPTED) != ACCEPTED:
-                    drone.commands.send(ARM, 0)  # refused in the air; on the ground it may refuse to land
+                if drone.command_results.get(command_id, ACCEPTED) != ACCEPTED:
+                    # An autopilot may refuse to land on the ground. It refuses to disarm in the air.
+                    drone.commands.send(ARM, 0)
         elif not drone.lands_or_returns and (
-            drone.dialect is not None or drone.command_results.get(number) != ACCEPTED
+            drone.dialect is not None or drone.command_results.get(command_id) != ACCEPTED
         ):
-            raise FlightError(TAKEN_OVER, f"another party flies it, nothing more is sent ({status_text(drone)})")
+            raise FlightError(TAKEN_OVER, f"another party flies it, so nothing more is sent ({status_text(drone)})")
         each_iteration()
         session.exchange(_POLL_S)
 
@@ -113,7 +114,7 @@ def _wait_for_mode(session: AutopilotSession, each_iteration: Callable[[], None]
 
 
 def alarm(drone: AutopilotState) -> str:
-    """Return the alarm text for a flight that ended without a landing: last known state, and manual action."""
+    """Return the alarm text for a flight that ended without a landing, with the last known state and what to do."""
     position_text = "ITS POSITION IS UNKNOWN"
     if drone.last_position_m is not None:
         north_m, east_m, down_m = drone.last_position_m

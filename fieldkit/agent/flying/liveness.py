@@ -17,10 +17,10 @@ from typing import NamedTuple
 PILOT, GUARD = 0, 1
 """Indices of the entries."""
 IDLE, FLYING, LANDING, ENDED = 0, 1, 2, 3
-"""State of a program: it waits, flies the drone, lands it, or has ended."""
+"""State of a program: it waits, flies the drone, lands it, or exits."""
 
 SILENCE_TIMEOUT_S = 0.8
-"""A program whose counter does not change for this time has stopped."""
+"""A program whose counter does not change for this time is considered stopped."""
 _MAX_POLL_S = 0.2
 """Maximum time that one poll adds to the silence, because delays of the polling program must not count."""
 _ENTRY = struct.Struct("<QQQQ")
@@ -36,13 +36,13 @@ class LifeEntry(NamedTuple):
 
     Attributes:
         pid: Its process id.
-        started: Start time of the process, in clock ticks since boot.
+        start_ticks: Start time of the process, in clock ticks since boot.
         iterations: Counter of its iterations.
         state: Its state: `IDLE`, `FLYING`, `LANDING` or `ENDED`.
     """
 
     pid: int
-    started: int
+    start_ticks: int
     iterations: int
     state: int
 
@@ -98,22 +98,22 @@ class LivenessFile:
         Returns:
             The reason why it does not run, for example `has ended`; empty while it runs.
         """
-        pid, started, count, _ = self._other_entry()
+        pid, start_ticks, count, _ = self._other_entry()
         now_s = time.monotonic()
-        passed_s, self._polled_s = min(now_s - self._polled_s, _MAX_POLL_S), now_s
-        self._silent_s = self._silent_s + passed_s if count == self._other_count else 0.0
+        elapsed_s, self._polled_s = min(now_s - self._polled_s, _MAX_POLL_S), now_s
+        self._silent_s = self._silent_s + elapsed_s if count == self._other_count else 0.0
         self._other_count = count
-        state, other_started = _process_state(pid)
-        if not pid or other_started != started or state in _ENDED_STATES:
+        state, other_start_ticks = _process_state(pid)
+        if not pid or other_start_ticks != start_ticks or state in _ENDED_STATES:
             return "has ended"
         if state in _SUSPENDED_STATES:
             return "is suspended"
         return f"has not run for {self._silent_s:.1f} s" if self._silent_s > SILENCE_TIMEOUT_S else ""
 
     def kill_other(self) -> None:
-        """Kill the other program, so that it cannot continue later; never another process that reuses its pid."""
-        pid, started, *_ = self._other_entry()
-        if pid and _process_state(pid)[1] == started:
+        """Kill the other program, so that it cannot continue later. A process that reuses its pid is not killed."""
+        pid, start_ticks, *_ = self._other_entry()
+        if pid and _process_state(pid)[1] == start_ticks:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
 

@@ -1,4 +1,4 @@
-"""The control loop of a pilot: ten iterations per second, each of which checks whether the flight may continue."""
+"""The control loop of a pilot. It runs ten times per second and checks each time whether the flight may continue."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from fieldkit.agent.orders import Orders
 RATE_HZ = 10.0
 """Rate of iterations, of set-points, and of the requested reports."""
 GAP_S = 1.0
-"""Maximum time between two iterations. After a longer gap, as by SIGSTOP, the flight is aborted."""
+"""Maximum time between two iterations. After a longer gap, for example after SIGSTOP, the flight is aborted."""
 HEARTBEAT_S = 6.0
 """Timeout for the first heartbeat of the autopilot."""
 
@@ -118,9 +118,7 @@ class FlightLoop:
                 raise FlightError(CANCELLED, "the job was cancelled")
             self.orders.poll()
             if self.orders.expired:
-                raise FlightError(
-                    LEASE_EXPIRED, "the order was not renewed in time: the laptop does not answer any more"
-                )
+                raise FlightError(LEASE_EXPIRED, "the order was not renewed in time: the laptop no longer answers")
             self._require_guard()
             self._require_control()
             if set_point is not None:

@@ -1,8 +1,8 @@
 """The origin of a trial's flights, which is the position and heading of the first start, and the fence around it.
 
-All directions and distances of a plan are relative to the origin, so that each repeat flies the same path for any
-initial heading of the drone. The origin is a position in LOCAL_POSITION_NED, whose frame is valid until the autopilot
-reboots. Latitude and longitude, if known, give its position in the frame of a later start.
+All directions and distances of a plan are relative to the origin, so that each repeat flies the same path, regardless
+of the drone's initial heading. The origin is a position in LOCAL_POSITION_NED, whose frame is valid until the
+autopilot reboots. Latitude and longitude, if known, give its position in the frame of a later start.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ FENCE_MARGIN_M = 2.0
 _METRES_PER_DEGREE = 111_318.84502145034
 """Metres per degree of latitude (ArduPilot, AP_Common/Location.h, LOCATION_SCALING_FACTOR)."""
 _SAME_BOOT_S = 10.0
-"""Maximum difference between two estimates of one boot time: the autopilot's clock drifts against the computer's."""
+"""Maximum difference between two estimates of one boot time, because the clocks of autopilot and computer drift."""
 
 
 class OriginError(Exception):
@@ -58,7 +58,7 @@ class FlightOrigin:
         return cls(**{name: values.get(name) for name in cls.__dataclass_fields__})  # type: ignore[arg-type]
 
     def position_at(self, ahead_m: float, left_m: float, down_m: float) -> Position:
-        """Return the position of a point given relative to the origin; `down_m` is absolute."""
+        """Return the position of a point. `ahead_m` and `left_m` are relative to the origin; `down_m` is absolute."""
         cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
         north_m, east_m = self.x_m + ahead_m * cos + left_m * sin, self.y_m + ahead_m * sin - left_m * cos
         return north_m, east_m, down_m
@@ -74,24 +74,24 @@ class FlightOrigin:
         return math.hypot(position_m[0] - self.x_m, position_m[1] - self.y_m)
 
 
-def frame_id(computer: str, booted_s: float) -> str:
+def frame_id(computer: str, boot_time_s: float) -> str:
     """Return the identifier of an autopilot's local frame, which is valid until the autopilot reboots.
 
     Args:
         computer: Boot ID of the drone's computer.
-        booted_s: Boot time of the autopilot by CLOCK_BOOTTIME of the computer, in seconds.
+        boot_time_s: Boot time of the autopilot by CLOCK_BOOTTIME of the computer, in seconds.
     """
-    return f"{computer} {booted_s:.1f}"
+    return f"{computer} {boot_time_s:.1f}"
 
 
 def is_same_frame(identifier: str, other_identifier: str) -> bool:
-    """Return True if two identifiers of `frame_id` denote the same frame, without a reboot between them."""
-    (computer, _, booted), (other_computer, _, other_booted) = (
+    """Return True if two identifiers from `frame_id` denote the same frame, without a reboot between them."""
+    (computer, _, boot_time), (other_computer, _, other_boot_time) = (
         identifier.rpartition(" "),
         other_identifier.rpartition(" "),
     )
     try:
-        return computer == other_computer and abs(float(booted) - float(other_booted)) < _SAME_BOOT_S
+        return computer == other_computer and abs(float(boot_time) - float(other_boot_time)) < _SAME_BOOT_S
     except ValueError:
         return False
 
@@ -99,12 +99,12 @@ def is_same_frame(identifier: str, other_identifier: str) -> bool:
 def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> FlightOrigin:
     """Return the origin of a flight in the frame of its start.
 
-    The heading of a recorded origin is kept. If latitude and longitude of both positions are known, they give its
+    The heading is that of the recorded origin. If latitude and longitude of both positions are known, they give its
     position in the frame of the start; otherwise the frame must be the same as at the first start.
 
     Args:
         recorded: The origin of the trial; None for its first start, which becomes the origin.
-        start: Present position and heading of the drone.
+        start: Current position and heading of the drone.
 
     Raises:
         OriginError: The drone is more than `START_M` from the origin, or the distance is unknown.
@@ -142,11 +142,11 @@ def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> Flight
 
 @dataclass(frozen=True)
 class FlightFence:
-    """A cylinder around the origin in which a drone flies.
+    """A cylinder around the origin that a drone must not leave.
 
     Attributes:
         origin: The centre.
-        ground_m: Position of the ground, down.
+        ground_m: Down coordinate of the ground.
         radius_m: The radius.
         ceiling_m: The height over the ground.
     """
@@ -157,7 +157,7 @@ class FlightFence:
     ceiling_m: float
 
     def clamped(self, position_m: Position) -> Position:
-        """Return the nearest point inside the fence: moved horizontally towards its axis, and vertically."""
+        """Return the nearest point inside the fence."""
         scale = min(1.0, self.radius_m / max(self.origin.distance_m(position_m), 1e-9))
         return (
             self.origin.x_m + scale * (position_m[0] - self.origin.x_m),
@@ -166,11 +166,11 @@ class FlightFence:
         )
 
     def breach(self, position_m: Position) -> str:
-        """Return a text if a reported position is more than `FENCE_MARGIN_M` beyond the fence, else an empty text."""
-        for value_m, limit_m, what in (
+        """Return the reason if a position is more than `FENCE_MARGIN_M` outside the fence, else an empty text."""
+        for distance_m, limit_m, direction in (
             (self.origin.distance_m(position_m), self.radius_m, "from its origin"),
-            (self.ground_m - position_m[2], self.ceiling_m, "high"),
+            (self.ground_m - position_m[2], self.ceiling_m, "above the ground"),
         ):
-            if value_m > limit_m + FENCE_MARGIN_M:
-                return f"it is {value_m:.1f} m {what}, and its fence ends at {limit_m:g} m"
+            if distance_m > limit_m + FENCE_MARGIN_M:
+                return f"it is {distance_m:.1f} m {direction}, and its fence ends at {limit_m:g} m"
         return ""

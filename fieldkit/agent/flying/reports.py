@@ -12,7 +12,7 @@ _CHUNK = struct.Struct("<HB")
 
 
 class AutopilotTexts:
-    """The last texts of STATUSTEXT messages with severity `NOTICE` or more severe."""
+    """The last texts of STATUSTEXT messages that are at least as severe as `NOTICE`."""
 
     def __init__(self) -> None:
         self._texts: list[tuple[int, str]] = []
@@ -40,7 +40,7 @@ class AutopilotTexts:
 
     @property
     def warnings(self) -> list[str]:
-        """The texts with severity `WARNING` or more severe, in order of arrival."""
+        """The texts that are at least as severe as `WARNING`, in order of arrival."""
         return [text for severity, text in self._texts if severity <= WARNING]
 
     @property

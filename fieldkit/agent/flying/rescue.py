@@ -1,4 +1,4 @@
-"""The rescue of a drone: lands it if neither its pilot nor its guard runs. fieldkit starts it from the laptop."""
+"""A program that lands a drone if neither its pilot nor its guard runs. The laptop starts it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def rescue(plan: FlightPlan) -> None:
 def is_under_control(drone: AutopilotState) -> bool:
     """Return True if the drone is in the mode of the flight, or in the failsafe for missing set-points.
 
-    A person who takes the drone over ends the failsafe, even if the mode stays the same.
+    When a person takes the drone over, the failsafe ends, even if the mode stays the same.
     """
     return drone.guided or (
         drone.failsafe and drone.dialect is not None and drone.dialect.is_failsafe_hold(drone.mode)
@@ -73,7 +73,7 @@ def _open_session(connection: str, deadline_s: float) -> AutopilotSession:
     """
     has_warned = False
     while time.monotonic() < deadline_s:
-        with suppress(OSError):  # each attempt takes up to some seconds
+        with suppress(OSError):  # each attempt may take several seconds
             return AutopilotSession(connection, component=GUARD)
         if not has_warned:
             log_line(f"ALARM: THE DRONE MAY STILL BE IN THE AIR. {connection} CANNOT BE OPENED. {MANUAL_ACTION}")

@@ -23,7 +23,7 @@ OPEN_TIMEOUT_S = 3.0
 """Timeout for opening a connection when a client starts; a router restarts in 2 s."""
 
 _ROOT = os.path.abspath(os.path.join(os.path.dirname(__file__), "..", "..", ".."))  # noqa: PTH100, PTH118, PTH120
-"""The archive of the agent, or the parent folder of `fieldkit`; absolute, since the working folder may change."""
+"""The archive of the agent, or the parent folder of `fieldkit`; absolute, because the working folder may change."""
 _POLL_S = 0.1
 _SUSPENDED_TIMEOUT_S = 0.5
 _TIMEOUT_S = 2.0
@@ -53,7 +53,7 @@ class MessageRate:
 class SharedLink:
     """A connection to an autopilot that other programs share; implements `mavlink_links.FlightLink`.
 
-    A thread communicates with the server, so that a dead server is replaced also while the program is busy.
+    A separate thread communicates with the server and replaces a dead server, even while the program is busy.
 
     Args:
         connection: Name of the connection.
@@ -75,7 +75,7 @@ class SharedLink:
         self._server: socket.socket | None = None
         self._requests: dict[tuple[bytes, bytes], bytes] = {}
         self._stop_event = threading.Event()
-        self._answered_s = 0.0
+        self._last_answer_s = 0.0
         self._refused = self._dropped_by_client = self._dropped_by_server = self._dropped_by_earlier_servers = 0
         self.lost_since_s: float | None = time.monotonic()
         self.error = (0, "")
@@ -131,7 +131,7 @@ class SharedLink:
         self._send(FRAMES + frame)
 
     def _send(self, packet: bytes) -> None:
-        # The thread replaces a dead server; callers must tolerate lost frames, as by radio.
+        # The thread replaces a dead server; callers must tolerate lost frames, as on a radio link.
         with self._lock, suppress(OSError):
             if self._server is not None:
                 self._server.send(packet)
@@ -164,7 +164,7 @@ class SharedLink:
             if readable:
                 self._receive_packet()
             elif time.monotonic() - iteration_s > 2 * _POLL_S:
-                self._answered_s = time.monotonic()  # this program was suspended, not the server
+                self._last_answer_s = time.monotonic()  # this program was suspended, not the server
             elif self._is_dead():
                 self._kill_server()
 
@@ -179,7 +179,7 @@ class SharedLink:
         if not packet:
             self._disconnect()
             return
-        self._answered_s = time.monotonic()
+        self._last_answer_s = time.monotonic()
         if packet[:1] == FRAMES:
             try:
                 self._frames_in.send(packet[1:])
@@ -194,7 +194,7 @@ class SharedLink:
 
     def _is_dead(self) -> bool:
         """Return True if the server does not answer, or is suspended."""
-        silent_s = time.monotonic() - self._answered_s
+        silent_s = time.monotonic() - self._last_answer_s
         return silent_s > _TIMEOUT_S or (silent_s > _SUSPENDED_TIMEOUT_S and self._is_suspended())
 
     def _is_suspended(self) -> bool:
@@ -225,7 +225,7 @@ class SharedLink:
         self.restarts += 1
 
     def _connect(self) -> None:
-        """Connect to the server of the connection, which is started if it does not run.
+        """Connect to the link server of the connection. If it does not run, it is started.
 
         Raises:
             OSError: The server cannot be started.
@@ -233,13 +233,13 @@ class SharedLink:
         deadline_s = time.monotonic() + _START_TIMEOUT_S
         while (server := self._try_connect()) is None:
             if time.monotonic() > deadline_s:
-                raise TimeoutError(f"no link server serves {self._connection}")
+                raise TimeoutError(f"the link server of {self._connection} does not start")
             self._start()
             if self._stop_event.wait(0.01):
                 return
         with self._lock:
             self._server = server
-            self._answered_s = time.monotonic()
+            self._last_answer_s = time.monotonic()
             for frame in self._requests.values():
                 server.send(FRAMES + frame)
             server.send(ALIVE)
@@ -255,7 +255,7 @@ class SharedLink:
             return None
         if link_files.peer_credentials(server)[1] != os.geteuid():
             server.close()
-            raise PermissionError(f"another user serves {self._connection}")
+            raise PermissionError(f"the link server of {self._connection} belongs to another user")
         server.setblocking(False)
         return server
 

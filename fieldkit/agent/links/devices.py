@@ -17,7 +17,7 @@ from typing import Protocol
 MAX_BYTES = 65_536
 _CONNECT_TIMEOUT_S = 2.0
 _PEER_TIMEOUT_S = 3.0
-"""If the peer sends no datagram for this time, the next sender replaces it: a restarted peer has a new port."""
+"""If the peer sends no datagram for this time, the next sender becomes the peer: a restarted peer has a new port."""
 _MAX_QUEUED_BYTES = 4096
 """Maximum number of queued bytes for a slow line: 0.7 s at 57600 baud. Older data would be useless."""
 
@@ -46,7 +46,7 @@ class FlightDevice(Protocol):
         """
 
     def flush(self) -> None:
-        """Send queued bytes of a slow line; raises as `write`."""
+        """Send queued bytes of a slow line; raises the errors of `write`."""
 
     def close(self) -> None:
         """Close the connection."""
@@ -118,7 +118,7 @@ class UdpDevice:
         return self._socket.fileno()
 
     def read(self) -> bytes:
-        """Return the next datagram; an unreachable port is not an error, since the peer may start later."""
+        """Return the next datagram; an unreachable port is not an error, because the peer may start later."""
         with suppress(BlockingIOError, ConnectionRefusedError):
             datagram, sender = self._socket.recvfrom(MAX_BYTES)
             now_s = time.monotonic()

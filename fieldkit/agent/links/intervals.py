@@ -1,8 +1,9 @@
 """Message intervals that several clients request from one autopilot.
 
 An interval applies to a port of the autopilot: all programs on that port share it, and other stations may change it.
-The smallest requested interval is set, set again if the message is too slow or missing, and reset to the default if
-no client requests it any more (MAV_CMD_SET_MESSAGE_INTERVAL, https://mavlink.io/en/messages/common.html).
+The smallest requested interval is set. It is set again if the rate of the message is too low, and reset to the
+default when no client requests the message any longer (MAV_CMD_SET_MESSAGE_INTERVAL,
+https://mavlink.io/en/messages/common.html).
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, Callable, Hashable, Mapping, Tuple
 from fieldkit.agent.autopilots.mavlink_frames import ACCEPTED
 
 DEFAULT = 0
-"""Interval that selects the default rate of the autopilot; it also ends a request."""
+"""Interval that selects the default rate of the autopilot; it also cancels a request."""
 _OFF = -1
 RETRY_RESULTS = (1, 5)
 """MAV_RESULT_TEMPORARILY_REJECTED and MAV_RESULT_IN_PROGRESS: the request may be accepted later."""
@@ -58,9 +59,9 @@ class MessageInterval:
     @property
     def interval_us(self) -> int:
         """The interval that satisfies all clients."""
-        positive = [requested for requested in self.requested_us.values() if requested > 0]
-        if positive:
-            return min(positive)
+        positive_us = [interval_us for interval_us in self.requested_us.values() if interval_us > 0]
+        if positive_us:
+            return min(positive_us)
         return _OFF if _OFF in self.requested_us.values() else DEFAULT
 
     @property
@@ -115,7 +116,7 @@ class MessageInterval:
 
 
 class MessageIntervals:
-    """The intervals of all messages. They are requested in sequence, because an answer does not name its message.
+    """The intervals of all messages. They are requested in sequence, because an answer contains no message id.
 
     Args:
         send: Sends a request to a target, with message id and interval in microseconds.
@@ -132,7 +133,7 @@ class MessageIntervals:
         return all(message.interval_us == message.set_us for message in self._messages.values())
 
     def request(self, client: Hashable, target: Target, kind: int, interval_us: int) -> None:
-        """Register the request of a client; the interval `DEFAULT` ends a request."""
+        """Register the request of a client; the interval `DEFAULT` cancels a request."""
         key = target, kind
         if interval_us == DEFAULT and key not in self._messages:
             return
@@ -151,7 +152,7 @@ class MessageIntervals:
             message.requested_us.pop(client, None)
 
     def on_reopened(self) -> None:
-        """Repeat all requests after the connection was reopened, since the autopilot's port may be another one."""
+        """Repeat all requests after the connection was reopened, because the autopilot's port may be another one."""
         self._pending = None
         for message in self._messages.values():
             message.set_us, message.tries = None, 0
@@ -180,8 +181,8 @@ class MessageIntervals:
     def advance(self, now_s: float) -> None:
         """Send the next request that is due."""
         if self._pending is not None:
-            key, _, until_s = self._pending
-            if now_s < until_s:
+            key, _, timeout_s = self._pending
+            if now_s < timeout_s:
                 return
             self._pending = None
             if key in self._messages:
@@ -201,7 +202,7 @@ class MessageIntervals:
         self._send(key[0], key[1], message.interval_us)
 
     def report(self, client: Hashable, now_s: float) -> Mapping[str, Any]:
-        """Return the interval in us, MAV_RESULT and rate in Hz of each message that a client requested, by id."""
+        """Return interval in us, MAV_RESULT and rate in Hz of each message that a client requested, by message id."""
         return {
             str(kind): {"interval_us": message.interval_us, "result": message.result, "hz": message.hz(now_s)}
             for (_, kind), message in self._messages.items()

@@ -45,7 +45,7 @@ def name(connection: str) -> str:
 
 @contextmanager
 def address(connection: str) -> Iterator[str]:
-    """Yield a short address of a connection's socket; the length of the home folder's path does not matter."""
+    """Yield an address of a connection's socket that is short even if the path of the home folder is long."""
     descriptor = os.open(folder(), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield f"/proc/self/fd/{descriptor}/{name(connection)}.sock"
@@ -54,7 +54,7 @@ def address(connection: str) -> Iterator[str]:
 
 
 def lock(connection: str) -> int | None:
-    """Return the descriptor of a connection's locked lock file, or None if another server holds the lock.
+    """Lock the lock file of a connection; return its descriptor, or None if another server holds the lock.
 
     Raises:
         OSError: The file cannot be created.

@@ -1,4 +1,4 @@
-"""The link server: it owns the connection to an autopilot, and forwards frames between the autopilot and its clients.
+"""The link server. It owns the connection to an autopilot, and forwards frames between the autopilot and clients.
 
 Clients connect to a Unix-domain socket of type SOCK_SEQPACKET. The first byte of a packet is its type: `FRAMES`
 precedes complete frames, `ALIVE` is a poll of a client, and `STATE` precedes the answer to it, a JSON object.
@@ -68,8 +68,8 @@ class SharedDevice:
     def __init__(self, connection: str) -> None:
         self._connection = connection
         self._device: FlightDevice | None = None
-        self._opening: threading.Thread | None = None
-        self._opened: list[FlightDevice | OSError] = []
+        self._open_thread: threading.Thread | None = None
+        self._open_results: list[FlightDevice | OSError] = []
         self._next_s, self._pause_s = 0.0, _FIRST_PAUSE_S
         self._buffer = bytearray()
         self._received_s = 0.0
@@ -86,12 +86,12 @@ class SharedDevice:
             if self._connection.startswith("tcp:") and now_s > self._received_s + _SILENT_S:
                 self._disconnect(TimeoutError(errno.ETIMEDOUT, f"no byte in {_SILENT_S:g} s"))
             return False
-        if self._opening is None and now_s >= self._next_s:
-            self._opening = threading.Thread(target=self._open, daemon=True)
-            self._opening.start()
-        if not self._opened:
+        if self._open_thread is None and now_s >= self._next_s:
+            self._open_thread = threading.Thread(target=self._open, daemon=True)
+            self._open_thread.start()
+        if not self._open_results:
             return False
-        result, self._opening = self._opened.pop(), None
+        result, self._open_thread = self._open_results.pop(), None
         if isinstance(result, OSError):
             self.error = result.errno or errno.EIO, result.strerror or str(result)
             self._next_s, self._pause_s = now_s + self._pause_s, min(2 * self._pause_s, _MAX_PAUSE_S)
@@ -103,9 +103,9 @@ class SharedDevice:
 
     def _open(self) -> None:
         try:
-            self._opened.append(devices.open_device(self._connection))
+            self._open_results.append(devices.open_device(self._connection))
         except OSError as error:
-            self._opened.append(error)
+            self._open_results.append(error)
 
     def receive(self) -> list[bytes]:
         """Return the frames that have arrived."""
@@ -217,7 +217,7 @@ class LinkServer:
         self._device.close()
 
     def _register_device(self) -> None:
-        """Register the present descriptor of the device with the selector."""
+        """Register the current descriptor of the device with the selector."""
         if self._device_descriptor == self._device.fileno():
             return
         if self._device_descriptor >= 0:
@@ -231,7 +231,7 @@ class LinkServer:
             self._accept()
         elif descriptor == self._device_descriptor:
             self._distribute(self._device.receive())
-            self._register_device()  # before another descriptor gets the same number
+            self._register_device()  # before another file gets the same descriptor
         elif descriptor in self._clients:
             self._receive_packet(descriptor, self._clients[descriptor])
 
@@ -244,18 +244,18 @@ class LinkServer:
             self._clients[stream.fileno()] = LinkClient(stream)
             self._selector.register(stream, selectors.EVENT_READ)
 
-    def _distribute(self, received: list[bytes]) -> None:
+    def _distribute(self, received_frames: list[bytes]) -> None:
         now_s = time.monotonic()
-        for frame in received:
+        for frame in received_frames:
             message = parse_frame(frame)
             source = message.system, message.component
             self._intervals.on_message(source, message.kind, now_s)
             if message.kind == COMMAND_ACK and is_intact(frame):
                 self._on_command_ack(source, message, now_s)
-        if received:
-            packet = FRAMES + b"".join(received)
+        if received_frames:
+            packet = FRAMES + b"".join(received_frames)
             for client in self._clients.values():
-                client.send(packet, len(received))
+                client.send(packet, len(received_frames))
 
     def _on_command_ack(self, source: Target, message: ParsedFrame, now_s: float) -> None:
         command, result, *target = _COMMAND_ACK.unpack(
@@ -285,7 +285,7 @@ class LinkServer:
                     self._device.send(frame)
 
     def _intercept_request(self, client: int, frame: bytes) -> bool:
-        """Process a frame that requests an interval, which is not forwarded; return True if the frame is one."""
+        """Return True if a frame requests a message interval. Such a request is processed here and not forwarded."""
         message = parse_frame(frame)
         if message.kind != COMMAND_LONG or not is_intact(frame):
             return False
@@ -342,7 +342,7 @@ def serve(connection: str, stop_event: threading.Event) -> None:
             LinkServer(connection, listener).run(stop_event)
             link_files.remove(connection)  # while the lock is held
         code = 0
-    except Exception:  # noqa: BLE001 (the log has it, and clients start another server)
+    except Exception:  # noqa: BLE001 (it is in the log; clients start another server)
         traceback.print_exc()
     finally:
         sys.stderr.flush()

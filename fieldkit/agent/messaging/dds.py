@@ -1,7 +1,7 @@
 """DDS with the Python binding of CycloneDDS, the package `cyclonedds`. Only this module imports it.
 
 Samples are passed through as bytes: the binding writes and takes serialized data (`_clayer`) in 2 us, whereas its
-serializer needs 30 us and more. The library needs a type nevertheless, which is built member by member; other
+serializer needs 30 us and more. The library still needs a type, which is built member by member; other
 participants receive only its name.
 """
 
@@ -66,66 +66,67 @@ def start(network: Network) -> DdsMiddleware:
 def configuration(network: Network) -> str:
     """Return the configuration of CycloneDDS: one interface, predictable ports, and discovery."""
     multicast = "true" if network.discovery == "multicast" else "false"
-    requested = {
+    settings = {
         "General/AllowMulticast": multicast,
         # Ports by the formula of RTPS, so that peers without multicast and evaluations of captures can compute them.
         "Discovery/ParticipantIndex": "auto",
         **network.settings,
     }
     peers = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in network.peers)
-    fixed = {
+    fixed_elements = {
         "General": f"<Interfaces><NetworkInterface address={quoteattr(network.address)}/></Interfaces>",
         "Discovery": f"<Peers>{peers}</Peers>" if peers else "",
     }
-    return f"<CycloneDDS><Domain>{_elements(requested, fixed)}</Domain></CycloneDDS>"
+    return f"<CycloneDDS><Domain>{_elements(settings, fixed_elements)}</Domain></CycloneDDS>"
 
 
-def _elements(requested: Mapping[str, str], fixed: Mapping[str, str]) -> str:
-    """Return settings, given by their paths, as nested XML elements; `@` precedes the name of an attribute."""
-    nested_settings: dict[str, dict[str, str]] = {name: {} for name in fixed}
+def _elements(settings: Mapping[str, str], fixed_elements: Mapping[str, str]) -> str:
+    """Return settings, whose keys are paths, as nested XML elements; `@` precedes the name of an attribute."""
+    nested_settings: dict[str, dict[str, str]] = {name: {} for name in fixed_elements}
     leaves = []
-    for path, value in requested.items():
-        name, _, rest = path.partition("/")
+    for path, value in settings.items():
+        name, _, nested_path = path.partition("/")
         element, _, attribute = name.partition("@")
-        if rest:
-            nested_settings.setdefault(name, {})[rest] = value
+        if nested_path:
+            nested_settings.setdefault(name, {})[nested_path] = value
         elif attribute:
             leaves.append(f"<{element} {attribute}={quoteattr(value)}/>")
         else:
             leaves.append(f"<{name}>{escape(value)}</{name}>")
     nested_elements = (
-        f"<{name}>{fixed.get(name, '')}{_elements(rest, {})}</{name}>" for name, rest in nested_settings.items()
+        f"<{name}>{fixed_elements.get(name, '')}{_elements(nested, {})}</{name}>"
+        for name, nested in nested_settings.items()
     )
     return "".join([*leaves, *nested_elements])
 
 
-def quality(requested: Quality, user_data: str, *, writes: bool) -> Qos:
+def quality(qos: Quality, user_data: str, *, writes: bool) -> Qos:
     """Return a quality of service as DDS policies of a writer or a reader."""
     policies = [Policy.DataRepresentation(use_cdrv0_representation=True)]
-    if requested.reliability == "reliable":
+    if qos.reliability == "reliable":
         policies.append(Policy.Reliability.Reliable(MAX_BLOCKING_NS))
-    elif requested.reliability == "best_effort":
+    elif qos.reliability == "best_effort":
         policies.append(Policy.Reliability.BestEffort)
-    if requested.history == "keep_all":
+    if qos.history == "keep_all":
         policies.append(Policy.History.KeepAll)
-    elif requested.history == "keep_last" and requested.depth:
-        policies.append(Policy.History.KeepLast(requested.depth))
-    policies += _durability(requested, writes=writes)
-    if requested.deadline_ns is not None:
-        policies.append(Policy.Deadline(requested.deadline_ns))
-    if requested.lifespan_ns is not None and writes:
-        policies.append(Policy.Lifespan(requested.lifespan_ns))
+    elif qos.history == "keep_last" and qos.depth:
+        policies.append(Policy.History.KeepLast(qos.depth))
+    policies += _durability(qos, writes=writes)
+    if qos.deadline_ns is not None:
+        policies.append(Policy.Deadline(qos.deadline_ns))
+    if qos.lifespan_ns is not None and writes:
+        policies.append(Policy.Lifespan(qos.lifespan_ns))
     if user_data:
         policies.append(Policy.Userdata(user_data.encode()))
     return Qos(*policies)
 
 
-def _durability(requested: Quality, *, writes: bool) -> list[Any]:
+def _durability(qos: Quality, *, writes: bool) -> list[Any]:
     """Return the durability policies. The history for late readers is a separate policy, whose default depth is 1."""
-    if requested.durability != "transient_local":
-        return [Policy.Durability.Volatile] if requested.durability == "volatile" else []
-    keeps_all = requested.history == "keep_all" and not requested.late_reader_depth
-    depth = requested.late_reader_depth or requested.depth or 1
+    if qos.durability != "transient_local":
+        return [Policy.Durability.Volatile] if qos.durability == "volatile" else []
+    keeps_all = qos.history == "keep_all" and not qos.late_reader_depth
+    depth = qos.late_reader_depth or qos.depth or 1
     history = Policy.History.KeepAll if keeps_all else Policy.History.KeepLast(depth)
     service = [Policy.DurabilityService(0, history, *[_UNLIMITED] * 3)] if writes else []
     return [Policy.Durability.TransientLocal, *service]
@@ -155,25 +156,25 @@ def _make_struct(name: str, topic: Topic, struct_by_name: dict[str, type]) -> ty
 
 
 def padded(data: bytes) -> bytes:
-    """Return a sample as sent: padded to a multiple of 4 bytes, with the number of added bytes in its header.
+    """Return a sample padded to a multiple of 4 bytes, with the number of padding bytes in its header.
 
     RTPS 2.5, section 10.2 (the two lowest bits of the encapsulation options; XTypes 1.3, section 7.6.3.1.2).
     """
-    added = -len(data) % 4
-    return data if not added else data[:3] + bytes([data[3] & ~3 | added]) + data[4:] + bytes(added)
+    padding = -len(data) % 4
+    return data if not padding else data[:3] + bytes([data[3] & ~3 | padding]) + data[4:] + bytes(padding)
 
 
 def unpadded(data: bytes) -> bytes:
     """Return a sample without the padding of `padded`."""
-    added = data[3] & 3 if len(data) > 3 else 0
-    return data if not added else data[:3] + bytes([data[3] & ~3]) + data[4:-added]
+    padding = data[3] & 3 if len(data) > 3 else 0
+    return data if not padding else data[:3] + bytes([data[3] & ~3]) + data[4:-padding]
 
 
 def hide_type_description(topic: DdsTopic) -> Any:  # noqa: ANN401 (of ctypes)
-    """Make discovery announce a topic's type by its name only; must be called before endpoints are created.
+    """Let discovery announce only the name of a topic's type; must be called before endpoints are created.
 
-    CycloneDDS 11.0 cannot read the type descriptions of Fast DDS 3 (ROS 2 Kilted), and endpoints never match if both
-    announce descriptions that differ. The binding has no option for this, so the three functions that return the
+    CycloneDDS 11.0 cannot read the type descriptions of Fast DDS 3 (ROS 2 Kilted), and endpoints do not match if both
+    announce descriptions and these differ. The binding has no option for this, so the three functions that return the
     description are removed from the type's table of functions (`struct ddsi_sertype_ops`), if it has the expected
     layout.
 
@@ -212,7 +213,7 @@ class DdsMiddleware:
         self._network = network
         self._readers: list[bytes] = []
         self._writers: list[bytes] = []
-        self._nodes = self._writer(graph.topic(network.gid_bytes))
+        self._node_info_writer = self._writer(graph.topic(network.gid_bytes))
         self._publish_node_info()
 
     def _topic(self, topic: Topic) -> DdsTopic:
@@ -238,13 +239,13 @@ class DdsMiddleware:
         if self._participant is not None:
             guid, network = self._participant.guid.bytes, self._network
             node_info = graph.entities_info(guid, network.node, self._readers, self._writers, network.gid_bytes)
-            ddspy_write(self._nodes._ref, padded(node_info))
+            ddspy_write(self._node_info_writer._ref, padded(node_info))
 
     def subscribe(self, topic: Topic, deliver: Deliver) -> Callable[[], int]:
         """Create a data reader for a topic; return a function that returns the number of matched writers."""
         qos = quality(topic.quality, topic.user_data, writes=False)
-        requested = Qos(Policy.IgnoreLocal.Participant, base=qos)
-        reader = DataReader(DdsSubscriber(self._participant), self._topic(topic), qos=requested)
+        remote_only = Qos(Policy.IgnoreLocal.Participant, base=qos)
+        reader = DataReader(DdsSubscriber(self._participant), self._topic(topic), qos=remote_only)
         self._readers.append(reader.guid.bytes)
         self._publish_node_info()
         thread = threading.Thread(target=self._read_samples, args=(reader, deliver), daemon=True)
@@ -253,7 +254,7 @@ class DdsMiddleware:
         return lambda: len(reader.get_matched_publications())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the different types that discovered endpoints use for the topic."""
+        """Return the types of the topic at discovered endpoints, without the topic's own type."""
         own_type = topic.dds_types[topic.type]
         return {
             endpoint.type_name

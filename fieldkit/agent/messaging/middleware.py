@@ -32,7 +32,7 @@ class Quality:
         deadline_ns: Maximum expected time between two samples; None for no deadline.
         lifespan_ns: Time after which a sample expires; None for no limit.
         late_reader_depth: Number of samples that a DDS writer with `transient_local` keeps for readers that it
-            discovers later; 0 for as many as `history` and `depth` say.
+            discovers later; 0 for the number of `history` and `depth`.
     """
 
     reliability: str = "reliable"
@@ -88,10 +88,10 @@ class Network:
     """Network settings of a robot's middleware.
 
     Attributes:
-        address: Its IPv4 address on the radio, the only one used. For ROS 2 the robot's environment selects it.
+        address: Its IPv4 address on the radio; no other address is used. For ROS 2, the environment selects it.
         discovery: `multicast`, `peers`, `router` or `master`; for ROS 2 also `environment`, the robot's settings.
         peers: Addresses of the other robots, for `peers`.
-        server: Address of the router or master; for ROS 1, empty for the one in the robot's setup files.
+        server: Address of the router or master; for ROS 1, empty for the master in the robot's setup files.
         port: Port of the router or master, or of Zenoh's listener.
         domain: ROS domain.
         node: Name of the node.
@@ -124,7 +124,10 @@ class Publisher(Protocol):
         """Return the number of matched subscriptions; for Zenoh, 1 for any number."""
 
     def drain(self, limit_s: float) -> None:
-        """Wait until all samples are acknowledged, at most for this time. Without acknowledgements do nothing."""
+        """Wait until all samples are acknowledged, at most for this time.
+
+        Returns immediately if the middleware has no acknowledgements.
+        """
 
 
 class Middleware(Protocol):
@@ -147,7 +150,7 @@ class Middleware(Protocol):
         """
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the names of different types that other participants use for the topic, as they announce them."""
+        """Return the types that other participants announce for the topic, without the topic's own type."""
 
     def close(self) -> None:
         """Close all endpoints and stop the middleware."""
@@ -157,7 +160,7 @@ def version_of(package: str) -> str:
     """Return the name and installed version of a package, or only its name if the version is unknown."""
     try:
         return f"{package} {metadata.version(package)}"
-    except metadata.PackageNotFoundError:  # it was not installed as a package
+    except metadata.PackageNotFoundError:  # it is not installed as a package
         return package
 
 
@@ -168,10 +171,10 @@ def adapter(name: str) -> Callable[[Network], Middleware]:
         name: One of `ADAPTERS`.
 
     Returns:
-        Starts the middleware with the given network settings; raises `MiddlewareError` if it does not start.
+        A function that starts the middleware with network settings; it raises `MiddlewareError` if this fails.
 
     Raises:
-        MiddlewareError: It is not installed here.
+        MiddlewareError: The middleware is unknown or not installed.
     """
     if name not in ADAPTERS:
         raise MiddlewareError(f"{name!r} is not a middleware; choose one of {', '.join(ADAPTERS)}")

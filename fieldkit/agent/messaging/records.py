@@ -4,8 +4,8 @@ No record is lost if the program is killed.
 
 The log is mapped into memory. Data in the mapping survive the process, like data passed to `write`, but a store needs
 no system call, so that logging does not delay samples. The file grows in pieces. A piece is allocated on disk before
-it is mapped, so that a full disk causes an error then, instead of SIGBUS at a later store. (A failing disk still
-causes SIGBUS.) If a log was not closed, zeros follow its last record.
+it is mapped, so that a full disk causes an error at that time, instead of SIGBUS at a later store. (A failing disk
+still causes SIGBUS.) If a log was not closed, zeros follow its last record.
 
 `fieldkit.ros.streams.topic_samples` reads it.
 """
@@ -26,16 +26,16 @@ Times are in nanoseconds since 1970 UTC. The local time of a record is never 0, 
 """
 
 SAMPLE = 1
-"""A sample. Publisher: with the send time in it, and the local time after the middleware accepted it. Subscriber: the
-local time is that of its arrival."""
-BEGUN = 2
+"""A sample; the send time is the time in the sample. The local time is the time after the middleware accepted the
+sample (publisher), or its time of arrival (subscriber)."""
+DISCOVERY_STARTED = 2
 """The middleware is imported, and its discovery starts."""
 MATCHED = 3
 """The other endpoint was discovered."""
 REFUSED = 4
 """A sample that the middleware did not accept."""
 SKIPPED = 5
-"""Samples whose time passed while the previous one was written; `sequence` is their number."""
+"""Samples that were not sent because writing the previous one took too long; `sequence` is their number."""
 FOREIGN = 6
 """A received sample that does not belong to this stream."""
 END = 7
@@ -104,18 +104,18 @@ class Log:
         self._piece[self._offset : end] = record
         self._offset = end
 
-    def origin(self, at_ns: int, end: int, topic: str) -> None:
+    def origin(self, at_ns: int, role: int, topic: str) -> None:
         """Write an `ORIGIN` record.
 
         Args:
             at_ns: The local time.
-            end: `PUBLISHER` or `SUBSCRIBER`.
+            role: `PUBLISHER` or `SUBSCRIBER`.
             topic: The topic's name.
 
         Raises:
-            LogError: As `note`.
+            LogError: The disk is full.
         """
-        self.note(ORIGIN, at_ns, size=zlib.crc32(topic.encode()), sequence=end)
+        self.note(ORIGIN, at_ns, size=zlib.crc32(topic.encode()), sequence=role)
 
     def end(self, at_ns: int) -> None:
         """Write the last record with a checksum, and flush the file to disk.
@@ -131,16 +131,16 @@ class Log:
             os.fsync(self._file)
             os.close(self._file)
 
-    def _checksum(self, end: bytes) -> int:
+    def _checksum(self, end_record: bytes) -> int:
         """Return the CRC-32 of the written file and its last record; the file is read piece by piece."""
-        total, offset, size = 0, 0, self._piece_start + self._offset
+        crc, offset, size = 0, 0, self._piece_start + self._offset
         while offset < size:
             piece = os.pread(self._file, min(PIECE_BYTES, size - offset), offset)
-            total, offset = zlib.crc32(piece, total), offset + len(piece)
-        return zlib.crc32(end, total)
+            crc, offset = zlib.crc32(piece, crc), offset + len(piece)
+        return zlib.crc32(end_record, crc)
 
     def _map_from(self, position: int) -> None:
-        """Map a piece of the log that starts at the page of a position, and continue to write at that position."""
+        """Map a piece of the log that starts at the page of a position, where the next record is written."""
         offset = position % mmap.ALLOCATIONGRANULARITY
         piece_start = position - offset
         try:

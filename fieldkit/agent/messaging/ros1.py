@@ -71,8 +71,8 @@ class Ros1Middleware:
             if message._connection_header["callerid"] != own_name:
                 deliver(bytes(message._buff), at_ns)
 
-        # The MD5 sum of the type makes publishers of another type refuse the connection. The buffer is rospy's
-        # default of 64 KiB: it is allocated for each read, and larger ones would cost more than a small message.
+        # The MD5 sum of the type makes publishers of another type refuse the connection. The buffer has rospy's
+        # default size of 64 KiB. It is allocated for each read, and a larger one would slow small messages down.
         endpoint = rospy.Subscriber(
             topic.name,
             _message_class(topic),
@@ -83,7 +83,7 @@ class Ros1Middleware:
         return lambda: int(endpoint.get_num_connections())
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the topic's type at the master if it differs; the master stores only the last publisher's type."""
+        """Return the topic's type at the master if it differs. The master stores only the last publisher's type."""
         own_name = rospy.get_name()
         try:
             master = Master(own_name)

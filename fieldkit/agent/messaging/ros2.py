@@ -31,8 +31,8 @@ def start(network: Network) -> Ros2Middleware:
 def environment(network: Network) -> dict[str, str]:
     """Return the environment variables for these network settings. Other variables are unchanged on the robot.
 
-    docs.ros.org, "Improved Dynamic Discovery": with `LOCALHOST` there is no multicast on the network, but static
-    peers are contacted. Available since ROS 2 Iron; earlier versions support multicast only.
+    With `LOCALHOST`, nodes do not use multicast on the network, but contact static peers (docs.ros.org, "Improved
+    Dynamic Discovery"). This is available since ROS 2 Iron; earlier versions support multicast only.
     """
     variables = {"ROS_DOMAIN_ID": str(network.domain)}
     if network.discovery != "environment":
@@ -41,15 +41,15 @@ def environment(network: Network) -> dict[str, str]:
     return variables
 
 
-def profile(requested: Quality) -> QoSProfile:
+def profile(qos: Quality) -> QoSProfile:
     """Return a quality of service as a profile of rclpy."""
     policies: dict[str, Any] = {
-        "reliability": ReliabilityPolicy[requested.reliability.upper()],
-        "history": HistoryPolicy[requested.history.upper()],
-        "depth": requested.depth,
-        "durability": DurabilityPolicy[requested.durability.upper()],
+        "reliability": ReliabilityPolicy[qos.reliability.upper()],
+        "history": HistoryPolicy[qos.history.upper()],
+        "depth": qos.depth,
+        "durability": DurabilityPolicy[qos.durability.upper()],
     }
-    for name, time_ns in (("deadline", requested.deadline_ns), ("lifespan", requested.lifespan_ns)):
+    for name, time_ns in (("deadline", qos.deadline_ns), ("lifespan", qos.lifespan_ns)):
         if time_ns is not None:
             policies[name] = Duration(nanoseconds=time_ns)
     return QoSProfile(**policies)
@@ -69,10 +69,10 @@ def message_type(name: str) -> Any:  # noqa: ANN401 (generated)
 
 
 class Ros2Middleware:
-    """A node with the requested topics only: no parameter services, no log on `/rosout`."""
+    """A node with only the requested topics: it has no parameter services and no log on `/rosout`."""
 
     def __init__(self, network: Network) -> None:
-        # Iron introduced both static peers and type hashes.
+        # Iron introduced static peers and type hashes; `rclpy.type_hash` shows that this is Iron or later.
         if network.discovery == "peers" and find_spec("rclpy.type_hash") is None:
             raise MiddlewareError("ROS 2 has no static peers before Iron: set the peers in the settings of its RMW")
         os.environ.update(environment(network))
@@ -123,7 +123,7 @@ class Ros2Middleware:
         return lambda: int(self._node.count_publishers(topic.name))
 
     def _require_single_role(self, role: str, topic: Topic) -> None:
-        """Refuse to publish and subscribe to one topic: rclpy cannot hide a node's samples from its subscription."""
+        """Raise an error if this node publishes and subscribes to one topic: it would receive its own samples."""
         self._roles.add((role, topic.name))
         if {("publish", topic.name), ("subscribe", topic.name)} <= self._roles:
             raise MiddlewareError(f"rclpy would receive its own samples on {topic.name}")
@@ -133,7 +133,7 @@ class Ros2Middleware:
             self._executor.spin_once(timeout_sec=_SPIN_S)
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the different types that other nodes use for the topic."""
+        """Return the types of the topic at other nodes, without the topic's own type."""
         return set(dict(self._node.get_topic_names_and_types()).get(topic.name, ())) - {topic.type}
 
     def close(self) -> None:
@@ -165,6 +165,6 @@ class Ros2Publisher:
         return int(self._publisher.get_subscription_count())
 
     def drain(self, limit_s: float) -> None:
-        """Wait until all samples are acknowledged, which rclpy supports since Humble."""
+        """Wait until all samples are acknowledged. rclpy supports this since Humble."""
         if hasattr(self._publisher, "wait_for_all_acked"):
             self._publisher.wait_for_all_acked(Duration(nanoseconds=int(limit_s * 1e9)))

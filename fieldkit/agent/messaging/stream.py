@@ -1,8 +1,8 @@
-"""Stream samples with sequence numbers and times from one robot to another, and log both sides.
+"""Stream samples with sequence numbers and times from one robot to another, and log them at both.
 
-A sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data begin with a
-magic number, the sequence number and the time; the rest is random, so that no compression changes its size. Or it is
-a `sensor_msgs/Image` of a synthetic camera, with number and time in its pixels.
+A sample is a `std_msgs/UInt8MultiArray` with an empty layout, which all ROS tools can read. Its data start with a
+magic number, the sequence number and the time. Random bytes follow, so that compression does not change its size. Or
+it is a `sensor_msgs/Image` of a synthetic camera, with number and time in its pixels.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class SampleCodec:
         if self._image:
             return self._image.decode(data)
         start = len(self._envelope)
-        # Some implementations pad CDR to a multiple of 4 bytes without a note in the header.
+        # Some implementations pad CDR to a multiple of 4 bytes and do not indicate this in the header.
         if not 0 <= len(data) - self._size < 4 or data[start : start + len(MAGIC)] != MAGIC:
             return None
         _, sequence, sent_ns = HEAD.unpack_from(data, start)
@@ -102,7 +102,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
     """Wait for a subscription, publish samples at their scheduled times, and log each of them.
 
     Args:
-        middleware: The middleware, which is started.
+        middleware: The started middleware.
         topic: The topic.
         stream: Parameters of the stream.
         log: The log.
@@ -170,15 +170,15 @@ def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, st
             else:
                 log.note(records.SAMPLE, at_ns, size=len(data), sequence=header[0], sent_ns=header[1])
         except LogError as error:
-            # An exception in a thread of the middleware would be lost, as if no more samples arrived.
+            # An exception in a thread of the middleware would be lost, and would look like an end of the stream.
             errors.append(error)
             stop_event.set()
 
-    matched = middleware.subscribe(topic, on_sample)
+    count_publishers = middleware.subscribe(topic, on_sample)
     is_matched = False
     with logged_reads(newest, stream.reads_hz, log, stop_event):
         while not stop_event.wait(_POLL_S if not is_matched else WAIT_S):
-            if not is_matched and matched() != 0:
+            if not is_matched and count_publishers() != 0:
                 is_matched = True
                 log.note(records.MATCHED, time.time_ns())
     if errors:

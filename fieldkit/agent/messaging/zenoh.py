@@ -33,7 +33,7 @@ def start(network: Network) -> ZenohMiddleware:
 
 
 def route(network: Network) -> ZenohMiddleware:
-    """Open a session that is a router for other sessions."""
+    """Open a session that is the router of other sessions."""
     return ZenohMiddleware(network, "router")
 
 
@@ -71,7 +71,7 @@ def gid(token: str) -> bytes:
     rmw_zenoh uses XXH3, which the standard library lacks. Receivers use the identifier only to distinguish
     publishers, so another hash is compatible.
     """
-    return hashlib.md5(token.encode()).digest()  # noqa: S324 (no secret)
+    return hashlib.md5(token.encode()).digest()  # noqa: S324 (not used for security)
 
 
 class ZenohMiddleware:
@@ -91,7 +91,7 @@ class ZenohMiddleware:
             self._session: Any = zenoh.open(config)
         except zenoh.ZError as error:
             raise MiddlewareError(f"Zenoh does not start: {error}") from error
-        self._declared: list[Any] = []
+        self._declarations: list[Any] = []
 
     def publisher(self, topic: Topic) -> ZenohPublisher:
         """Create a publisher of a topic."""
@@ -107,7 +107,7 @@ class ZenohMiddleware:
             endpoint: Any = zenoh.ext.declare_advanced_publisher(
                 self._session, topic.key, cache=cache, publisher_detection=True, **options
             )
-            # An advanced publisher does not report whether a subscription matches it; a plain one with its key does.
+            # Only a plain publisher reports whether a subscription matches; an advanced publisher does not.
             matching: Any = self._session.declare_publisher(topic.key, **options)
         else:
             endpoint = matching = self._session.declare_publisher(topic.key, **options)
@@ -128,12 +128,15 @@ class ZenohMiddleware:
             )
         else:
             endpoint = self._session.declare_subscriber(topic.key, on_sample, allowed_origin=origin)
-        self._declared.append(endpoint)
+        self._declarations.append(endpoint)
         self._declare_tokens(topic, "subscription")
         return lambda: -1
 
     def other_types(self, topic: Topic) -> set[str]:
-        """Return the different types of the topic in liveliness tokens, which end with topic, type, hash and QoS."""
+        """Return the types of the topic in liveliness tokens, without the topic's own type.
+
+        A token ends with topic, type, hash and QoS.
+        """
         domain, own_name, own_hash = topic.key.split("/")[0], *topic.key.split("/")[-2:]
         tokens = f"@ros2_lv/{domain}/**/{topic.name.replace('/', '%')}/*/*/*"
         types = (
@@ -146,12 +149,12 @@ class ZenohMiddleware:
         token = topic.key
         for template in topic.tokens.get(role, ()):
             token = template.replace("{zid}", str(self._session.zid()))
-            self._declared.append(self._session.liveliness().declare_token(token))
+            self._declarations.append(self._session.liveliness().declare_token(token))
         return token
 
     def close(self) -> None:
         """Close the session."""
-        self._declared.clear()
+        self._declarations.clear()
         self._session.close()
 
 

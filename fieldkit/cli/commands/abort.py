@@ -5,7 +5,7 @@ from typing import Final
 
 from fieldkit.cli import shared_arguments as shared
 from fieldkit.cli.display import show_error, showing_events
-from fieldkit.cli.operators import confirmed
+from fieldkit.cli.operators import confirm
 from fieldkit.cli.parser import Parser
 from fieldkit.core import runtime
 from fieldkit.core.errors import FieldkitError, RobotError
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
                 sink(Note(_NO_ROBOTS))
                 return 0
             question = f"terminate every job of fieldkit on {', '.join(robots)}"
-            if not arguments.yes and not confirmed(question, remedy="fieldkit abort --yes"):
+            if not arguments.yes and not confirm(question, remedy="fieldkit abort --yes"):
                 print_text("nothing was terminated")
                 return FieldkitError.exit_code
             results = locks.abort(robots, runtime.user_at_host())

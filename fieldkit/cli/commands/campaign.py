@@ -70,7 +70,7 @@ def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int
         show_error(f"{failed} failed; reasons in the trial.csv of each trial below {folder}\n  remedy: {remedy}")
     if outcome.remaining:
         names = ", ".join(map(str, outcome.remaining))
-        show_error(f"skipped: {names}\n  remedy: run the same command again for the skipped trials")
+        show_error(f"skipped: {names}\n  remedy: to run the skipped trials, run the same command again")
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
         show_error(

@@ -46,7 +46,7 @@ def add(parser: Parser) -> None:
     parser.set_defaults(run=run)
 
 
-# No person places robots for a check. Robots that fieldkit places are next to each other.
+# No person places robots for a check. Robots that fieldkit places are put 1 m apart.
 _CLOSE = Distance(metres=1.0, label="check")
 
 
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         name, backend = cli_options.backend(arguments, sink)
         if (code := cli_options.run_elsewhere(backend, arguments, Path("trials"))) is not None:
             return code
-        cast = backend.cast(request.chosen_topology)
+        cast = backend.cast(request.effective_topology)
         plan = make_plan(
             request,
             backend=name,
@@ -79,10 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
         with backend.open(plan.cast, seed=plan.seed, sink=sink, operator=Unattended()) as lab:
             lab.place(plan.placement)
             sink(PhaseStarted("check"))
-            checked = preflight.check(
+            result = preflight.check(
                 plan, lab.shells, Path("trials"), all_checks=True, fleet_checks=_fleet_checks(arguments.fleet_checks)
             )
-            findings = checked.findings
+            findings = result.findings
         if arguments.json:
             for finding in findings:
                 sink(finding)

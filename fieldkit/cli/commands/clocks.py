@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     with showing_events(as_json=arguments.json) as sink, ExitStack() as stack:
         _, backend = cli_options.backend(arguments, sink)
         robots: dict[str, Shell | FieldkitError] = dict(stack.enter_context(backend.persistent_shells(sink=sink)))
-        if not robots:  # they run only while their lab runs
+        if not robots:  # emulated robots run only while their lab runs
             cast = _any_cast(backend)
             testbed = stack.enter_context(backend.open(cast, seed=1, sink=sink, operator=Unattended()))
             robots = {robot.name: testbed.shells[role] for role, robot in cast.items()}

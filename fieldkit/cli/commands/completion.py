@@ -123,15 +123,15 @@ def _backends(_prefix: str) -> Iterable[str]:
 
 
 def _quantities(_prefix: str) -> Iterable[str]:
-    from fieldkit.trial.columns import installed
+    from fieldkit.trial.columns import installed_columns
 
-    return (column.name for column in installed() if column.figure)
+    return (column.name for column in installed_columns() if column.figure)
 
 
 def _columns(_prefix: str) -> Iterable[str]:
-    from fieldkit.trial.columns import installed
+    from fieldkit.trial.columns import installed_columns
 
-    return (column.name for column in installed())
+    return (column.name for column in installed_columns())
 
 
 _FILES: Final = FilesCompleter()

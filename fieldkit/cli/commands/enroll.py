@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fieldkit.cli.operators import confirmed
+from fieldkit.cli.operators import confirm
 from fieldkit.cli.parser import Parser
 from fieldkit.config.locations import SITE_FILE
 from fieldkit.core.deadline import Deadline
@@ -36,35 +36,35 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Pin the key, unless it is pinned already."""
     from fieldkit.config.site_edits import pin_host_key
-    from fieldkit.remote.login import offered_key
+    from fieldkit.remote.login import read_host_key
     from fieldkit.remote.sockets import over_tcp
     from fieldkit.remote.ssh import CONNECT_S
 
     name, path = arguments.robot, arguments.site
     robot, where = _robot(name, path)
     address = Address(name, robot.host or "", robot.port)
-    pinned = _pinned_key(name, robot, ignore_invalid=arguments.replace)
-    offered = offered_key(
+    pinned_key = _pinned_key(name, robot, ignore_invalid=arguments.replace)
+    robot_key = read_host_key(
         address,
         over_tcp(address.host, address.port),
         deadline=Deadline.after(CONNECT_S),
-        kind=pinned.kind if pinned else "ssh-ed25519",
+        kind=pinned_key.kind if pinned_key else "ssh-ed25519",
     )
-    if offered == pinned:
-        print_text(f"{name}: this key is already pinned: {offered.fingerprint}")
+    if robot_key == pinned_key:
+        print_text(f"{name}: this key is already pinned: {robot_key.fingerprint}")
         return 0
-    if pinned is not None and not arguments.replace:
+    if pinned_key is not None and not arguments.replace:
         raise HostKeyError(
-            f"the host key changed: pinned {pinned.fingerprint}, offered {offered.fingerprint}",
+            f"the host key changed: pinned {pinned_key.fingerprint}, offered {robot_key.fingerprint}",
             where=f"{where}: {name}",
             remedy=f"if the robot was reinstalled: fieldkit enroll {name} --replace; if not, another computer "
             "answered",
         )
-    _show(address, offered, pinned)
-    if not arguments.yes and not confirmed("pin it", remedy="compare the fingerprints, then add --yes"):
+    _show(address, robot_key, pinned_key)
+    if not arguments.yes and not confirm("pin it", remedy="compare the fingerprints, then add --yes"):
         print_text("not pinned")
         return FieldkitError.exit_code
-    pin_host_key(path, name, offered.text)
+    pin_host_key(path, name, robot_key.text)
     print_text(f"pinned in {path}")
     return 0
 
@@ -101,8 +101,12 @@ def _pinned_key(name: str, robot: "SiteRobot", *, ignore_invalid: bool) -> HostK
         raise
 
 
-def _show(address: Address, offered: HostKey, pinned: HostKey | None) -> None:
-    if pinned is not None:
-        print_text(f"pinned before: {pinned.kind} {pinned.fingerprint}")
-    print_text(f"{address.robot} at {address.host} port {address.port} offers: {offered.kind} {offered.fingerprint}")
-    print_text(f"compare it with the output of this command on the robot's console:\n  {offered.fingerprint_command}")
+def _show(address: Address, robot_key: HostKey, pinned_key: HostKey | None) -> None:
+    if pinned_key is not None:
+        print_text(f"pinned before: {pinned_key.kind} {pinned_key.fingerprint}")
+    print_text(
+        f"{address.robot} at {address.host} port {address.port} offers: {robot_key.kind} {robot_key.fingerprint}"
+    )
+    print_text(
+        f"compare it with the output of this command on the robot's console:\n  {robot_key.fingerprint_command}"
+    )

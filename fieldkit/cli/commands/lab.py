@@ -87,7 +87,7 @@ def _add_sdf(actions: Commands) -> None:
         "sdf",
         help="print the world of the robots for Gazebo",
         description="Print the world of the site file and its robots as SDF, for `physics: gazebo` of labs and "
-        "trials. Robots that Gazebo does not move are not in it.",
+        "trials. The SDF does not contain robots that Gazebo does not move.",
         epilog="example: fieldkit lab sdf > lab.sdf",
     )
     parser.add_choice(
@@ -125,7 +125,7 @@ def _add_move(actions: Commands) -> None:
         nargs="+",
         type=str.strip,
         metavar="LENGTH",
-        help="EAST NORTH [UP] from where it is, UP over the ground",
+        help="EAST NORTH [UP] from its position, UP above the ground",
     )
     parser.set_defaults(run=move)
 
@@ -191,7 +191,7 @@ def list_robots(arguments: argparse.Namespace) -> int:
 def _show_lateness(lateness: "LabLateness") -> None:
     """Print the lateness of a co-simulation, and a note if it was above its bound."""
     parts = (("packets", lateness.packet_max_s), ("windows", lateness.window_max_s))
-    texts = [f"{name} at most {late_s * 1e3:.3g} ms" for name, late_s in parts if late_s is not None]
+    texts = [f"{name} at most {max_late_s * 1e3:.3g} ms" for name, max_late_s in parts if max_late_s is not None]
     print_text(f"late: {', '.join(texts) or 'nothing'}; {format_count(lateness.windows, 'window')}")
     if lateness.late:
         show_note(
@@ -206,13 +206,13 @@ def move(arguments: argparse.Namespace) -> int:
     from fieldkit.lab import requests
     from fieldkit.lab.robots import Destination
 
-    relative = arguments.to is None
-    option, words = ("--by", arguments.by) if relative else ("--to", arguments.to)
+    is_relative = arguments.to is None
+    option, words = ("--by", arguments.by) if is_relative else ("--to", arguments.to)
     if len(words) not in {2, 3}:
         raise ConfigurationError(f"{option} takes EAST NORTH [UP], not {' '.join(words)!r}", remedy=_EXAMPLE)
     east_m, north_m, *up_m = map(parse_offset_m, words)
-    to = Destination(east_m, north_m, up_m[0] if up_m else None, relative)
-    place_m = requests.move(_lab_folder(), arguments.robot, to)
+    destination = Destination(east_m, north_m, up_m[0] if up_m else None, is_relative)
+    place_m = requests.move(_lab_folder(), arguments.robot, destination)
     print_text(f"{arguments.robot} is at {_place(place_m)} (m east, north, up)")
     return 0
 
@@ -271,8 +271,8 @@ def plot(arguments: argparse.Namespace) -> int:
     from fieldkit.report import figures, theme
 
     out: Path = arguments.out
-    form = theme.format_of(out, "--out")
-    files.write(out, figures.overview(_overview(arguments), form))
+    file_format = theme.format_of(out, "--out")
+    files.write(out, figures.overview(_overview(arguments), file_format))
     print_text(out)
     return 0
 

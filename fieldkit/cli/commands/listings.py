@@ -89,38 +89,39 @@ def run_columns(arguments: argparse.Namespace) -> int:
 
 
 def _columns_of(procedure: str) -> int:
-    """List the columns that the steps of a procedure fill, given by its name or its file."""
-    from fieldkit.trial.columns import filled_by
+    """List the columns that the steps of a procedure fill. The procedure is given by its name or its file."""
+    from fieldkit.trial.columns import filled_columns
     from fieldkit.trial.procedure import load_procedure, read_procedure
 
     path = Path(procedure)
-    loaded = read_procedure(path) if path.suffix == ".yaml" else load_procedure(procedure)
-    filled = filled_by(placed.step for placed in loaded.walk())
+    parsed_procedure = read_procedure(path) if path.suffix == ".yaml" else load_procedure(procedure)
+    shown_columns = filled_columns(placed.step for placed in parsed_procedure.walk())
     rows = [
-        (column.name, column.unit, column.figure.kind if column.figure else "", column.meaning) for column in filled
+        (column.name, column.unit, column.figure.kind if column.figure else "", column.meaning)
+        for column in shown_columns
     ]
-    table(("column", "unit", "repeats make a", "meaning"), rows)
+    table(("column", "unit", "aggregated as", "meaning"), rows)
     return 0
 
 
 def _columns(name: str | None) -> int:
     """List the columns of all files, or the columns called `name`."""
     from fieldkit.analysis.quantities import DEFAULT_BY
-    from fieldkit.trial.columns import installed
+    from fieldkit.trial.columns import installed_columns
 
-    trial = installed()
-    files = {
+    trial = installed_columns()
+    columns_by_file = {
         "trial.csv": trial,
         "summary.csv": (*(column for column in trial if column.name in DEFAULT_BY), *declared(EstimateRow)),
         "compare": declared(DifferenceRow),
     }
-    column_names = {column.name for columns in files.values() for column in columns}
+    column_names = {column.name for columns in columns_by_file.values() for column in columns}
     selected_name = (
         name if name is None or name in column_names else plain_name(name)
     )  # a named step adds its name to the column's name
     rows = [
         (file, column.name, column.unit, column.meaning)
-        for file, columns in files.items()
+        for file, columns in columns_by_file.items()
         for column in columns
         if selected_name in {None, column.name}
     ]

@@ -12,7 +12,7 @@ from fieldkit.cli.parser import Parser
 from fieldkit.core.text import print_text
 
 if TYPE_CHECKING:
-    from fieldkit.trial.stored.rebuild import Rebuilt
+    from fieldkit.trial.stored.rebuild import RebuildResult
 
 
 def add(parser: Parser) -> None:
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _show_summary(rebuilt: "Rebuilt", *, show_all: bool) -> None:
+def _show_summary(rebuilt: "RebuildResult", *, show_all: bool) -> None:
     from fieldkit.cli import results
 
     if left_out := results.show_summary(rebuilt.cells, show_all=show_all, expected=rebuilt.expected):
@@ -62,12 +62,13 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
     from fieldkit.core.tasks import completed
     from fieldkit.trial.stored import rebuild
 
-    absolute = [folder.absolute() for folder in folders]  # workers of a cluster have another working directory
+    # Workers of a cluster have another working directory.
+    absolute_folders = [folder.absolute() for folder in folders]
     exit_code = 0
     with showing_progress() as sink:
         report = partial(Progress, "rebuild", total=len(folders), unit="trials")
         workers = Workers(arguments.jobs, arguments.cluster)
-        for done, end in enumerate(completed(rebuild.rebuild, absolute, workers, show_note), start=1):
+        for done, end in enumerate(completed(rebuild.rebuild, absolute_folders, workers, show_note), start=1):
             sink(report(done=done))
             folder = folders[end.number]
             if end.result is not None:
@@ -81,10 +82,10 @@ def _rebuild_many(folders: Sequence[Path], arguments: argparse.Namespace) -> int
     return exit_code
 
 
-def _note_missing_manifest(folder: Path, rebuilt: "Rebuilt") -> None:
+def _note_missing_manifest(folder: Path, rebuilt: "RebuildResult") -> None:
     if not rebuilt.has_manifest:
         show_note(f"{folder}: there is no manifest to verify its evidence with")
 
 
-def _changes(rebuilt: "Rebuilt") -> str:
+def _changes(rebuilt: "RebuildResult") -> str:
     return f"changed: {', '.join(rebuilt.changed)}" if rebuilt.changed else "the same bytes as before"

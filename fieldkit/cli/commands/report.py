@@ -26,7 +26,7 @@ def add(parser: Parser) -> None:
         metavar="FILE",
         help="the page (default report.html)",
     )
-    parser.add_argument("--title", default="", help="its title (default: made from the procedures)")
+    parser.add_argument("--title", default="", help="its title (default: derived from the procedures)")
     parser.add_argument(
         "--repeat",
         default="",
@@ -61,9 +61,9 @@ def run(arguments: argparse.Namespace) -> int:
     data = sources.find(
         arguments.paths, show_note, rebuild=arguments.rebuild, use_index=arguments.use_index
     ).with_filter(arguments.where)
-    selected_names = [data.quantity(name).name for name in arguments.quantity]
+    quantity_names = [data.quantity(name).name for name in arguments.quantity]
     repeats = data.read()
-    with_attempts = (
+    folders_with_attempts = (
         {str(table.parent) for table in data.tables} if arguments.where else set(repeats.texts["source"].tolist())
     )
     report_contents = contents.build_contents(
@@ -72,8 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
         repeat=arguments.repeat,
         command=_command(arguments),
         paths=list(map(str, arguments.paths)),
-        quantities=selected_names,
-        unmeasured=list(unmeasured(arguments.paths, with_attempts, show_note)),
+        quantities=quantity_names,
+        unmeasured=list(unmeasured(arguments.paths, folders_with_attempts, show_note)),
         sweep=data.sweep_columns,
     )
     page.write(report_contents, out)

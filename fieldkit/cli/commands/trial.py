@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         cli_options.request(arguments, parse_distance(text), seed=arguments.seed, notes=arguments.notes)
         for text in arguments.distances
     ]
-    topology = requests[0].chosen_topology
+    topology = requests[0].effective_topology
     with showing_events(as_json=arguments.json) as sink, interruptible() as stop:
         name, backend = cli_options.backend(arguments, sink)
         cast = backend.cast(topology)
@@ -76,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
         if plans[0].procedure.expectations:
             from fieldkit.trial.check import shortfalls
 
-            for line in shortfalls.of_plan(plans[0]):
+            for line in shortfalls.undecidable_expectations(plans[0]):
                 sink(Note(line))
         if arguments.dry_run:
             from fieldkit.cli import dry_run
@@ -109,6 +109,6 @@ def _announcement(plans: "list[Plan]") -> str:
 
     protocols = " and ".join(protocol.upper() for protocol in plans[0].protocols)
     places = f" at each of {len(plans)} distances" if len(plans) > 1 else ""
-    duration = estimates.total(estimates.of_trial(plan, []) for plan in plans)
-    failed_links = "" if duration.is_certain else " if links fail"
-    return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}{failed_links}"
+    duration = estimates.total(estimates.estimate_trial(plan, []) for plan in plans)
+    condition = "" if duration.is_certain else " if links fail"
+    return f"{format_count(plans[0].repeats, 'repeat')} of {protocols}{places}, about {duration}{condition}"

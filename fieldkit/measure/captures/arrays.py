@@ -1,4 +1,4 @@
-"""Tables of numpy columns, and integers read from a file's bytes at one position per row."""
+"""Tables of numpy columns, and functions that read an integer per row from the bytes of a file."""
 
 import math
 from collections.abc import Iterable
@@ -26,7 +26,7 @@ _MULTIPLIER: Final = np.uint64(0x9E3779B97F4A7C15)
 
 
 def layout(order: Order, size_bytes: int, **fields: tuple[int, int]) -> np.dtype[np.void]:
-    """Return the data type of a header of unsigned integers; each field is given as (offset, size) in bytes."""
+    """Return the numpy type of a header of unsigned integers; `fields` gives the offset and size of each in bytes."""
     return np.dtype(
         {
             "names": list(fields),
@@ -39,19 +39,19 @@ def layout(order: Order, size_bytes: int, **fields: tuple[int, int]) -> np.dtype
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of equal length, which a subclass declares as its fields."""
+    """Columns of equal length. A subclass declares the columns as its fields."""
 
     def __len__(self) -> int:
         return len(next(iter(vars(self).values())))
 
-    def where(self, chosen: Mask | Ints | slice) -> Self:
-        """Return the rows that a mask or a slice selects, or the rows of an index array in its order."""
-        if not isinstance(chosen, slice) and chosen.dtype == np.bool_ and chosen.all():
+    def where(self, selection: Mask | Ints | slice) -> Self:
+        """Return the rows that a mask or a slice selects, or the rows at the indices of an array, in its order."""
+        if not isinstance(selection, slice) and selection.dtype == np.bool_ and selection.all():
             return self
-        return type(self)(**{name: column[chosen] for name, column in vars(self).items()})
+        return type(self)(**{name: column[selection] for name, column in vars(self).items()})
 
     def allocate(self, rows: int) -> Self:
-        """Return an uninitialized table with the same columns and this number of rows.
+        """Return an uninitialized table with the same columns and `rows` rows.
 
         All columns share one block of memory, so that the operating system can use large pages.
         """
@@ -68,7 +68,7 @@ class Table:
         )
 
     def write(self, at: int, rows: Self) -> None:
-        """Overwrite the rows from row `at` on."""
+        """Overwrite the rows of this table, starting at row `at`, with `rows`."""
         for name, column in vars(rows).items():
             vars(self)[name][at : at + len(rows)] = column
 
@@ -85,14 +85,14 @@ class Table:
         return table
 
 
-class Narrow:
-    """Column of a `Table` that is stored in few bytes and read as 64-bit integers.
+class NarrowColumn:
+    """Column of a `Table` that is stored in a narrow integer type and read as 64-bit integers.
 
-    Reading as 64-bit integers avoids overflows in additions and subtractions. A table has more than twenty columns of
-    millions of packets, and a computation reads only a few of them.
+    The narrow type saves memory, because a table has more than twenty columns of millions of packets. Reading as
+    64-bit integers avoids overflows in additions and subtractions.
 
     Args:
-        storage_type: Integer type in memory; must hold every value of the column.
+        storage_type: Integer type in memory, which can represent every value of the column.
     """
 
     def __init__(self, storage_type: type[np.integer[Any]]) -> None:
@@ -107,22 +107,22 @@ class Narrow:
         """Return a copy of the column.
 
         Raises:
-            AttributeError: Accessed on the class: the field has no default.
+            AttributeError: The column was read from the class instead of a table: the field has no default.
         """
         if table is None:
             raise AttributeError(self._name)
         return np.asarray(vars(table)[self._name], dtype=np.int64)
 
     def __set__(self, table: object, values: Ints) -> None:
-        """Store the values, which must fit into the storage type."""
+        """Store the values; each of them must fit into the storage type."""
         vars(table)[self._name] = np.asarray(values, dtype=self._storage_type)
 
 
 class Integers:
-    """Unsigned integers in a buffer, at any position.
+    """Reads unsigned integers at any positions of a buffer.
 
-    A position too close to the end of the buffer reads the last complete integer: the headers of a truncated packet
-    may extend beyond the file, and the caller masks the bytes that were not captured.
+    For a position too close to the end of the buffer, the last complete integer is read: the headers of a truncated
+    packet may extend beyond the end of the file, and the caller masks the bytes that were not captured.
     """
 
     def __init__(self, data: Buffer, order: Order = BIG) -> None:
@@ -152,21 +152,21 @@ class Integers:
         """Return the eight-byte integer at each position."""
         return self._read(8, at).astype(np.uint64)
 
-    def fields(self, form: np.dtype[np.void], at: Ints) -> "Fields":
-        """Return the headers at these positions, read with one access to the buffer for all fields.
+    def fields(self, header_type: np.dtype[np.void], at: Ints) -> "Fields":
+        """Return the headers of this numpy type at the positions; all their fields are read together.
 
         If the buffer ends inside a header, the missing bytes are zeros.
         """
-        size = form.itemsize
-        inside = at <= len(self._data) - size
+        size = header_type.itemsize
+        is_complete = at <= len(self._data) - size
         headers = np.ndarray(max(len(self._data) - size + 1, 0), f"V{size}", buffer=self._data, strides=(1,))
-        if inside.all():
-            return Fields(headers[at].view(form))
+        if is_complete.all():
+            return Fields(headers[at].view(header_type))
         rows = np.zeros(len(at), headers.dtype)
-        rows[inside] = headers[at[inside]]
-        for index in np.flatnonzero(~inside):
+        rows[is_complete] = headers[at[is_complete]]
+        for index in np.flatnonzero(~is_complete):
             rows[index] = np.void(bytes(self._data[at[index] : at[index] + size]).ljust(size, b"\0"))
-        return Fields(rows.view(form))
+        return Fields(rows.view(header_type))
 
     def _read(self, size: int, at: Ints) -> NDArray[Any]:
         view = self._views[size]
@@ -174,7 +174,7 @@ class Integers:
 
 
 def row_hashes(*columns: Ints | Keys) -> Keys:
-    """Return a hash per row. Equal rows have equal hashes; the chance of a collision is 1 in 2**64."""
+    """Return a hash for each row. Equal rows have equal hashes; two other rows collide with probability 2**-64."""
     hashes = np.zeros(len(columns[0]), dtype=np.uint64)
     for column in columns:
         hashes ^= column.view(np.uint64)
@@ -194,7 +194,7 @@ class Fields:
 
 
 NO_TIME: Final = -1
-"""Time of a frame that has no time in the file."""
+"""Time of a frame without a time stamp in the file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +222,7 @@ class Chunk:
 
     Attributes:
         frames: The frames.
-        damage: Position and kind of damage after the frames, in which case this chunk is the last; None if undamaged.
+        damage: Position and kind of the damage after the frames. This chunk is then the last one. None if undamaged.
     """
 
     frames: Frames

@@ -1,4 +1,4 @@
-"""Classic pcap files: a scan for the record boundaries, then the headers of all records are read together.
+"""Classic pcap files. A scan finds the record boundaries; then the headers of all records are read together.
 
 File format: draft-ietf-opsawg-pcap.
 """
@@ -30,7 +30,7 @@ _MAX_CAPTURED_BYTES: Final = 262_144
 
 
 def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
-    """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk.
+    """Yield the frames of a file in chunks of about `chunk_bytes`; there is at least one chunk.
 
     Raises:
         EvidenceError: The file ends inside its header, or has an unknown link type.
@@ -43,11 +43,11 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
     link_type = struct.unpack_from(f"{order}I", data, 20)[0] & 0xFFFF
     check_link_type(link_type, where=where)
     integers = Integers(data, order)
-    form = layout(order, _RECORD_HEADER_BYTES, seconds=(0, 4), ticks=(4, 4), captured=(8, 4), wire=(12, 4))
+    record_header = layout(order, _RECORD_HEADER_BYTES, seconds=(0, 4), ticks=(4, 4), captured=(8, 4), wire=(12, 4))
     at, count, damage = _FILE_HEADER_BYTES, 0, None
     while True:
         starts, at = _scan(data, order, at, min(at + chunk_bytes, size - _RECORD_HEADER_BYTES + 1))
-        frames, valid = _frames(integers, form, starts, link_type, ticks_per_s)
+        frames, valid = _frames(integers, record_header, starts, link_type, ticks_per_s)
         if not valid.all():
             frames = frames.where(slice(0, int(valid.argmin())))
             damage = f"no packet header at byte {starts[len(frames)]}, after packet {count + len(frames)}"
@@ -63,9 +63,10 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
 
 
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
-    """Return the start positions of the records from `at` to before `stop`, and the position of the next record.
+    """Return the positions of the records that start from `at` on and before `stop`, and of the record after them.
 
-    A snap length gives most records the same length. Such records are checked together, in groups of growing size.
+    If the packets were truncated to a snap length, most records have the same length. Such records are checked
+    together, in groups of growing size.
     """
     captured = struct.Struct(f"{order}I").unpack_from
     parts: list[Ints] = []
@@ -88,17 +89,17 @@ def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[Ints, int]:
 
 
 def _equal_length_run(data: Buffer, order: Order, at: int, step: int, count: int) -> int:
-    """Return the number of consecutive records of `step` bytes from `at` on, at most `count`."""
+    """Return the number of consecutive records with a length of `step` bytes from `at` on, at most `count`."""
     captured = np.ndarray(count, f"{order}u4", buffer=data, offset=at + 8, strides=(step,))
-    differ = captured != step - _RECORD_HEADER_BYTES
-    return int(differ.argmax()) if differ.any() else len(differ)
+    has_other_length = captured != step - _RECORD_HEADER_BYTES
+    return int(has_other_length.argmax()) if has_other_length.any() else count
 
 
 def _frames(
-    integers: Integers, form: np.dtype[np.void], start: Ints, link_type: int, ticks_per_s: int
+    integers: Integers, record_header: np.dtype[np.void], start: Ints, link_type: int, ticks_per_s: int
 ) -> tuple[Frames, Mask]:
-    """Return the frames of the records at the positions `start`, and a mask of valid record headers."""
-    head = integers.fields(form, start)
+    """Return the frames of the records at the positions `start`, and a mask of the valid record headers."""
+    head = integers.fields(record_header, start)
     ticks, captured, wire = head["ticks"], head["captured"], head["wire"]
     frames = Frames(
         start=start + _RECORD_HEADER_BYTES,

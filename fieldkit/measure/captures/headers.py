@@ -1,4 +1,4 @@
-"""IP headers of frames as columns. RFC 791 (IPv4), RFC 1071 (checksums); `ipv6_headers` reads those of IPv6."""
+"""IP headers of frames as columns: RFC 791 (IPv4), RFC 1071 (checksums). `ipv6_headers` decodes IPv6 headers."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,9 +15,9 @@ NO_HEADER: Final = -1
 """Position for a frame without an IP header."""
 
 RAW_LINKS: Final = frozenset((12, 14, 101, 228, 229))
-"""Link types whose frames are IP packets: DLT_RAW of most systems, of OpenBSD, LINKTYPE_RAW, IPv4, IPv6.
+"""Link types whose frames are IP packets: DLT_RAW of most systems, DLT_RAW of OpenBSD, LINKTYPE_RAW, IPv4, IPv6.
 
-`link_layers` has the other supported link types.
+`link_layers` supports further link types.
 """
 
 
@@ -40,17 +40,17 @@ def check_link_type(*link_types: int, where: str) -> None:
 
 
 def network(integers: Integers, frames: Frames) -> Ints:
-    """Return the position of each frame's IP header in the file; `NO_HEADER` if it has none or is unknown."""
+    """Return the position of each frame's IP header in the file; `NO_HEADER` if none is found."""
     header_at = np.full(len(frames), NO_HEADER)
     for link_type in np.flatnonzero(np.bincount(frames.link_type)).tolist():
-        chosen = np.flatnonzero(frames.link_type == link_type)
+        rows = np.flatnonzero(frames.link_type == link_type)
         if link_type in RAW_LINKS:
-            header_at[chosen] = frames.start[chosen]
+            header_at[rows] = frames.start[rows]
             continue
         from fieldkit.measure.captures.link_layers import LINKS  # noqa: PLC0415 (other link types only)
 
         if link_type in LINKS:
-            header_at[chosen] = LINKS[link_type](integers, frames.where(chosen))
+            header_at[rows] = LINKS[link_type](integers, frames.where(rows))
     return header_at
 
 
@@ -60,7 +60,7 @@ UDP: Final = 17
 SCTP: Final = 132
 
 Addresses = NDArray[np.uint64]
-"""Shape (n, 2): the halves of an IPv6 address, upper first; an IPv4 address as IPv4-mapped (RFC 4291, 2.5.5.2)."""
+"""Shape (n, 2): upper and lower half of each IPv6 address. IPv4 addresses are IPv4-mapped (RFC 4291, 2.5.5.2)."""
 
 _IPV4_HEADER_BYTES: Final = 20
 _IPV4: Final = layout(
@@ -95,7 +95,7 @@ class Headers(Table):
         more_fragments: True if more fragments follow.
         header_bytes: Length of the header and its extension headers.
         payload_at: Index of the first byte after the header and its extension headers in the file.
-        payload_bytes: Length of the payload by the header, even if fewer bytes were captured.
+        payload_bytes: Length of the payload according to the header, even if fewer bytes were captured.
         wrong_checksum: True if the header checksum of IPv4 is wrong.
     """
 
@@ -122,30 +122,30 @@ def address(text: str) -> tuple[int, int]:
 
 @lru_cache(maxsize=1024)
 def address_text(upper: int, lower: int) -> str:
-    """Return the usual text of an address whose two halves are given."""
+    """Return the text form of an address that is given as two halves."""
     ipv6 = IPv6Address(upper << 64 | lower)
     return str(ipv6.ipv4_mapped or ipv6)
 
 
 def ip_headers(integers: Integers, frames: Frames, at: Ints) -> Headers:
-    """Return the complete and valid IP headers at the positions `at` in `frames`; a negative position has none."""
+    """Return the complete and valid IP headers of `frames` at the positions `at`, which are negative without one."""
     captured = np.where(at < 0, 0, frames.start + frames.captured_bytes - at)
     version = integers.u8(np.maximum(at, 0)) >> 4
     ipv4_frames = np.flatnonzero((version == 4) & (captured >= _IPV4_HEADER_BYTES))
     ipv6_frames = np.flatnonzero((version == 6) & (captured >= IPV6_HEADER_BYTES))
     wire = frames.wire_bytes - (at - frames.start)
-    parts = [_ipv4(integers, ipv4_frames, at[ipv4_frames], captured[ipv4_frames], wire[ipv4_frames])]
+    parts = [_ipv4_headers(integers, ipv4_frames, at[ipv4_frames], captured[ipv4_frames], wire[ipv4_frames])]
     if not len(ipv6_frames):
         return parts[0]
     from fieldkit.measure.captures.ipv6_headers import ipv6_headers  # noqa: PLC0415 (most captures have none)
 
-    both = Headers.concatenated(
+    headers = Headers.concatenated(
         [*parts, ipv6_headers(integers, ipv6_frames, at[ipv6_frames], captured[ipv6_frames], wire[ipv6_frames])]
     )
-    return both.where(np.argsort(both.frame))
+    return headers.where(np.argsort(headers.frame))
 
 
-def _ipv4(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
+def _ipv4_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints) -> Headers:
     head = integers.fields(_IPV4, at)
     header = (head["length"] & 0xF) * 4
     # Segmentation offload leaves the total length 0 in frames above 64 KiB; the wire length is used instead.
@@ -153,8 +153,8 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints)
     fragment = head["fragment"]
     ipv4 = Headers(
         frame=frame,
-        src=_mapped(head["src"]),
-        dst=_mapped(head["dst"]),
+        src=_to_ipv4_mapped(head["src"]),
+        dst=_to_ipv4_mapped(head["dst"]),
         protocol=head["protocol"],
         ip_id=head["ip_id"],
         fragment_offset=(fragment & 0x1FFF) * 8,
@@ -162,37 +162,37 @@ def _ipv4(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire: Ints)
         header_bytes=header,
         payload_at=at + header,
         payload_bytes=total - header,
-        wrong_checksum=_wrong_checksums(integers, head, at, np.minimum(header, captured)),
+        wrong_checksum=_has_wrong_checksum(integers, head, at, np.minimum(header, captured)),
     )
     valid = (header >= _IPV4_HEADER_BYTES) & (header <= captured) & (total >= header)
     return ipv4 if valid.all() else ipv4.where(valid)
 
 
-def _wrong_checksums(integers: Integers, head: Fields, at: Ints, header: Ints) -> Mask:
-    """Return a mask of the headers whose checksum is wrong (RFC 1071: the words of a header add up to -0).
+def _has_wrong_checksum(integers: Integers, head: Fields, at: Ints, header: Ints) -> Mask:
+    """Return a mask of the headers with a wrong checksum (RFC 1071: the words of a valid header add up to -0).
 
-    A checksum of 0 was not computed: on some systems the adapter computes it, after the capture. Linux computes it
-    before the capture, also with offload, and drops received packets in which it is wrong.
+    A checksum of 0 is not wrong: on some systems the network adapter computes it after the capture. Linux computes
+    it before the capture, even with offload, and drops received packets with a wrong one.
 
     Args:
         integers: The file.
         head: The headers without options.
         at: Position of each header.
-        header: Length of each header with its options, as far as it was captured.
+        header: Captured length of each header including its options, in bytes.
     """
     total = head["word0"] + head["word1"] + head["word2"] + head["src"] + head["dst"]
-    longer = np.flatnonzero(header > _IPV4_HEADER_BYTES)
-    option = _IPV4_HEADER_BYTES
-    while len(longer):
-        total[longer] += integers.u32(at[longer] + option)
-        option += 4
-        longer = longer[header[longer] > option]
-    # 2**16 is 1 modulo 0xFFFF, so words of 32 bits have the same sum in one's complement as words of 16 bits.
+    with_options = np.flatnonzero(header > _IPV4_HEADER_BYTES)
+    option_at = _IPV4_HEADER_BYTES
+    while len(with_options):
+        total[with_options] += integers.u32(at[with_options] + option_at)
+        option_at += 4
+        with_options = with_options[header[with_options] > option_at]
+    # 2**16 is 1 modulo 0xFFFF, so the one's complement sum of 32-bit words equals the sum of 16-bit words.
     wrong: Mask = (total % 0xFFFF != 0) & (head["checksum"] != 0)
     return wrong
 
 
-def _mapped(value: Ints) -> Addresses:
+def _to_ipv4_mapped(value: Ints) -> Addresses:
     halves = np.zeros((len(value), 2), dtype=np.uint64)
     halves[:, 1] = value | _MAPPED
     return halves

@@ -14,8 +14,8 @@ _HOP_BY_HOP: Final = 0
 _FRAGMENT: Final = 44
 _AUTHENTICATION: Final = 51
 _JUMBO_OPTION: Final = 0xC204
-# Hop-by-hop, routing, fragment, authentication, destination, mobility, host identity, shim6: one format, except for
-# the encoding of the length.
+# Hop-by-hop, routing, fragment, authentication, destination, mobility, host identity and shim6 headers have the same
+# format, except for the encoding of the length.
 _IS_EXTENSION: Final = np.isin(np.arange(256), (_HOP_BY_HOP, 43, _FRAGMENT, _AUTHENTICATION, 60, 135, 139, 140))
 
 
@@ -26,8 +26,8 @@ def ipv6_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire
         integers: The file.
         frame: Indices of the frames.
         at: Positions of the headers in the file.
-        captured: Number of captured bytes from each position on.
-        wire: Number of bytes that were sent from each position on.
+        captured: Number of captured bytes from each position to the end of the frame.
+        wire: Number of bytes on the link from each position to the end of the frame.
     """
     end = at + captured
     protocol = integers.u8(at + 6)
@@ -35,20 +35,24 @@ def ipv6_headers(integers: Integers, frame: Ints, at: Ints, captured: Ints, wire
     payload_at = at + IPV6_HEADER_BYTES
     ip_id, fragment = np.zeros_like(at), np.zeros_like(at)
 
-    inside = np.flatnonzero(_IS_EXTENSION[protocol] & (payload_at + 8 <= end))
-    while len(inside):
-        header_at, kind = payload_at[inside], protocol[inside]
+    unfinished = np.flatnonzero(_IS_EXTENSION[protocol] & (payload_at + 8 <= end))
+    while len(unfinished):
+        header_at, kind = payload_at[unfinished], protocol[unfinished]
         units = integers.u8(header_at + 1)
         size = np.where(kind == _AUTHENTICATION, (units + 2) * 4, (units + 1) * 8)
-        fragmented = kind == _FRAGMENT
-        size[fragmented] = 8
-        fragment[inside[fragmented]] = integers.u16(header_at[fragmented] + 2)
-        ip_id[inside[fragmented]] = integers.u32(header_at[fragmented] + 4)
-        protocol[inside] = integers.u8(header_at)
-        payload_at[inside] = header_at + size
+        is_fragment = kind == _FRAGMENT
+        size[is_fragment] = 8
+        fragment[unfinished[is_fragment]] = integers.u16(header_at[is_fragment] + 2)
+        ip_id[unfinished[is_fragment]] = integers.u32(header_at[is_fragment] + 4)
+        protocol[unfinished] = integers.u8(header_at)
+        payload_at[unfinished] = header_at + size
         # In a fragment other than the first, the data after the fragment header is payload.
-        continues = _IS_EXTENSION[protocol[inside]] & (header_at + size + 8 <= end[inside]) & (fragment[inside] < 8)
-        inside = inside[continues]
+        continues = (
+            _IS_EXTENSION[protocol[unfinished]]
+            & (header_at + size + 8 <= end[unfinished])
+            & (fragment[unfinished] < 8)
+        )
+        unfinished = unfinished[continues]
     return Headers(
         frame=frame,
         src=_halves(integers, at + 8),

@@ -1,4 +1,4 @@
-"""Headers of the link layer: positions of the IP headers by link type.
+"""Headers of the link layer: for each link type, a function that finds the IP headers of frames.
 
 Sources: https://www.tcpdump.org/linktypes.html, https://www.radiotap.org, IEEE 802.1Q, IEEE 802.11-2020 section 9.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from fieldkit.measure.captures.arrays import LITTLE, Frames, Integers, Ints, Mask
 from fieldkit.measure.captures.headers import NO_HEADER
 
-Finder = Callable[[Integers, Frames], Ints]
+HeaderFinder = Callable[[Integers, Frames], Ints]
 
 _IP_TYPES: Final = (0x0800, 0x86DD)
 _TAG_TYPES: Final = (0x8100, 0x88A8, 0x9100)
@@ -23,24 +23,24 @@ _RADIOTAP_HEADER_BYTES: Final = 8
 
 
 def _after_ethertype(integers: Integers, frames: Frames, type_at: Ints, network: Ints) -> Ints:
-    """Return the position of the IP header after an EtherType, skipping VLAN tags.
+    """Return the positions of the IP headers after the EtherTypes; VLAN tags are skipped.
 
     Args:
         integers: The file.
         frames: Its frames.
         type_at: Positions of the EtherTypes.
-        network: Positions of the bytes that the EtherTypes describe.
+        network: Positions of the payloads whose type the EtherTypes state.
     """
     type_at, network = type_at.copy(), network.copy()
-    kind = integers.u16(type_at)
+    ethertype = integers.u16(type_at)
     end = frames.start + frames.captured_bytes
-    tagged = np.flatnonzero(_is_in(kind, _TAG_TYPES))
+    tagged = np.flatnonzero(_is_in(ethertype, _TAG_TYPES))
     while len(tagged):
         type_at[tagged] = network[tagged] + 2
         network[tagged] += 4
-        kind[tagged] = integers.u16(type_at[tagged])
-        tagged = tagged[_is_in(kind[tagged], _TAG_TYPES) & (network[tagged] < end[tagged])]
-    return np.where(_is_in(kind, _IP_TYPES), network, NO_HEADER)
+        ethertype[tagged] = integers.u16(type_at[tagged])
+        tagged = tagged[_is_in(ethertype[tagged], _TAG_TYPES) & (network[tagged] < end[tagged])]
+    return np.where(_is_in(ethertype, _IP_TYPES), network, NO_HEADER)
 
 
 def _ethernet(integers: Integers, frames: Frames) -> Ints:
@@ -56,44 +56,44 @@ def _cooked_v2(integers: Integers, frames: Frames) -> Ints:
 
 
 def _null(integers: Integers, frames: Frames) -> Ints:
-    """Return the positions after the address family, whose byte order may differ from the byte order of the file."""
+    """Return the positions after the address family, which may have another byte order than the file."""
     family = integers.u32(frames.start)
     is_ip = _is_in(family, _IP_FAMILIES) | _is_in(family, [number << 24 for number in _IP_FAMILIES])
     return np.where(is_ip, frames.start + 4, NO_HEADER)
 
 
 def _radiotap(integers: Integers, frames: Frames) -> Ints:
-    """Skip the radiotap header. A frame with a bad checksum (FCS) counts as a frame without an IP header."""
+    """Return the positions of the IP headers after radiotap headers; `NO_HEADER` if the FCS is wrong."""
     little = integers.with_order(LITTLE)
     length = little.u16(frames.start + 2)
     end = frames.start + np.minimum(length, frames.captured_bytes)
     present = little.u32(frames.start + 4)
-    after = frames.start + _RADIOTAP_HEADER_BYTES
+    fields_at = frames.start + _RADIOTAP_HEADER_BYTES
     extended = np.flatnonzero(present >> 31)
     while len(extended):
-        more = little.u32(after[extended]) >> 31 == 1
-        after[extended] += 4
-        extended = extended[more & (after[extended] < end[extended])]
-    # The flags follow the time stamp, which is aligned to 8 bytes.
+        is_extended = little.u32(fields_at[extended]) >> 31 == 1
+        fields_at[extended] += 4
+        extended = extended[is_extended & (fields_at[extended] < end[extended])]
+    # The flags follow the time stamp, if there is one. The time stamp is aligned to 8 bytes.
     has_timestamp = present & 1 == 1
-    flags_at = np.where(has_timestamp, frames.start + (after - frames.start + 7) // 8 * 8 + 8, after)
+    flags_at = np.where(has_timestamp, frames.start + (fields_at - frames.start + 7) // 8 * 8 + 8, fields_at)
     flags = np.where((present & 2 == 2) & (flags_at < end), integers.u8(flags_at), 0)
-    network = _from_80211(integers, frames, frames.start + length, padded=flags & 0x20 != 0)
+    network = _after_mac_header(integers, frames, frames.start + length, padded=flags & 0x20 != 0)
     return np.where((integers.u8(frames.start) == 0) & (flags & 0x40 == 0), network, NO_HEADER)
 
 
 def _80211(integers: Integers, frames: Frames) -> Ints:
-    return _from_80211(integers, frames, frames.start, padded=np.zeros(len(frames), dtype=np.bool_))
+    return _after_mac_header(integers, frames, frames.start, padded=np.zeros(len(frames), dtype=np.bool_))
 
 
-def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) -> Ints:
-    """Return the positions of the IP headers in data frames.
+def _after_mac_header(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) -> Ints:
+    """Return the positions of the IP headers in data frames of IEEE 802.11.
 
     Args:
         integers: The file.
         frames: Its frames.
-        mac: Positions of their MAC headers.
-        padded: Mask of frames whose MAC header is padded to a multiple of four bytes.
+        mac: Positions of the MAC headers.
+        padded: Mask of the frames whose MAC header is padded to a multiple of four bytes.
     """
     kind, flags = integers.u8(mac), integers.u8(mac + 1)
     qos = kind & 0x80 != 0
@@ -102,7 +102,7 @@ def _from_80211(integers: Integers, frames: Frames, mac: Ints, *, padded: Mask) 
     aggregated = qos & (integers.u8(mac + header - 2) & 0x80 != 0)
     header += 4 * (qos & (flags & 0x80 != 0))  # HT control
     llc = mac + np.where(padded, (header + 3) // 4 * 4, header)
-    # Data frames of version 0, except null frames, encrypted frames, later fragments and aggregates (A-MSDU).
+    # These are the data frames of version 0, except null frames, encrypted frames, later fragments and A-MSDUs.
     readable = (kind & 0x4F == 0x08) & (flags & 0x40 == 0) & (integers.u8(mac + 22) & 0x0F == 0) & ~aggregated
     readable &= (integers.u32(llc) == _SNAP) & (integers.u16(llc + 4) == 0)
     return np.where(readable, _after_ethertype(integers, frames, llc + 6, llc + 8), NO_HEADER)
@@ -115,7 +115,7 @@ def _is_in(values: Ints, allowed: tuple[int, ...] | list[int]) -> Mask:
     return mask
 
 
-LINKS: Final[Mapping[int, Finder]] = MappingProxyType(
+LINKS: Final[Mapping[int, HeaderFinder]] = MappingProxyType(
     {
         0: _null,  # BSD loopback
         1: _ethernet,
@@ -126,4 +126,4 @@ LINKS: Final[Mapping[int, Finder]] = MappingProxyType(
         276: _cooked_v2,
     }
 )
-"""Functions by link type number; without those of `headers.RAW_LINKS`."""
+"""Function that finds the IP headers, by link type number. The types of `headers.RAW_LINKS` need no function."""

@@ -17,7 +17,7 @@ from fieldkit.measure.captures.arrays import (
     Integers,
     Ints,
     Mask,
-    Narrow,
+    NarrowColumn,
     Table,
     layout,
     row_hashes,
@@ -36,10 +36,10 @@ _TRANSPORT: Final = layout(
 )
 
 NO_PORT: Final = -1
-"""Port of a packet that has no port: a later fragment, or another protocol."""
+"""Port of a packet without ports: a later fragment, or a packet of another protocol."""
 
 NO_STAMP: Final = -1
-"""TCP time stamp of a packet that has none, or was truncated before it."""
+"""TCP time stamp of a packet that has no time stamp, or was truncated before it."""
 
 NO_ECHO: Final = -1
 """Identifier of a packet that is not an ICMP echo, or was truncated before it."""
@@ -51,8 +51,8 @@ NOT_CAPTURED: Final = -1
 """Content hash of a packet that was truncated before `CONTENT_BYTES` of content."""
 
 CONTENT_BYTES: Final = 32
-"""Number of content bytes that are compared. fieldkit's captures have at least this many after any headers: they
-capture 128 bytes of each packet."""
+"""Number of content bytes that are compared. fieldkit captures 128 bytes of each packet, so its captures contain at
+least this many bytes after the headers."""
 
 _CONTENT: Final = layout(LITTLE, CONTENT_BYTES, **{str(at): (at, 8) for at in range(0, CONTENT_BYTES, 8)})
 _FIRST_BYTES: Final = np.array([(1 << 8 * count) - 1 for count in range(9)], dtype=np.uint64).astype(np.int64)
@@ -74,28 +74,30 @@ class Packets(Table):
         src: Source address.
         dst: Destination address.
         protocol: IP protocol number after IPv6 extension headers.
-        ip_id: Identification, which the fragments of a datagram share; 0 in an IPv6 packet that is not a fragment.
+        ip_id: Identification, which is equal in all fragments of a datagram; 0 in an IPv6 packet that is not a
+            fragment.
         fragment_offset: Offset of the payload in its datagram in bytes; 0 except for later fragments.
         more_fragments: True if more fragments follow.
-        ip_header_bytes: Length of the IP header and its extensions.
-        ip_payload_bytes: Length after the IP header and its extensions, by the header, even if fewer bytes were
-            captured.
-        wrong_checksum: True if the header checksum of IPv4 is wrong, so that a field of the header was altered.
+        ip_header_bytes: Length of the IP header and its extension headers.
+        ip_payload_bytes: Length after the IP header and its extension headers according to the header, even if fewer
+            bytes were captured.
+        wrong_checksum: True if the header checksum of IPv4 is wrong, which shows that the header was altered.
         sport: Source port of TCP, UDP and SCTP, or `NO_PORT`.
         dport: Destination port, or `NO_PORT`.
         tcp_seq: TCP sequence number; 0 without a TCP header.
         tcp_ack: TCP acknowledgment number; 0 without a TCP header.
         tcp_flags: TCP flags; 0 without a TCP header.
-        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission; `NO_STAMP` if it has none.
-        tcp_mss: Maximum segment size option of a SYN; 0 if it has none.
+        tcp_stamp: TSval of the TCP time stamp option, which is larger in a retransmission; `NO_STAMP` without the
+            option.
+        tcp_mss: Maximum segment size option of a SYN; 0 without the option.
         tcp_payload_bytes: Length after the TCP header; 0 without a TCP header.
         udp_bytes: Length field of the UDP header, which includes the header; 0 without a UDP header.
         echo: Identifier of an ICMP echo request, which differs between ping processes; `ECHO_REPLY` is added in a
             reply. `NO_ECHO` for other packets.
         echo_seq: Sequence number of an ICMP echo request or reply; `NO_ECHO` for other packets.
         content: Hash of the first `CONTENT_BYTES` after the TCP or UDP header or, without one, after the IP header.
-            The transport checksum is not included, because offload computes it later. `NOT_CAPTURED` if one of these
-            bytes is missing.
+            The transport checksum is excluded, because with offload it is computed after the capture. `NOT_CAPTURED`
+            if one of these bytes is missing.
     """
 
     time_ns: Ints
@@ -144,33 +146,33 @@ _STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
         **dict.fromkeys(("sport", "dport", "echo", "echo_seq"), np.int32),
     }
 )
-"""Columns stored in fewer than eight bytes: the type holds the header field and the special values below 0."""
+"""Columns stored in fewer than eight bytes. A type fits the header field and the negative special values."""
 
 for _name, _storage_type in _STORAGE_TYPES.items():
-    _column = Narrow(_storage_type)
+    _column = NarrowColumn(_storage_type)
     _column.__set_name__(Packets, _name)
     setattr(Packets, _name, _column)
 
 
 def decode(integers: Integers, frames: Frames) -> Packets:
-    """Return the IP packets among `frames`; frames of other protocols or truncated in the IP header are omitted."""
+    """Return the IP packets of `frames`; frames of other protocols or with a truncated IP header are omitted."""
     ip = ip_headers(integers, frames, network(integers, frames))
     if len(ip) < len(frames):
         frames = frames.where(ip.frame)
     transport, payload, protocol = ip.payload_at, ip.payload_bytes, ip.protocol
-    # Ethernet pads short frames, so more bytes than the packet has may have been captured.
+    # Ethernet pads short frames, so the capture may contain more bytes than the packet.
     captured = np.minimum(frames.start + frames.captured_bytes - transport, payload)
 
-    first = ip.fragment_offset == 0
-    is_tcp, is_udp = first & (protocol == TCP), first & (protocol == UDP)
-    has_ports = (is_tcp | is_udp | first & (protocol == SCTP)) & (captured >= 4)
+    is_first = ip.fragment_offset == 0
+    is_tcp, is_udp = is_first & (protocol == TCP), is_first & (protocol == UDP)
+    has_ports = (is_tcp | is_udp | is_first & (protocol == SCTP)) & (captured >= 4)
     tcp, udp = is_tcp & (captured >= 20), is_udp & (captured >= UDP_HEADER_BYTES)
     head = integers.fields(_TRANSPORT, transport)
     tcp_header = (head["length"] >> 4) * 4
     tcp_flags = np.where(tcp, head["flags"], 0)
     options_end = transport + np.minimum(captured, tcp_header)
-    echo = _echoes(integers, first & (protocol == ICMP) & (captured >= 8), transport)
-    skipped = np.where(tcp, tcp_header, np.where(udp, UDP_HEADER_BYTES, 0))
+    echo = _echo_identifiers(integers, is_first & (protocol == ICMP) & (captured >= 8), transport)
+    transport_bytes = np.where(tcp, tcp_header, np.where(udp, UDP_HEADER_BYTES, 0))
     return Packets(
         time_ns=frames.time_ns,
         wire_bytes=frames.wire_bytes,
@@ -188,34 +190,36 @@ def decode(integers: Integers, frames: Frames) -> Packets:
         tcp_seq=np.where(tcp, head["seq"], 0),
         tcp_ack=np.where(tcp, head["ack"], 0),
         tcp_flags=tcp_flags,
-        tcp_stamp=_stamps(integers, tcp, transport, options_end),
+        tcp_stamp=_time_stamps(integers, tcp, transport, options_end),
         tcp_mss=_option(integers, np.flatnonzero(tcp_flags & SYN), transport, options_end, _MSS_OPTION, missing=0),
         tcp_payload_bytes=np.where(tcp, np.maximum(payload - tcp_header, 0), 0),
         udp_bytes=np.where(udp, head["udp_bytes"], 0),
         echo=echo,
         echo_seq=np.where(echo == NO_ECHO, NO_ECHO, integers.u16(np.where(echo == NO_ECHO, 0, transport + 6))),
-        content=_contents(integers, transport + skipped, captured - skipped, payload - skipped),
+        content=_content_hashes(
+            integers, transport + transport_bytes, captured - transport_bytes, payload - transport_bytes
+        ),
     )
 
 
-def _stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> Ints:
-    """Return the TSval of the packets in the mask `tcp`; their options end at `end`."""
+def _time_stamps(integers: Integers, tcp: Mask, transport: Ints, end: Ints) -> Ints:
+    """Return the TSval of the packets that the mask `tcp` selects; their options end at `end`."""
     stamps = np.full_like(transport, NO_STAMP)
     if not tcp.any():
         return stamps
-    aligned = tcp & (transport + 32 <= end)
-    aligned[aligned] = integers.u32(transport[aligned] + 20) == _ALIGNED_STAMP
-    stamps[aligned] = integers.u32(transport[aligned] + 24)
-    others = np.flatnonzero(tcp & ~aligned & (transport + 30 <= end))
-    return np.where(aligned, stamps, _option(integers, others, transport, end, _STAMP_OPTION, missing=NO_STAMP))
+    is_aligned = tcp & (transport + 32 <= end)
+    is_aligned[is_aligned] = integers.u32(transport[is_aligned] + 20) == _ALIGNED_STAMP
+    stamps[is_aligned] = integers.u32(transport[is_aligned] + 24)
+    others = np.flatnonzero(tcp & ~is_aligned & (transport + 30 <= end))
+    return np.where(is_aligned, stamps, _option(integers, others, transport, end, _STAMP_OPTION, missing=NO_STAMP))
 
 
-def _option(integers: Integers, chosen: Ints, transport: Ints, end: Ints, option: int, *, missing: int) -> Ints:
+def _option(integers: Integers, rows: Ints, transport: Ints, end: Ints, option: int, *, missing: int) -> Ints:
     """Return the value of a TCP option (RFC 9293, section 3.2; RFC 7323, section 3.2), or `missing`.
 
     Args:
         integers: The file.
-        chosen: Indices of the packets to read.
+        rows: Indices of the packets to read.
         transport: Position of each packet's TCP header.
         end: Position of the end of each packet's captured options.
         option: `_MSS_OPTION` or `_STAMP_OPTION`.
@@ -223,21 +227,21 @@ def _option(integers: Integers, chosen: Ints, transport: Ints, end: Ints, option
     """
     values = np.full_like(transport, missing)
     size, read = (4, integers.u16) if option == _MSS_OPTION else (10, integers.u32)
-    at, end = transport[chosen] + 20, end[chosen]
+    at, end = transport[rows] + 20, end[rows]
     has_more = at + size <= end
     while has_more.any():
-        chosen, at, end = chosen[has_more], at[has_more], end[has_more]
+        rows, at, end = rows[has_more], at[has_more], end[has_more]
         kind = integers.u8(at)
         step = np.where(kind == 1, 1, integers.u8(at + 1))
         matches = (kind == option) & (step == size)
-        values[chosen[matches]] = read(at[matches] + 2)
+        values[rows[matches]] = read(at[matches] + 2)
         at = at + step
         has_more = ~matches & (kind != 0) & (step > 0) & (at + size <= end)
     return values
 
 
-def _echoes(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
-    """Return the identifiers of the echo packets in the mask `icmp`."""
+def _echo_identifiers(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
+    """Return the identifiers of the ICMP echoes among the packets that the mask `icmp` selects."""
     identifiers = np.full_like(transport, NO_ECHO)
     at = transport[icmp]
     kind, identifier = integers.u8(at), integers.u16(at + 4)
@@ -245,17 +249,17 @@ def _echoes(integers: Integers, icmp: Mask, transport: Ints) -> Ints:
     return identifiers
 
 
-def _contents(integers: Integers, at: Ints, captured: Ints, content_bytes: Ints) -> Ints:
-    """Return a hash of the content at the positions `at`."""
+def _content_hashes(integers: Integers, at: Ints, captured: Ints, content_bytes: Ints) -> Ints:
+    """Return a hash of the first `CONTENT_BYTES` of the content at each position."""
     words = integers.fields(_CONTENT, at)
-    hashed = np.clip(content_bytes, 0, CONTENT_BYTES)
-    short = np.flatnonzero(hashed < CONTENT_BYTES)
+    hashed_bytes = np.clip(content_bytes, 0, CONTENT_BYTES)
+    short = np.flatnonzero(hashed_bytes < CONTENT_BYTES)
     columns = [words[str(start)] for start in range(0, CONTENT_BYTES, 8)]
     for number, word in enumerate(columns):
-        # Zero the bytes after the end of a short packet. The words are little-endian: the first bytes are the lowest.
-        word[short] &= _FIRST_BYTES[np.clip(hashed[short] - 8 * number, 0, 8)]
+        # Set the bytes after the end of a short packet to 0. The first byte of a little-endian word is the lowest.
+        word[short] &= _FIRST_BYTES[np.clip(hashed_bytes[short] - 8 * number, 0, 8)]
     hashes = (row_hashes(*columns) >> np.uint64(1)).astype(np.int64)
-    hashes[captured < hashed] = NOT_CAPTURED
+    hashes[captured < hashed_bytes] = NOT_CAPTURED
     return hashes
 
 

@@ -1,6 +1,6 @@
-"""Capture files, pcap and pcapng: their IP packets as columns, for the whole file or in chunks.
+"""Readers of capture files in pcap and pcapng format: IP packets as columns, for the whole file or in chunks.
 
-Each format has a module with a function `chunks`, which is imported when a file of the format is read.
+Each format has a module with a function `chunks`. The module is imported when a file of its format is read.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,10 +17,11 @@ from fieldkit.measure.captures.packets import Packets, decode
 from fieldkit.measure.evidence import reading
 
 CHUNK_BYTES: Final = 1 << 22
-"""Number of file bytes that are decoded together. The columns and a few times this number of bytes are in memory."""
+"""Number of file bytes that are decoded together. Decoding needs memory for a few times this number of bytes, in
+addition to the columns."""
 
 _SPARE_DIVISOR: Final = 8
-"""The expected number of rows, divided by this value, is the number of additional rows that are allocated."""
+"""The table has additional rows: the estimated number of rows divided by this value."""
 
 FORMATS: Final = MappingProxyType(
     {
@@ -31,18 +32,18 @@ FORMATS: Final = MappingProxyType(
         b"\x0a\x0d\x0d\x0a": "pcapng",
     }
 )
-"""Module that reads a format, in this package, by the first four bytes of the file."""
+"""Module of this package that reads a format, by the first four bytes of the file."""
 
 
 class ChunkReader(Protocol):
     """The function `chunks` of a format's module."""
 
     def __call__(self, data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
-        """Yield the frames of a file in chunks of about `chunk_bytes`; at least one chunk."""
+        """Yield the frames of a file in chunks of about `chunk_bytes`; there is at least one chunk."""
 
 
 def frame_reader(data: Buffer) -> ChunkReader | None:
-    """Return the reader of a capture file's format, or None if the bytes have none of the formats."""
+    """Return the reader for the format of a capture file, or None if the format is unknown."""
     module = FORMATS.get(bytes(data[:4]))
     if module is None:
         return None
@@ -58,7 +59,7 @@ class Capture:
         packets: IP packets.
         frames: Number of frames, including frames without a decodable IP packet: too short, encrypted, or of an
             unknown link type.
-        damage: Position and kind of damage after `packets`, or None if the file is undamaged.
+        damage: Position and kind of the damage after `packets`, or None if the file is undamaged.
     """
 
     packets: Packets
@@ -76,7 +77,7 @@ def read(path: Path) -> Capture:
 
 
 def parse(data: bytes, *, where: str) -> Capture:
-    """Return the packets in the bytes of a capture file; `where` is its name for messages.
+    """Return the packets in the bytes of a capture file; `where` is its name in messages.
 
     Raises:
         EvidenceError: The bytes are not pcap or pcapng, or have an unknown link type.
@@ -85,16 +86,16 @@ def parse(data: bytes, *, where: str) -> Capture:
 
 
 def stream(path: Path, *, chunk_bytes: int = CHUNK_BYTES) -> Iterator[Capture]:
-    """Yield the packets of a capture file in chunks, at least one, for files whose columns do not fit into memory.
+    """Yield the packets of a capture file in one or more chunks; for files whose columns do not fit into memory.
 
-    Only the last chunk can have damage. A large file must not be truncated while it is read, see `reading.mapped`.
+    Only the last chunk can have damage. A large file must not be truncated while it is read (see `reading.mapped`).
 
     Args:
         path: The file.
         chunk_bytes: Size of a chunk in the file, in bytes; the packet that crosses the boundary is the chunk's last.
 
     Raises:
-        EvidenceError: As for `read`. An unknown link type in a later section is only found after earlier chunks.
+        EvidenceError: As for `read`. An unknown link type in a later section is detected after the earlier chunks.
     """
     data = reading.mapped(path)
     for capture in _captures(data, str(path), chunk_bytes):
@@ -120,23 +121,23 @@ def _captures(data: Buffer, where: str, chunk_bytes: int) -> Iterator[Capture]:
 def _concatenate(captures: Iterable[Capture], size_bytes: int) -> Capture:
     """Return all packets of a file. Each chunk is freed after it was copied, so little additional memory is needed.
 
-    The number of rows is estimated from the packets so far, with a margin. Rows that are never written occupy no
+    The number of rows is estimated from the earlier chunks, with a margin. Rows that are never written occupy no
     physical memory.
     """
     chunks = -(-size_bytes // CHUNK_BYTES)
-    joined: Packets | None = None
+    all_packets: Packets | None = None
     rows, frames, damage = 0, 0, None
     for capture in captures:
         stop = rows + len(capture.packets)
-        if joined is None or stop > len(joined):
+        if all_packets is None or stop > len(all_packets):
             larger = capture.packets.allocate(
                 stop + max(stop * (chunks - 1), rows) * (_SPARE_DIVISOR + 1) // _SPARE_DIVISOR
             )
-            if joined is not None:
-                larger.write(0, joined.where(slice(0, rows)))
-            joined = larger
-        joined.write(rows, capture.packets)
+            if all_packets is not None:
+                larger.write(0, all_packets.where(slice(0, rows)))
+            all_packets = larger
+        all_packets.write(rows, capture.packets)
         rows, frames, damage = stop, frames + capture.frames, capture.damage
-    if joined is None:
+    if all_packets is None:
         raise ValueError("a capture file has at least one chunk")
-    return Capture(joined.where(slice(0, rows)), frames, damage)
+    return Capture(all_packets.where(slice(0, rows)), frames, damage)

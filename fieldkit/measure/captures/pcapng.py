@@ -1,4 +1,4 @@
-"""pcapng files: a scan for the block boundaries, then the packets of all packet blocks are read together.
+"""pcapng files. A scan finds the block boundaries; then the packets of all packet blocks are read together.
 
 File format: draft-ietf-opsawg-pcapng. A section has its own byte order and its own interfaces.
 """
@@ -32,22 +32,24 @@ _SMALLEST_BLOCK_BYTES: Final = 12
 _NO_LIMIT: Final = 1 << 32
 # Wireshark's WTAP_MAX_PACKET_SIZE_STANDARD, which equals libpcap's MAXIMUM_SNAPLEN.
 _MAX_CAPTURED_BYTES: Final = 262_144
-# Each definition starts a new chunk. Merged files have a few; this many short chunks take 1 s to read.
+# Each section header and interface description starts a new chunk. Merged files have a few of them. Reading this many
+# short chunks takes 1 s.
 _MAX_DEFINITIONS: Final = 1_000
 
 
 @dataclass(frozen=True)
 class _Section:
-    """Byte order and interfaces of a section's packets up to its next interface description."""
+    """Byte order and interfaces of the packets of a section, up to the next interface description."""
 
     order: Order
     interfaces: tuple["Interface", ...] = ()
 
 
 def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
-    """Yield the frames of a file in chunks of about `chunk_bytes` with the same interfaces; at least one chunk.
+    """Yield the frames of a file in chunks of about `chunk_bytes`; there is at least one chunk.
 
-    Frames of unknown link types are included if another interface of the section has a known one.
+    All frames of a chunk have the same section and interfaces. Frames of an unknown link type are included if another
+    interface of the section has a known link type.
 
     Raises:
         EvidenceError: The file does not start with a complete section header, a section with packets has no interface
@@ -72,7 +74,7 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
         if at < end and not damage:
             definition = _next_definition(section, data, at)
             if definition is None:
-                damage = _damage(data, section.order, at)
+                damage = _describe_damage(data, section.order, at)
             else:
                 section, at = definition
                 definitions += 1
@@ -85,9 +87,9 @@ def chunks(data: Buffer, *, where: str, chunk_bytes: int) -> Iterator[Chunk]:
 
 
 def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[list[int], int]:
-    """Return the positions of the packet blocks from `at` to before `stop`, and the position where the scan stopped.
+    """Return the positions of the packet blocks from `at` on and before `stop`, and the position after the scan.
 
-    It stops early at a section header, an interface description or an invalid block.
+    The scan stops early at a section header, an interface description or an invalid block.
     """
     header = struct.Struct(f"{order}2I").unpack_from
     starts: list[int] = []
@@ -95,14 +97,14 @@ def _scan(data: Buffer, order: Order, at: int, stop: int) -> tuple[list[int], in
         kind, length = header(data, at)
         if kind in _PACKETS and length >= _SMALLEST_BLOCK_BYTES:
             starts.append(at)
-        elif kind in _DEFINITIONS or not _is_whole(data, order, at):
+        elif kind in _DEFINITIONS or not _is_complete_block(data, order, at):
             break
         at += length
     return starts, at
 
 
 def _frames(data: Buffer, section: _Section, start: Ints) -> tuple[Frames, Mask]:
-    """Return the frames of the blocks at the positions `start`, and a mask of valid blocks."""
+    """Return the frames of the blocks at the positions `start`, and a mask of the valid blocks."""
     integers = Integers(data, section.order)
     kind, length = integers.u32(start), integers.u32(start + 4)
     simple = kind == _SIMPLE_PACKET
@@ -135,46 +137,48 @@ def _snap_bytes(section: _Section) -> int:
 
 
 def _next_definition(section: _Section, data: Buffer, at: int) -> tuple[_Section, int] | None:
-    """Return the section state after the section header or interface description at `at`, and the end of that block.
+    """Return the section after the section header or interface description at `at`, and the end of that block.
 
-    Return None if there is neither of them at `at`, or if the block is incomplete or invalid.
+    Return None if the block at `at` is neither of the two, incomplete or invalid.
     """
     order = section.order
     kind = bytes(data[at : at + 4])
     if kind == MAGIC:
         new_order = _ORDERS.get(bytes(data[at + 8 : at + 12]))
-        if new_order is None or not _is_whole(data, new_order, at, min_bytes=_SECTION_BYTES):
+        if new_order is None or not _is_complete_block(data, new_order, at, min_bytes=_SECTION_BYTES):
             return None
-        return _Section(new_order), at + _length(data, new_order, at)
-    if kind != struct.pack(f"{order}I", _INTERFACE) or not _is_whole(data, order, at, min_bytes=_INTERFACE_BYTES):
+        return _Section(new_order), at + _block_length(data, new_order, at)
+    if kind != struct.pack(f"{order}I", _INTERFACE) or not _is_complete_block(
+        data, order, at, min_bytes=_INTERFACE_BYTES
+    ):
         return None
-    end = at + _length(data, order, at)
+    end = at + _block_length(data, order, at)
     interface = parse_interface(bytes(data[at + 8 : end - 4]), order)
     return None if interface is None else (_Section(order, (*section.interfaces, interface)), end)
 
 
-def _length(data: Buffer, order: Order, at: int) -> int:
+def _block_length(data: Buffer, order: Order, at: int) -> int:
     length: int = struct.unpack_from(f"{order}I", data, at + 4)[0]
     return length
 
 
-def _is_whole(data: Buffer, order: Order, at: int, *, min_bytes: int = _SMALLEST_BLOCK_BYTES) -> bool:
-    """Return True if there is a block at `at` of at least `min_bytes`, with the same length at its start and end."""
+def _is_complete_block(data: Buffer, order: Order, at: int, *, min_bytes: int = _SMALLEST_BLOCK_BYTES) -> bool:
+    """Return True if a block of at least `min_bytes` is at `at`, and its two length fields are equal."""
     if len(data) - at < min_bytes:
         return False
-    length = _length(data, order, at)
+    length = _block_length(data, order, at)
     if length < min_bytes or length % 4 or at + length > len(data):
         return False
     return bytes(data[at + 4 : at + 8]) == bytes(data[at + length - 4 : at + length])
 
 
-def _damage(data: Buffer, order: Order, at: int) -> str:
-    """Return a description of the damage at `at`, where there is no complete block."""
+def _describe_damage(data: Buffer, order: Order, at: int) -> str:
+    """Return a description of the damage at `at`, a position without a complete block."""
     remaining = len(data) - at
     block_order: Order | None = order
     if bytes(data[at : at + 4]) == MAGIC:
         block_order = _ORDERS.get(bytes(data[at + 8 : at + 12]))
-    if remaining < _SMALLEST_BLOCK_BYTES or (block_order and remaining < _length(data, block_order, at)):
+    if remaining < _SMALLEST_BLOCK_BYTES or (block_order and remaining < _block_length(data, block_order, at)):
         return f"ends inside the block at byte {at}"
     return f"no block at byte {at}"
 
@@ -194,8 +198,8 @@ class Interface:
     Attributes:
         link_type: Link type number (https://www.tcpdump.org/linktypes.html).
         snap_bytes: Snap length; 0 for no limit.
-        ticks_per_s: Unit of the time stamps.
-        offset_s: Added to the time stamps, in seconds.
+        ticks_per_s: Number of units of the time stamps in one second.
+        offset_s: Offset in seconds that is added to the time stamps.
     """
 
     link_type: int
@@ -209,9 +213,9 @@ class Interface:
         if ticks_per_s > _MAX_TICKS_PER_S:
             ticks = np.array([tick * _NS // ticks_per_s for tick in ticks.tolist()], dtype=np.uint64)
             ticks_per_s = _NS
-        seconds, rest = np.divmod(ticks, np.uint64(ticks_per_s))
-        rest_ns = rest * np.uint64(_NS) // np.uint64(ticks_per_s)
-        return (seconds.astype(np.int64) + self.offset_s) * _NS + rest_ns.astype(np.int64)
+        seconds, remaining_ticks = np.divmod(ticks, np.uint64(ticks_per_s))
+        fraction_ns = remaining_ticks * np.uint64(_NS) // np.uint64(ticks_per_s)
+        return (seconds.astype(np.int64) + self.offset_s) * _NS + fraction_ns.astype(np.int64)
 
 
 def parse_interface(body: bytes, order: Order) -> Interface | None:

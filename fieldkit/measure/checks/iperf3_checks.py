@@ -1,6 +1,6 @@
 """Contradictions within the JSON of one end of an iperf3 test, and between the JSON of both ends.
 
-The checks hold for versions 3.1.3 to 3.17.1 in both directions, for any loss, duplication or delay.
+The checks are valid for versions 3.1.3 to 3.17.1 in both directions, with any loss, duplication or delay.
 """
 
 import math
@@ -13,14 +13,14 @@ from fieldkit.core.model import Protocol
 from fieldkit.measure.evidence.iperf3 import IperfInterval, IperfTest
 
 _ROUNDING_S: Final = 0.002
-"""iperf3 prints times with 6 digits, some versions print `seconds` with more."""
+"""Tolerance for rounding: iperf3 prints times with 6 digits, and some versions print `seconds` with more."""
 _SUMMARY_DELAY_S: Final = 0.02
-"""Allowed difference: the clock is read for the last interval and again, later, for the summary."""
+"""Maximum time between the end of the last interval and the end in the summary: the clock is read again for it."""
 _MAX_OMITTED_S: Final = 1.1
-"""Maximum length of a last interval that version 3.17 omits because nothing arrived in it."""
+"""Maximum length of a last interval without data, which version 3.17 omits."""
 _ROUNDING: Final = 1e-3
 _EARLY_S: Final = 0.1
-"""A timer of the client may end a test up to this time before its full duration."""
+"""A timer of the client may end a test earlier than its full duration by up to this time."""
 _TIMESTAMP_S: Final = 2
 """`timesecs` has a resolution of whole seconds."""
 
@@ -78,14 +78,14 @@ class IperfSettings:
         streams: Number of parallel streams.
         payload_bytes: Payload of a UDP datagram.
         reverse: True if the server sends.
-        lasts_s: Duration in seconds; None if the test ends after a number of bytes.
+        duration_s: Duration in seconds; None if the test ends after a number of bytes.
     """
 
     protocol: Protocol
     streams: int
     payload_bytes: int
     reverse: bool
-    lasts_s: float | None
+    duration_s: float | None
 
 
 def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
@@ -93,7 +93,7 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
     intervals = test.intervals
     yield from _gaps(intervals)
     for number, interval in enumerate(intervals, 1):
-        yield from (f"interval {number} {why}" for why in _interval_problems(interval))
+        yield from (f"interval {number} {problem}" for problem in _interval_problems(interval))
     totals = test.totals
     sums = (
         ("bytes", totals.sent_bytes if sends else totals.received_bytes, _sum(intervals, "payload_bytes")),
@@ -103,8 +103,12 @@ def check_one_end(test: IperfTest, *, sends: bool) -> Iterator[str]:
         if total is not None and interval_sum is not None and total != interval_sum:
             yield f"the sum of {quantity} over its intervals is {interval_sum}, but its summary has {total}"
     end_s = intervals[-1].end_s if intervals else None
-    if end_s is not None and totals.ends_s and not any(_ends_near(end_s, total_s) for total_s in totals.ends_s):
-        yield f"its last interval ends at {end_s:.3f} s, but its summary at {max(totals.ends_s):.3f} s"
+    if (
+        end_s is not None
+        and totals.summary_ends_s
+        and not any(_ends_near(end_s, total_s) for total_s in totals.summary_ends_s)
+    ):
+        yield f"its last interval ends at {end_s:.3f} s, but its summary at {max(totals.summary_ends_s):.3f} s"
     if not sends and test.start.protocol == Protocol.UDP and test.start.block_bytes:
         yield from _datagram_bytes(test, test.start.block_bytes)
 
@@ -132,28 +136,31 @@ def _gaps(intervals: tuple[IperfInterval, ...]) -> Iterator[str]:
 def _interval_problems(interval: IperfInterval) -> Iterator[str]:
     if interval.start_s is not None and interval.end_s is not None:
         duration_s = interval.end_s - interval.start_s
-        if abs(duration_s - interval.lasted_s) > _ROUNDING_S:
-            yield f"lasts {duration_s:.3f} s by its start and end, but {interval.lasted_s:.3f} s by its length"
+        if abs(duration_s - interval.duration_s) > _ROUNDING_S:
+            yield f"lasts {duration_s:.3f} s by its start and end, but {interval.duration_s:.3f} s by its length"
     if interval.stream_bytes is not None and interval.stream_bytes != interval.payload_bytes:
         yield f"has {interval.payload_bytes} bytes, but its streams have {interval.stream_bytes}"
     rate = interval.rate_bit_s
     if rate is not None and not math.isclose(rate, interval.bit_s, rel_tol=_ROUNDING, abs_tol=8):
         yield f"has {interval.bit_s:.0f} bit/s by its bytes, but reports {rate:.0f} bit/s"
     if interval.lost is not None and interval.datagrams is not None and interval.lost > interval.datagrams:
-        # A datagram that arrives late is lost in one interval, and subtracted from the losses of the next.
+        # A datagram that arrives late is counted as lost in one interval, and subtracted from the losses of the next.
         yield f"has {interval.lost} of {interval.datagrams} datagrams lost"
 
 
 def _datagram_bytes(test: IperfTest, payload_bytes: int) -> Iterator[str]:
-    """Yield a contradiction if bytes and datagrams received differ; duplicates are counted in the bytes only."""
+    """Yield a contradiction if the received bytes do not agree with the received datagrams.
+
+    iperf3 counts duplicates only in the bytes.
+    """
     datagrams, lost = (_sum(test.intervals, name) for name in ("datagrams", "lost"))
     received_bytes = _sum(test.intervals, "payload_bytes")
     if datagrams is None or lost is None or received_bytes is None:
         return
     extra = received_bytes - (datagrams - lost) * payload_bytes
     if not 0 <= extra <= test.totals.out_of_order * payload_bytes:
-        counted = f"{datagrams} datagrams of {payload_bytes} bytes with {lost} lost"
-        yield f"it received {received_bytes} bytes, but counts {counted}"
+        datagrams_text = f"{datagrams} datagrams of {payload_bytes} bytes with {lost} lost"
+        yield f"it received {received_bytes} bytes, but counts {datagrams_text}"
 
 
 def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) -> Iterator[str]:
@@ -164,10 +171,10 @@ def compare_ends(client: IperfTest, server: IperfTest, settings: IperfSettings) 
     if set(client.ports) != {(local, remote) for remote, local in server.ports}:
         yield "client and server report different ports"
     for name, test in (("client", client), ("server", server)):
-        yield from (f"the {name} {why}" for why in _differences(test, settings))
-    total_s = sum(interval.lasted_s for interval in client.intervals)
-    if settings.lasts_s is not None and client.intervals and total_s < settings.lasts_s - _EARLY_S:
-        yield f"the client's intervals last {total_s:.1f} s in total instead of {settings.lasts_s:g} s"
+        yield from (f"the {name} {problem}" for problem in _differences(test, settings))
+    total_s = sum(interval.duration_s for interval in client.intervals)
+    if settings.duration_s is not None and client.intervals and total_s < settings.duration_s - _EARLY_S:
+        yield f"the client's intervals last {total_s:.1f} s in total instead of {settings.duration_s:g} s"
     sender, receiver = (server, client) if settings.reverse else (client, server)
     yield from _totals(client, sender, receiver, settings)
 
@@ -197,7 +204,7 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings:
     comparisons = (
         ("bytes sent", totals.sent_bytes, (sent_bytes,)),
         ("bytes received", totals.received_bytes, (received_bytes,)),
-        # Before version 3.8 the only summary may have the sender's count.
+        # Before version 3.8 there is one summary, which may have the sender's count.
         ("datagrams", totals.datagrams, (_sum(receiver.intervals, "datagrams"), _sum(sender.intervals, "datagrams"))),
         ("datagrams lost", totals.lost, (_sum(receiver.intervals, "lost"),)),
     )
@@ -217,14 +224,14 @@ def _totals(client: IperfTest, sender: IperfTest, receiver: IperfTest, settings:
 
 def date_problem(test: IperfTest, window: tuple[int, int] | None) -> str | None:
     """Return the reason why a test did not run during the attempt by the robot's clock, or None if it did."""
-    if window is None or test.start.began_utc_s is None:
+    if window is None or test.start.start_utc_s is None:
         return None
     first_s, last_s = (edge_ns / 1e9 for edge_ns in window)
-    began_s = test.start.began_utc_s
-    if first_s - _TIMESTAMP_S <= began_s <= last_s + _TIMESTAMP_S:
+    start_s = test.start.start_utc_s
+    if first_s - _TIMESTAMP_S <= start_s <= last_s + _TIMESTAMP_S:
         return None
-    distance_s = first_s - began_s if began_s < first_s else began_s - last_s
-    return f"it began {distance_s:.0f} s {'before' if began_s < first_s else 'after'} the attempt"
+    distance_s = first_s - start_s if start_s < first_s else start_s - last_s
+    return f"it began {distance_s:.0f} s {'before' if start_s < first_s else 'after'} the attempt"
 
 
 def _sum(intervals: tuple[IperfInterval, ...], name: str) -> int | None:

@@ -1,10 +1,10 @@
 """Contradictions between the results of an iperf3 test and the captures of both ends.
 
 iperf3 counts the bytes that its sockets read and write; a capture contains the packets that passed the interface. At
-any time, iperf3 has therefore received at most the bytes in the capture up to then. It has received at least the
-bytes that the kernel had acknowledged (TCP), or the bytes that arrived minus the bytes dropped at its socket buffer
-(UDP). Times in the JSON are relative to the start of the test, which is between the client's last message on the
-control connection and the first packet of data.
+any time, iperf3 has therefore received at most the bytes that the capture contains until this time. It has received
+at least the bytes that the kernel has acknowledged (TCP), or the bytes that have arrived minus the bytes that were
+dropped at its socket buffer (UDP). Times in the JSON are relative to the start of the test. The test starts between
+the client's last message on the control connection and the first data packet.
 """
 
 from collections.abc import Iterator
@@ -25,12 +25,12 @@ from fieldkit.measure.transfers.tcp_streams import LONGEST_BYTES
 
 EARLY_NS: Final = 300_000_000
 LATE_NS: Final = 500_000_000
-"""Largest differences between times in the JSON and in the capture: a busy robot reads late."""
+"""Largest differences between times in the JSON and in the capture; iperf3 reads late on a busy robot."""
 
 _BUFFERED_BYTES: Final = 256 << 10
 _BUFFERED_WINDOWS: Final = 3
-"""Payload in the buffer of a sending socket: Linux lets it grow to at most 3 congestion windows
-(tcp_sndbuf_expand); a window is at most the number of acknowledged bytes, and the initial buffer is 87 kB."""
+"""Maximum payload in the buffer of a sending socket. Linux expands this buffer to at most 3 congestion windows
+(tcp_sndbuf_expand). A window is at most the number of acknowledged bytes, and the initial buffer is 87 kB."""
 
 _BLOCK_BYTES: Final = 128 << 10
 _RACE_DATAGRAMS: Final = 2
@@ -43,7 +43,7 @@ _TAIL_DATAGRAMS: Final = 10
 
 @dataclass(frozen=True)
 class LoadEvidence:
-    """Captures of a test, and the kernels' counters for the attempt.
+    """Captures of a test, and the increments of the kernels' counters during the attempt.
 
     Attributes:
         sender: Packets of the sender's capture.
@@ -64,7 +64,7 @@ class LoadEvidence:
 
 @dataclass(frozen=True, eq=False)
 class _Progress:
-    """Lower and upper bound of the number of bytes of all streams that the receiver has read at each time."""
+    """Lower and upper bounds of the number of bytes that the receiver has read from all streams until each time."""
 
     times_ns: Ints
     lower: Ints
@@ -79,8 +79,10 @@ class _Progress:
         return int(self.lower[index]) if index >= 0 else 0
 
 
-def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, evidence: LoadEvidence) -> Iterator[str]:
-    """Yield the contradictions between both ends' JSON and both captures; none if a capture has no times."""
+def find_contradictions(
+    flow: LoadFlow, sent: IperfTest, received: IperfTest, evidence: LoadEvidence
+) -> Iterator[str]:
+    """Yield the contradictions between the JSON of both ends and both captures; none if a capture has no times."""
     if (evidence.receiver.time_ns == NO_TIME).any() or (evidence.sender.time_ns == NO_TIME).any():
         return
     sent_streams, received_streams = flow.streams(evidence.sender), flow.streams(evidence.receiver)
@@ -88,19 +90,21 @@ def find(flow: LoadFlow, sent: IperfTest, received: IperfTest, evidence: LoadEvi
         yield f"the sender's capture has no packet of {format_count(missing, 'stream')} of iperf3"
         return
     if flow.protocol is Protocol.UDP:
-        yield from _datagrams(sent, received, sent_streams, received_streams, evidence)
+        yield from _check_datagrams(sent, received, sent_streams, received_streams, evidence)
     else:
-        yield from _sent_bytes(sent, sent_streams, evidence)
+        yield from _check_sent_bytes(sent, sent_streams, evidence)
     progress = (
         _udp_progress(flow, received_streams)
         if flow.protocol is Protocol.UDP
         else _tcp_progress(flow, received_streams, evidence)
     )
     if progress is not None:
-        yield from _arrivals(flow, received, progress, evidence)
+        yield from _check_arrivals(flow, received, progress, evidence)
 
 
-def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, evidence: LoadEvidence) -> Iterator[str]:
+def _check_arrivals(
+    flow: LoadFlow, received: IperfTest, progress: _Progress, evidence: LoadEvidence
+) -> Iterator[str]:
     """Yield a contradiction for the first interval at whose end iperf3 had received too many or too few bytes."""
     total_bytes = sum(interval.payload_bytes for interval in received.intervals)
     if not len(progress.times_ns):
@@ -122,8 +126,8 @@ def _arrivals(flow: LoadFlow, received: IperfTest, progress: _Progress, evidence
         lower = progress.lower_bound(request_ns + end_ns - LATE_NS) - dropped_bytes
         if not lower <= received_bytes <= upper:
             bound = f"at least {lower}" if received_bytes < lower else f"at most {upper}"
-            when = f"by second {interval.end_s:.1f} of the test"
-            yield f"iperf3 received {received_bytes} bytes {when}, but {bound} by the receiver's capture"
+            iperf3_text = f"iperf3 received {received_bytes} bytes until second {interval.end_s:.1f} of the test"
+            yield f"{iperf3_text}, but {bound} according to the receiver's capture"
             return
 
 
@@ -149,13 +153,13 @@ def _last_request_ns(flow: LoadFlow, evidence: LoadEvidence, first_ns: int) -> i
 def _udp_progress(flow: LoadFlow, streams: list[Packets]) -> _Progress:
     times_ns = np.sort(np.concatenate([stream.time_ns for stream in streams]))
     upper = flow.payload_bytes * np.arange(1, len(times_ns) + 1)
-    # The first fragment of a fragmented datagram does not show that the rest arrived.
+    # The first fragment of a fragmented datagram does not show that the other fragments arrived.
     fragmented = any(stream.more_fragments.any() for stream in streams)
     return _Progress(times_ns, np.zeros_like(upper) if fragmented else upper, upper)
 
 
 def _tcp_progress(flow: LoadFlow, streams: list[Packets], evidence: LoadEvidence) -> _Progress | None:
-    """Return the progress of all streams; None if a stream is too long for unambiguous sequence numbers."""
+    """Return the progress of all streams, or None if the sequence numbers of a long stream are ambiguous."""
     cookie_bytes = 0 if evidence.reverse else COOKIE_BYTES
     parts_ns: list[Ints] = []
     lower: list[Ints] = []
@@ -203,11 +207,11 @@ def _acknowledgments(flow: LoadFlow, packets: Packets, sport: int, dport: int) -
     )
 
 
-def _sent_bytes(sent: IperfTest, streams: list[Packets], evidence: LoadEvidence) -> Iterator[str]:
+def _check_sent_bytes(sent: IperfTest, streams: list[Packets], evidence: LoadEvidence) -> Iterator[str]:
     """Yield a contradiction if iperf3 wrote fewer TCP bytes than were captured, or more than a socket can buffer."""
-    written = sum(interval.payload_bytes for interval in sent.intervals)
+    written_bytes = sum(interval.payload_bytes for interval in sent.intervals)
     cookie_bytes = 0 if evidence.reverse else COOKIE_BYTES
-    unique, carried, segment_bytes = 0, 0, 1
+    unique_bytes, carried_bytes, segment_bytes = 0, 0, 1
     for stream in streams:
         first_seq = _first_seq(stream)
         if first_seq is None:
@@ -216,26 +220,27 @@ def _sent_bytes(sent: IperfTest, streams: list[Packets], evidence: LoadEvidence)
         end = int(((data.tcp_seq - first_seq) % 2**32 + data.tcp_payload_bytes).max(initial=0))
         if end > LONGEST_BYTES:
             return
-        unique += max(end - cookie_bytes, 0)
-        carried += int(data.tcp_payload_bytes.sum()) - cookie_bytes
+        unique_bytes += max(end - cookie_bytes, 0)
+        carried_bytes += int(data.tcp_payload_bytes.sum()) - cookie_bytes
         mss = [int(packets.tcp_mss.max(initial=0)) for packets in (evidence.sender, stream)]
         segment_bytes = max(segment_bytes, *mss)
-    # From version 3.16 on, the thread of each stream may continue writing while the others are counted.
-    if written + _BLOCK_BYTES * len(streams) < unique:
-        yield f"iperf3 sent {written} bytes, but {unique} are in the sender's capture"
-    elif written > (1 + _BUFFERED_WINDOWS) * unique + _BUFFERED_BYTES * len(streams):
-        yield f"iperf3 sent {written} bytes, but only {unique} are in the sender's capture"
+    # From version 3.16 on, each stream has a thread, which may continue to write while the other streams are counted.
+    if written_bytes + _BLOCK_BYTES * len(streams) < unique_bytes:
+        yield f"iperf3 sent {written_bytes} bytes, but {unique_bytes} are in the sender's capture"
+    elif written_bytes > (1 + _BUFFERED_WINDOWS) * unique_bytes + _BUFFERED_BYTES * len(streams):
+        yield f"iperf3 sent {written_bytes} bytes, but only {unique_bytes} are in the sender's capture"
     retransmits = [interval.retransmits for interval in sent.intervals if interval.retransmits is not None]
-    captured, reported = max(carried - unique, 0) / segment_bytes, sum(retransmits)
+    captured_segments, reported = max(carried_bytes - unique_bytes, 0) / segment_bytes, sum(retransmits)
     differs = (
-        _RESENT_FACTOR * captured + _RESENT_SEGMENTS < reported,
-        _RESENT_FACTOR * reported + _RESENT_SEGMENTS < captured,
+        _RESENT_FACTOR * captured_segments + _RESENT_SEGMENTS < reported,
+        _RESENT_FACTOR * reported + _RESENT_SEGMENTS < captured_segments,
     )
     if len(retransmits) == len(sent.intervals) and any(differs):
-        yield f"iperf3 retransmitted {reported} segments, but about {captured:.0f} by the sender's capture"
+        capture_text = f"about {captured_segments:.0f} according to the sender's capture"
+        yield f"iperf3 retransmitted {reported} segments, but {capture_text}"
 
 
-def _datagrams(
+def _check_datagrams(
     sent: IperfTest,
     received: IperfTest,
     sent_streams: list[Packets],
@@ -248,30 +253,31 @@ def _datagrams(
     ]
     if any(None in part or not part for part in counts):
         return
-    written, expected, lost = map(sum, counts)
-    captured, arrived = sum(map(len, sent_streams)), sum(map(_distinct, received_streams))
-    # From version 3.16 on, the thread of each stream may continue while the others are counted.
-    race = _RACE_DATAGRAMS * len(sent_streams) + round(_RACE_SHARE * written)
-    if written + race < captured:
-        yield f"iperf3 sent {written} datagrams, but {captured} are in the sender's capture"
+    sent_count, expected, lost = map(sum, counts)
+    captured, arrived = sum(map(len, sent_streams)), sum(map(_distinct_datagrams, received_streams))
+    # From version 3.16 on, each stream has a thread, which may continue to send while the other streams are counted.
+    race = _RACE_DATAGRAMS * len(sent_streams) + round(_RACE_SHARE * sent_count)
+    if sent_count + race < captured:
+        yield f"iperf3 sent {sent_count} datagrams, but {captured} are in the sender's capture"
     refused = evidence.sender_counters.udp_send_errors or 0
-    tail, missed = max(written - expected, 0), max(captured - arrived, 0)
-    # A sender's queue that drops datagrams before the capture causes gaps in the numbers that the receiver reads.
-    is_plausible = captured + refused >= written or tail <= missed + _TAIL_SHARE * written + _TAIL_DATAGRAMS
+    tail, missed = max(sent_count - expected, 0), max(captured - arrived, 0)
+    # If the sender's queue drops datagrams before the capture, the sequence numbers at the receiver have gaps.
+    is_plausible = captured + refused >= sent_count or tail <= missed + _TAIL_SHARE * sent_count + _TAIL_DATAGRAMS
     if not is_plausible:
-        yield (f"iperf3 sent {written} datagrams, but the receiver expected {expected}, and {captured} were captured")
+        capture_text = f"the sender's capture contains {captured}"
+        yield f"iperf3 sent {sent_count} datagrams, but the receiver expected {expected}, and {capture_text}"
     undelivered = evidence.receiver_counters.udp_undelivered or 0
-    max_lost = missed + undelivered + max(written - captured, 0)
+    max_lost = missed + undelivered + max(sent_count - captured, 0)
     if not any(stream.more_fragments.any() for stream in received_streams):
-        # Each copy reduces iperf3's number of losses by one.
+        # Each copy reduces the number of losses that iperf3 reports by one.
         copies = sum(map(len, received_streams)) - arrived
         if not missed - tail - copies - race <= lost <= max_lost + race:
             missing_text = f"the receiver's capture lacks {missed} of those in the sender's"
             yield f"iperf3 lost {lost} datagrams, but {missing_text}, and its kernel dropped {undelivered}"
 
 
-def _distinct(stream: Packets) -> int:
-    """Return the number of datagrams without duplicates: each starts with a unique number and time."""
+def _distinct_datagrams(stream: Packets) -> int:
+    """Return the number of datagrams without duplicates. Each starts with a unique number and time."""
     if (stream.content == NOT_CAPTURED).any():
         return len(stream)
     return len(np.unique(stream.content))

@@ -1,8 +1,8 @@
 """Contradictions within the output of ping, and between the output and captures.
 
-On a busy machine with 2 cores, round-trip times of iputils' ping differed from captured ones by -0.03 to 0.9 ms, and
-the median differed by less than 0.1 ms. busybox reads the time of a reply when its process resumes, iputils reads it
-from the kernel.
+On a busy machine with 2 cores, the round-trip times printed by iputils' ping minus the captured ones were -0.03 to
+0.9 ms, and their median was below 0.1 ms. iputils reads the arrival time of a reply from the kernel. busybox reads
+the clock when its process resumes.
 """
 
 from collections.abc import Iterator, Mapping
@@ -26,8 +26,8 @@ class CapturedPing:
     """Echoes of one ICMP identifier in one capture; times in nanoseconds since 1970 UTC, by sequence number.
 
     Attributes:
-        requested_ns: Time of the first request; if fragmented, of its first fragment.
-        replied_ns: Time of the first complete reply; if fragmented, of its last fragment.
+        requested_ns: Time of the first request; time of its first fragment if it is fragmented.
+        replied_ns: Time of the first complete reply; time of its last fragment if it is fragmented.
     """
 
     requested_ns: Mapping[int, int]
@@ -50,26 +50,32 @@ def captured_pings(packets: Packets, source: str, destination: str, payload_byte
     complete_ns = _complete_ns(returning, replies, payload_bytes + ICMP_HEADER_BYTES)
     for identifier in np.unique(requests.echo).tolist():
         matches = requests.echo == identifier
-        answered = (replies.echo == identifier + ECHO_REPLY) & (complete_ns >= 0)
+        is_answer = (replies.echo == identifier + ECHO_REPLY) & (complete_ns >= 0)
         yield CapturedPing(
-            _first(requests.echo_seq[matches], requests.time_ns[matches]),
-            _first(replies.echo_seq[answered], complete_ns[answered]),
+            _earliest_by_number(requests.echo_seq[matches], requests.time_ns[matches]),
+            _earliest_by_number(replies.echo_seq[is_answer], complete_ns[is_answer]),
         )
 
 
 def _sizes(packets: Packets, first: Packets) -> Ints:
-    """Return the captured size of the datagram that starts with each of these first fragments."""
+    """Return the captured size of each datagram, given its first fragment."""
     ends = packets.fragment_offset + packets.ip_payload_bytes
     order = np.lexsort((ends, packets.ip_id))
     ids, last = packets.ip_id[order], ends[order]
     unfragmented = ~first.more_fragments
-    # Among equal ids the largest end is last.
+    # Fragments with equal ids are sorted by their end, so the last of them has the largest end.
     at = np.searchsorted(ids, first.ip_id, side="right") - 1
     return np.where(unfragmented, first.ip_payload_bytes, last[at])
 
 
 def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
-    """Return the time at which each datagram was complete; -1 if it was never complete, or has another size."""
+    """Return the time at which each datagram was complete; -1 if it was never complete, or has another size.
+
+    Args:
+        packets: All packets of this direction.
+        first: First fragment of each datagram.
+        size_bytes: IP payload of a complete datagram.
+    """
     times_ns = np.where(first.more_fragments, -1, np.where(first.ip_payload_bytes == size_bytes, first.time_ns, -1))
     for index in np.flatnonzero(first.more_fragments):
         parts = packets.where(packets.ip_id == first.ip_id[index])
@@ -79,27 +85,27 @@ def _complete_ns(packets: Packets, first: Packets, size_bytes: int) -> Ints:
     return times_ns
 
 
-def _first(numbers: Ints, times_ns: Ints) -> dict[int, int]:
+def _earliest_by_number(numbers: Ints, times_ns: Ints) -> dict[int, int]:
     """Return the earliest time of each number."""
     order = np.argsort(-times_ns, kind="stable")
     return dict(zip(numbers[order].tolist(), times_ns[order].tolist(), strict=True))
 
 
 _ROUNDING: Final = 0.006
-"""Rounding error: ping prints three digits."""
+"""Relative rounding error of a round-trip time: ping prints three digits."""
 _MAX_EARLIER_S: Final = 0.000_2
 _MAX_LATER_S: Final = 0.020
-"""Limit of the excess of a single round-trip time over the captured one: ping's process may be delayed."""
+"""Maximum of a printed round-trip time minus the captured one: the process of ping may be delayed."""
 _MAX_MEDIAN_LATER_S: Final = 0.001
 _BUSYBOX_FACTOR: Final = 5
-"""Factor of the limits for busybox's ping, which may print later."""
+"""Factor by which the limits are larger for busybox's ping, which may print later."""
 _MAX_PRINT_DELAY_S: Final = 1.0
 _MAX_MEDIAN_PRINT_DELAY_S: Final = 0.05
 _MAX_SEQUENCE: Final = 0xFFFF
 _WAIT_SHARE: Final = 0.9
 """Minimum share of the interval that ping waits after its last request; below 1, because a timer may fire early."""
 _UNREAD_S: Final = 0.1
-"""ping may end before it reads a reply that arrived within this time."""
+"""ping may exit before it reads a reply that arrived less than this time before."""
 _CLOCK_SLACK_S: Final = 1.0
 
 CROSS_CHECKS: Final = (
@@ -153,15 +159,15 @@ def check_output(output: Ping, count: int, payload_bytes: int, window: tuple[int
     ]
     if unexpected and last is not None and last <= _MAX_SEQUENCE:
         yield f"ping has a reply to request {unexpected[0]} of {output.transmitted}"
-    yield from _summary(output)
-    moments = [reply.at_utc_ns for reply in output.replies if reply.at_utc_ns is not None]
-    if window is not None and moments:
+    yield from _check_summary(output)
+    times_ns = [reply.at_utc_ns for reply in output.replies if reply.at_utc_ns is not None]
+    if window is not None and times_ns:
         slack_ns = round(1e9 * _CLOCK_SLACK_S)
-        if min(moments) < window[0] - slack_ns or max(moments) > window[1] + slack_ns:
-            yield "ping has a reply from before or after the attempt, by the robot's clock"
+        if min(times_ns) < window[0] - slack_ns or max(times_ns) > window[1] + slack_ns:
+            yield "ping has a reply from before or after the attempt according to the robot's clock"
 
 
-def _summary(output: Ping) -> Iterator[str]:
+def _check_summary(output: Ping) -> Iterator[str]:
     times_s = [reply.rtt_s for reply in output.replies if reply.rtt_s is not None and not reply.damaged]
     if output.summary_s is None or not times_s:
         return
@@ -170,8 +176,8 @@ def _summary(output: Ping) -> Iterator[str]:
         ("shortest", "mean", "longest"), output.summary_s, line_times_s, strict=True
     ):
         if abs(summary_s - printed_s) > _ROUNDING * max(summary_s, printed_s) + 2e-6:
-            in_lines = f"but its lines {1e3 * printed_s:.3f} ms"
-            yield f"ping's summary has {1e3 * summary_s:g} ms as the {name} time, {in_lines}"
+            lines_text = f"but its lines have {1e3 * printed_s:.3f} ms"
+            yield f"ping's summary has {1e3 * summary_s:g} ms as the {name} time, {lines_text}"
 
 
 def compare_with_capture(
@@ -184,26 +190,27 @@ def compare_with_capture(
         captured: The echoes of one identifier.
         interval_s: Time between requests.
         role: Role of the capturing robot.
-        is_requester: True if this robot sends the requests; otherwise its capture has the times at which it sends the
-            replies.
+        is_requester: True if this robot sends the requests. The capture of the other robot contains the times at
+            which the replies were sent, so times are not compared with it.
     """
     if output.transmitted is None or output.transmitted > _MAX_SEQUENCE:
         return
     if len(captured.requested_ns) > output.transmitted:
         yield f"ping sent {output.transmitted} requests, but the {role}'s capture has {len(captured.requested_ns)}"
-    answers = {reply.seq: reply for reply in output.answers}
-    not_captured = sorted(answers.keys() - (captured.requested_ns.keys() & captured.replied_ns.keys()))
+    answers_by_seq = {reply.seq: reply for reply in output.answers}
+    not_captured = sorted(answers_by_seq.keys() - (captured.requested_ns.keys() & captured.replied_ns.keys()))
     if not_captured:
-        yield f"ping has a reply to request {not_captured[0]}, but the {role}'s capture lacks request or reply"
+        reply_text = f"ping has a reply to request {not_captured[0]}"
+        yield f"{reply_text}, but the {role}'s capture lacks the request or the reply"
     if not is_requester:
         return
     yield from _unprinted_replies(output, captured, interval_s, role)
-    captured_replies = [reply for seq, reply in answers.items() if seq not in not_captured]
+    captured_replies = [reply for seq, reply in answers_by_seq.items() if seq not in not_captured]
     yield from _time_problems(output, captured_replies, captured, role)
 
 
 def _unprinted_replies(output: Ping, captured: CapturedPing, interval_s: float, role: str) -> Iterator[str]:
-    """Yield a contradiction if replies reached the robot while its ping ran, and are not in the output."""
+    """Yield a contradiction if the output lacks replies that reached the robot while ping was running."""
     if not captured.requested_ns:
         return
     until_ns = max(captured.requested_ns.values()) + round(1e9 * (_WAIT_SHARE * interval_s - _UNREAD_S))
@@ -241,4 +248,4 @@ def _time_problems(output: Ping, answers: list[Reply], captured: CapturedPing, r
         yield f"a reply has a time stamp {worst_s:.3f} s after its arrival in the {role}'s capture"
     elif print_delay_s and median(print_delay_s) > _MAX_MEDIAN_PRINT_DELAY_S:
         median_s = median(print_delay_s)
-        yield f"its time stamps are {median_s:.3f} s later than in the {role}'s capture, in the median"
+        yield f"the median of its time stamps is {median_s:.3f} s later than in the {role}'s capture"

@@ -1,7 +1,7 @@
-"""Sources of the columns of a transfer, and contradictions between its two captures and two files.
+"""Contradictions between the two captures and the two files of a transfer, and the sources of its columns.
 
-A contradiction shows that a capture or a file is incomplete, for any loss, duplication or reordering, and for
-any clock offset.
+A contradiction shows that a capture or a file is incomplete. Losses, duplicates, reordering and clock offsets cause
+no contradiction.
 """
 
 from collections.abc import Iterator
@@ -35,30 +35,32 @@ class _Files:
         return self.sent_bytes == self.received_bytes == self.common_bytes
 
 
-def find(evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, cut: bool = False) -> Iterator[str]:
-    """Yield each contradiction as a sentence. Incomplete evidence contradicts nothing.
+def find_contradictions(
+    evidence: AttemptEvidence, transfer: Transfer, *, finished: bool, was_stopped: bool = False
+) -> Iterator[str]:
+    """Yield each contradiction as a sentence. Files and captures that are missing or damaged are not compared.
 
     Args:
         evidence: The attempt's evidence.
         transfer: The transfer.
-        finished: True if the listener is known to have ended without being stopped.
-        cut: True if the listener is known to have been stopped before it was finished.
+        finished: True if the evidence shows that the listener exited without being stopped.
+        was_stopped: True if the evidence shows that the listener was stopped before it had finished.
     """
     files = _files(evidence, transfer)
     if files and transfer.protocol is Protocol.TCP and files.common_bytes < files.received_bytes:
-        yield f"{transfer.received_file} is not a prefix of {transfer.sent_file}, although TCP changes no byte"
-    sender, receiver = map(evidence.whole_capture, transfer.captures)
+        yield f"{transfer.received_file} is not a prefix of {transfer.sent_file}, although TCP does not alter bytes"
+    sender, receiver = map(evidence.undamaged_capture, transfer.captures)
     if sender is None or receiver is None:
         return
     if earlier_packets := _earlier_traffic(sender.packets, receiver.packets, transfer):
         yield f"packets of an earlier attempt were still in transit: {earlier_packets}"
     elif transfer.protocol is Protocol.UDP:
-        size_problems = list(_udp(sender.packets, receiver.packets, files, transfer))
-        yield from size_problems or udp_file_checks.find(
-            evidence, transfer, sender.packets, receiver.packets, cut=cut
+        size_problems = list(_udp_contradictions(sender.packets, receiver.packets, files, transfer))
+        yield from size_problems or udp_file_checks.find_contradictions(
+            evidence, transfer, sender.packets, receiver.packets, was_stopped=was_stopped
         )
     elif files is None or max(files.sent_bytes, files.received_bytes) < LONGEST_BYTES:
-        yield from _tcp(sender.packets, receiver.packets, files, transfer, finished=finished)
+        yield from _tcp_contradictions(sender.packets, receiver.packets, files, transfer, finished=finished)
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
@@ -71,9 +73,9 @@ def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
 def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:
     """Return a description of packets of an earlier transfer, or None if there are none.
 
-    A sending netcat uses one source port per transfer. Packets of an earlier transfer are detected in two ways: they
-    arrive with payload from a port from which the sender's capture has no packet; or they left the sender late, from
-    another port than the transfer that started last. Over TCP a SYN marks a start, because retransmissions of an
+    A sending netcat uses one source port per transfer. Packets are from an earlier transfer if they arrive with
+    payload from a source port that is missing in the sender's capture, or if the sender sent them from another port
+    than the transfer that started last. Over TCP, a SYN marks the start of a transfer, because retransmissions of an
     aborted connection contain no SYN.
     """
     sent, received = (
@@ -81,28 +83,30 @@ def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> 
     )
     has_payload = (received.tcp_payload_bytes > 0) | (received.udp_bytes > 0)
     if stray := int((has_payload & ~np.isin(received.sport, sent.sport)).sum()):
-        return f"{format_count(stray, 'packet')} to the transfer's port came from a port from which none was sent"
+        packets_text = f"{format_count(stray, 'packet')} arrived at the transfer's port"
+        return f"{packets_text} from source ports that are not in the {transfer.source}'s capture"
     starts = sent if transfer.protocol is Protocol.UDP else sent.where(sent.tcp_flags & SYN != 0)
     ports, first = np.unique(starts.sport, return_index=True)
     if len(ports) > 1:
         delayed = int((starts.sport != ports[first.argmax()]).sum())
-        return f"{format_count(delayed, 'packet')} left for the transfer's port before its sender started"
+        return f"{format_count(delayed, 'packet')} to the transfer's port left before its sender started"
     return None
 
 
 def _byte_count_contradictions(
     files: _Files, captured_bytes: int, arrived_bytes: int, transfer: Transfer
 ) -> Iterator[str]:
-    """Yield contradictions if captures contain more bytes than were sent, or fewer than were received."""
+    """Yield contradictions between the sizes of the files and the number of bytes in the captures."""
     if captured_bytes > files.sent_bytes:
         yield f"{captured_bytes} bytes left the {transfer.source}, but {transfer.sent_file} has {files.sent_bytes}"
     if files.received_bytes > arrived_bytes:
-        captured = f"contains {arrived_bytes} bytes of the transfer"
-        file = f"{transfer.received_file} has {files.received_bytes}"
-        yield f"the {transfer.destination}'s capture {captured}, but {file}"
+        capture_text = f"the {transfer.destination}'s capture contains {arrived_bytes} bytes of the transfer"
+        yield f"{capture_text}, but {transfer.received_file} has {files.received_bytes}"
 
 
-def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer) -> Iterator[str]:
+def _udp_contradictions(
+    sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer
+) -> Iterator[str]:
     both = transfer.forward(sender), transfer.forward(receiver)
     # A capture also contains later fragments of other programs' datagrams.
     ids = np.concatenate([packets.ip_id[packets.dport == transfer.port] for packets in both])
@@ -116,16 +120,16 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
         yield f"{format_count(unsent, 'datagram')} arrived without being in the {transfer.source}'s capture"
     if files is None:
         return
-    # The number of arrived bytes is at most the number that the first fragments announce, and at most the number in
-    # all fragments.
-    announced = received.udp_bytes[first_received]
-    arrived_bytes = min(int(announced.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
-        announced
+    # The number of arrived bytes is at most the sum of the UDP lengths in the first fragments, and at most the sum of
+    # the payloads of all fragments.
+    udp_bytes = received.udp_bytes[first_received]
+    arrived_bytes = min(int(udp_bytes.sum()), int(received.ip_payload_bytes.sum())) - UDP_HEADER_BYTES * len(
+        udp_bytes
     )
     sent_bytes = int((sent.udp_bytes[first] - UDP_HEADER_BYTES).sum())
     yield from _byte_count_contradictions(files, sent_bytes, arrived_bytes, transfer)
-    # Copies can compensate for missing packets in the sum, but not packet by packet. A later fragment whose id
-    # another transfer also uses cannot be assigned.
+    # Copies can compensate for missing packets in the sum of bytes, so the packets are also compared individually.
+    # A later fragment cannot be assigned if another transfer uses the same id.
     other_ids = np.concatenate(
         [packets.ip_id[(packets.dport != transfer.port) & (packets.dport != NO_PORT)] for packets in both]
     )
@@ -137,11 +141,11 @@ def _udp(sender: Packets, receiver: Packets, files: _Files | None, transfer: Tra
 
 
 def _packet_keys(packets: Packets) -> Keys:
-    """Return a key per packet that is equal at both ends and practically unique."""
+    """Return a key of each packet, which is the same at both ends and practically unique."""
     return row_hashes(packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes, packets.sport + 1)
 
 
-def _tcp(
+def _tcp_contradictions(
     sender: Packets, receiver: Packets, files: _Files | None, transfer: Transfer, *, finished: bool
 ) -> Iterator[str]:
     sent, received = (
@@ -153,8 +157,8 @@ def _tcp(
         for packets in (transfer.backward(sender), transfer.backward(receiver))
     )
     if _is_refused(sent, answers_received):
-        what = f"the {transfer.destination} refused the connection"
-        yield f"{what}: no program listened when the {transfer.source} started"
+        refusal = f"the {transfer.destination} refused the connection"
+        yield f"{refusal}: no program was listening when the {transfer.source} started"
         return
     connections_by_role = {
         transfer.source: Connections.from_syn(sent),
@@ -162,9 +166,9 @@ def _tcp(
     }
     data_ports = np.unique(received.sport[received.tcp_payload_bytes > 0])
     has_syn = {role: connections.includes(data_ports) for role, connections in connections_by_role.items()}
-    for role, mask in has_syn.items():
-        # If the SYN is in neither capture, these are retransmissions of an earlier transfer.
-        if (~mask & np.logical_or(*has_syn.values())).any():
+    for role, role_has_syn in has_syn.items():
+        # If the SYN is in neither capture, the packets are retransmissions of an earlier transfer.
+        if (~role_has_syn & np.logical_or(*has_syn.values())).any():
             yield f"bytes arrived on a connection whose SYN is not in the {role}'s capture"
             return
     connections = connections_by_role[transfer.source]
@@ -172,23 +176,26 @@ def _tcp(
         yield f"{format_count(unsent, 'byte')} arrived without being in the {transfer.source}'s capture"
     answers = Packets.concatenated((answers_received, answers_sent))
     acknowledged = connections.acknowledged(answers)
-    for frames, role in ((sent, transfer.source), (received, transfer.destination)):
-        if missing := acknowledged.bytes_not_in(connections.numbers(frames)):
-            yield f"{format_count(missing, 'byte')} were acknowledged that are not in the {role}'s capture"
+    for packets, role in ((sent, transfer.source), (received, transfer.destination)):
+        if missing := acknowledged.bytes_not_in(connections.numbers(packets)):
+            yield f"{format_count(missing, 'byte')} were acknowledged, but are not in the {role}'s capture"
     if files is None:
         return
     arrived_bytes = connections.payload(received).size_bytes
     yield from _byte_count_contradictions(files, connections.payload(sent).size_bytes, arrived_bytes, transfer)
-    ended = not connections.numbers(sent).bytes_not_in(acknowledged)
-    # If a program stops reading before the end, the kernel rejects the rest with a reset.
-    refused = (answers.tcp_flags & RST != 0).any()
-    if finished and (ended or refused) and files.received_bytes < arrived_bytes:
-        arrived = f"{arrived_bytes} bytes arrived, but {transfer.received_file} has {files.received_bytes}"
-        yield f"{arrived}, although its listener ended normally"
+    is_acknowledged = not connections.numbers(sent).bytes_not_in(acknowledged)
+    # If a program stops reading before the end of the stream, the kernel rejects the later bytes with a reset.
+    is_reset = (answers.tcp_flags & RST != 0).any()
+    if finished and (is_acknowledged or is_reset) and files.received_bytes < arrived_bytes:
+        arrived_text = f"{arrived_bytes} bytes arrived, but {transfer.received_file} has {files.received_bytes}"
+        yield f"{arrived_text}, although its listener exited normally"
 
 
 def _is_refused(sent: Packets, answers: Packets) -> bool:
-    """Return True if the sender's only SYN was refused and none accepted; a repeated SYN may be due to the link."""
+    """Return True if the receiver refused the only SYN and accepted no connection.
+
+    A repeated SYN shows nothing, because the link may have caused it.
+    """
     resets = answers.where(answers.tcp_flags & RST != 0)
     if not len(resets) or (answers.tcp_flags & SYN != 0).any():
         return False

@@ -2,8 +2,8 @@
 
 netcat writes the payload of each datagram that its kernel delivers, in the order of delivery. The received file is
 therefore a sequence of blocks of the sent file: the payloads of the datagrams that arrived completely and were not
-dropped by the kernel. The kernel counts its drops after the capture: a full socket buffer or a wrong checksum
-(InErrors), a failed reassembly (ReasmFails), a listener that had ended (NoPorts).
+dropped by the kernel. The kernel counts the datagrams that it drops after the capture because of a full socket buffer
+or a wrong checksum (InErrors), a failed reassembly (ReasmFails), or a listener that had exited (NoPorts).
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,41 +38,44 @@ class _Block:
     stop: int
 
 
-def find(
-    evidence: AttemptEvidence, transfer: Transfer, sender: Packets, receiver: Packets, *, cut: bool
+def find_contradictions(
+    evidence: AttemptEvidence, transfer: Transfer, sender: Packets, receiver: Packets, *, was_stopped: bool
 ) -> Iterator[str]:
-    """Yield differences between the file and the arrived datagrams; none if the captures do not identify them.
+    """Yield contradictions between the received file and the datagrams that arrived.
+
+    There are none if the datagrams cannot be identified in the captures.
 
     Args:
         evidence: The attempt's evidence.
         transfer: The transfer, over UDP.
         sender: Packets of the sender's undamaged capture.
         receiver: Packets of the receiver's undamaged capture.
-        cut: True if the listener was stopped before it was finished.
+        was_stopped: True if the listener was stopped before it had finished.
     """
     sent_file, received_file = (
         evidence.read_or_none(reading.mapped, name) for name in (transfer.sent_file, transfer.received_file)
     )
     if sent_file is None or received_file is None:
         return
-    arrived = _blocks(transfer.forward(sender), transfer.forward(receiver), transfer.port, len(sent_file))
-    if arrived is None:
+    arrival = _blocks(transfer.forward(sender), transfer.forward(receiver), transfer.port, len(sent_file))
+    if arrival is None:
         return
-    blocks, has_no_copies = arrived
+    blocks, has_no_copies = arrival
     counters = evidence.counters(transfer.destination)
     drop_counters = (counters.udp_undelivered, counters.reassembly_failures or 0, counters.udp_no_ports or 0)
-    dropped = None if cut or drop_counters[0] is None else sum(count or 0 for count in drop_counters)
+    dropped = None if was_stopped or drop_counters[0] is None else sum(count or 0 for count in drop_counters)
     arrived_text = f"{format_count(len(blocks), 'datagram')} arrived completely"
     if not has_no_copies:
-        # A copy may be delivered as well, so only sizes can be compared, not positions in the file.
-        least_bytes = sum(sorted(block.stop - block.start for block in blocks)[: len(blocks) - (dropped or 0)])
-        if dropped is not None and len(received_file) < least_bytes:
-            yield f"{arrived_text}, but {transfer.received_file} has {len(received_file)} bytes of {least_bytes}"
+        # Copies may also be delivered, so only sizes are compared, not positions in the file.
+        min_bytes = sum(sorted(block.stop - block.start for block in blocks)[: len(blocks) - (dropped or 0)])
+        if dropped is not None and len(received_file) < min_bytes:
+            size_text = f"{transfer.received_file} has {len(received_file)} bytes instead of {min_bytes} or more"
+            yield f"{arrived_text}, but {size_text}"
         return
     at, remaining = 0, list(blocks)
     while at < len(received_file):
-        # Two processors may deliver datagrams in another order than they captured them.
-        matches = (_is_block_at(received_file, at, sent_file, block, cut) for block in remaining)
+        # With two processors, the order of delivery may differ from the order in the capture.
+        matches = (_is_block_at(received_file, at, sent_file, block, was_stopped) for block in remaining)
         index = next((position for position, is_match in enumerate(matches) if is_match), -1)
         if index < 0:
             break
@@ -80,31 +83,36 @@ def find(
         at = min(at + block.stop - block.start, len(received_file))
     skipped = len(remaining)
     if at < len(received_file):
-        yield f"{transfer.received_file} differs from {transfer.sent_file} from byte {at} on: {arrived_text}"
+        difference = f"{transfer.received_file} differs from {transfer.sent_file} from byte {at} on"
+        yield f"{difference}, although {arrived_text}"
     elif dropped is not None and skipped > dropped:
         missing_text = f"{arrived_text}, but {transfer.received_file} lacks {skipped} of them"
         yield f"{missing_text}, and the kernel of the {transfer.destination} dropped {dropped}"
 
 
-def _is_block_at(received_file: bytes | mmap, at: int, sent_file: bytes | mmap, block: _Block, cut: bool) -> bool:
-    """Return True if the block is at this position in the received file; with `cut` the last one may be shorter."""
+def _is_block_at(
+    received_file: bytes | mmap, at: int, sent_file: bytes | mmap, block: _Block, was_stopped: bool
+) -> bool:
+    """Return True if the received file contains the block at this position.
+
+    The last block may be incomplete if the listener was stopped.
+    """
     size = block.stop - block.start
-    if cut:
+    if was_stopped:
         size = min(size, len(received_file) - at)
     return received_file[at : at + size] == sent_file[block.start : block.start + size]
 
 
 def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tuple[Sequence[_Block], bool] | None:
-    """Return the datagrams that arrived completely, in the order of completion.
+    """Return the datagrams that arrived completely, in this order, and True if no fragment arrived twice.
 
-    Returns:
-        The datagrams, and True if no fragment arrived twice; None if datagrams cannot be identified.
+    Return None if the datagrams cannot be identified.
     """
     first = sent.where(sent.dport == port)
     sizes = first.udp_bytes - UDP_HEADER_BYTES
     stops = np.cumsum(sizes)
-    unique = len(np.unique(first.ip_id)) == len(first)
-    if not len(first) or not unique or stops[-1] != size_bytes:
+    has_unique_ids = len(np.unique(first.ip_id)) == len(first)
+    if not len(first) or not has_unique_ids or stops[-1] != size_bytes:
         return None
     index_by_id = {int(ip_id): index for index, ip_id in enumerate(first.ip_id)}
     fragments = received.where(np.isin(received.ip_id, first.ip_id))
@@ -124,6 +132,6 @@ def _blocks(sent: Packets, received: Packets, port: int, size_bytes: int) -> tup
     complete_ns = np.maximum.reduceat(fragments.time_ns[order], starts)
     index = np.array([index_by_id[int(ip_id)] for ip_id in ids])
     is_complete = fragment_bytes == first.udp_bytes[index]
-    arrival = np.argsort(complete_ns[is_complete], kind="stable")
-    arrived = index[is_complete][arrival]
-    return [_Block(int(stops[at] - sizes[at]), int(stops[at])) for at in arrived], has_no_copies
+    order = np.argsort(complete_ns[is_complete], kind="stable")
+    blocks = [_Block(int(stops[at] - sizes[at]), int(stops[at])) for at in index[is_complete][order]]
+    return blocks, has_no_copies

@@ -1,12 +1,12 @@
-"""Detection of steps of a robot's clock between two readings, by comparison with its time since boot.
+"""Detection of steps of a robot's clock between two readings, by comparison with the time since boot.
 
-Linux slews its clock and the time since boot together, so gradual corrections by NTP (up to 500 ppm, or 8.3 % by
+Linux slews the clock and the time since boot together, so gradual corrections by NTP (up to 500 ppm, or 8.3 % by
 chrony) change both equally (clock_gettime(2)). Their difference changes only if the clock is set: by settimeofday(2),
 ADJ_SETOFFSET of adjtimex(2), or a leap second. A change of the difference is therefore a clock step.
 
-A state file has lines `BEFORE TIME AFTER`: the clock between two readings of /proc/uptime, which is truncated to
-10 ms. Each line gives a lower and an upper bound of the difference for any duration of the reading; several lines
-give closer bounds.
+A state file has lines `BEFORE TIME AFTER`: a reading of the clock between two readings of /proc/uptime, which is
+truncated to 10 ms. Each line gives a lower and an upper bound of the difference, however long the readings took.
+Several lines give closer bounds.
 """
 
 import re
@@ -39,7 +39,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class ClockStep:
-    """Step of a clock between two times of one boot.
+    """Step of a clock between two readings without a reboot between them.
 
     Attributes:
         step_s: Estimated step in seconds; negative if the clock was set back.
@@ -51,7 +51,7 @@ class ClockStep:
 
 
 def parse(lines: Iterable[str]) -> Clock | None:
-    """Return the bounds of a clock from lines of readings; None if there is no reading. Other lines are ignored."""
+    """Return the bounds of a clock from the lines that are readings, or None if there are no readings."""
     readings = [_bounds(match) for line in lines if (match := _READING.fullmatch(line))]
     if not readings:
         return None
@@ -69,13 +69,16 @@ def _bounds(match: re.Match[str]) -> tuple[int, int, int, int]:
 
 
 def clock_step(before: Clock, after: Clock) -> ClockStep:
-    """Return the step of a clock between two times of one boot."""
-    least_ns, most_ns = after.lowest_ns - before.highest_ns, after.highest_ns - before.lowest_ns
-    return ClockStep((least_ns + most_ns) / 2e9, (most_ns - least_ns) / 2e9)
+    """Return the step of a clock between two readings without a reboot between them."""
+    min_step_ns, max_step_ns = after.lowest_ns - before.highest_ns, after.highest_ns - before.lowest_ns
+    return ClockStep((min_step_ns + max_step_ns) / 2e9, (max_step_ns - min_step_ns) / 2e9)
 
 
 def step_description(before: Clock, after: Clock) -> str | None:
-    """Return a description of a clock step between two times of one boot; None if no step can be detected."""
+    """Return a description of a clock step between two readings, or None if no step can be detected.
+
+    The robot must not have been rebooted between the readings.
+    """
     if any(reading.lowest_ns > reading.highest_ns for reading in (before, after)):
         return "its clock was set while it was read"
     step = clock_step(before, after)

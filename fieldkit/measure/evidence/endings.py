@@ -20,7 +20,8 @@ _KILLED: Final = 128
 """A shell's exit code for a command that was killed by a signal is this number plus the signal number."""
 
 _TOLERANCE_S: Final = 0.1
-"""Tolerance of a job's duration, for the resolution of both times (10 ms) and the start of its program."""
+"""Tolerance of a job's duration: both times have a resolution of 10 ms, and the program of the job needs time to
+start."""
 
 
 class Cause(StrEnum):
@@ -47,23 +48,23 @@ class Ending:
     Attributes:
         cause: Cause of the termination; `EXITED` includes a signal that was not sent by fieldkit.
         code: Exit code; None if the job was killed together with its supervisor, or is still running.
-        lasted_s: Duration in seconds; None if the end is unknown.
+        duration_s: Duration in seconds; None if the end is unknown.
         ended_s: End, in seconds since boot; None if unknown.
     """
 
     cause: Cause
     code: int | None
-    lasted_s: float | None
+    duration_s: float | None
     ended_s: float | None = None
 
 
 def parse(lines: Iterable[str]) -> Mapping[str, Ending]:
-    """Return the terminations by name of the job; other lines are ignored."""
+    """Return the terminations by the names of the jobs; other lines are ignored."""
     return {match["name"]: _ending(match) for line in lines if (match := _ENDING.fullmatch(line))}
 
 
 def times_s(lines: Iterable[str]) -> Mapping[str, tuple[float, float | None]]:
-    """Return start and end of each job in seconds since boot, by its name; the end is None if unknown."""
+    """Return start and end of each job in seconds since boot, by name; the end is None if unknown."""
     matches = [match for line in lines if (match := _ENDING.fullmatch(line))]
     started_s = {match["name"]: int(match["started"]) / _TICKS_PER_S for match in matches}
     ended_s = {match["name"]: None if match["ended"] == "-" else float(match["ended"]) for match in matches}
@@ -72,17 +73,17 @@ def times_s(lines: Iterable[str]) -> Mapping[str, tuple[float, float | None]]:
 
 def _ending(match: re.Match[str]) -> Ending:
     ended_s = None if match["ended"] == "-" else float(match["ended"])
-    lasted_s = None if ended_s is None else ended_s - int(match["started"]) / _TICKS_PER_S
-    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), lasted_s, ended_s)
+    duration_s = None if ended_s is None else ended_s - int(match["started"]) / _TICKS_PER_S
+    return Ending(Cause(match["how"]), None if match["code"] == "-" else int(match["code"]), duration_s, ended_s)
 
 
-def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float = 0.0) -> str | None:
-    """Return the reason why the termination of a job is not acceptable, without its name; None if it is.
+def termination_error(ending: Ending, allowed: Collection[Cause], min_duration_s: float = 0.0) -> str | None:
+    """Return the reason why the termination of a job is not acceptable, or None if it is; without the job's name.
 
     Args:
         ending: The termination.
         allowed: Acceptable causes.
-        least_s: Minimum duration of a job that exits without being stopped, in seconds.
+        min_duration_s: Minimum duration of a job that exits without being stopped, in seconds.
     """
     if ending.code is None:
         return "was still running when the evidence was collected" if ending.cause is Cause.RUNNING else "was killed"
@@ -90,8 +91,12 @@ def termination_error(ending: Ending, allowed: Collection[Cause], least_s: float
         return _NOT_ALLOWED[ending.cause].format(ending.code)
     if ending.cause is Cause.EXITED and ending.code > _KILLED:
         return f"was killed by {_signal(ending.code - _KILLED)}, not by fieldkit"
-    if ending.cause is Cause.EXITED and ending.lasted_s is not None and ending.lasted_s + _TOLERANCE_S < least_s:
-        return f"exited after {ending.lasted_s:.1f} s of {least_s:g} s"
+    if (
+        ending.cause is Cause.EXITED
+        and ending.duration_s is not None
+        and ending.duration_s + _TOLERANCE_S < min_duration_s
+    ):
+        return f"exited after {ending.duration_s:.1f} s instead of {min_duration_s:g} s"
     return None
 
 

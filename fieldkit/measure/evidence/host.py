@@ -38,7 +38,7 @@ SYSTEM: Final = columns(
     ),
 )
 
-_SHARED_REASON: Final = "other steps send UDP to the receiver too, and its kernel has only one counter for all of it"
+_SHARED_REASON: Final = "other steps also send UDP to the receiver, and its kernel has one counter for all datagrams"
 _SECTION: Final = re.compile(r"^==> (?P<file>.+) <==$", re.MULTILINE)
 _BOOT: Final = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 BOOT: Final = "boot"
@@ -50,8 +50,8 @@ _MAX_NAME_BYTES: Final = 16
 """Maximum length of the name of a congestion control in Linux (TCP_CA_NAME_MAX)."""
 _DEV: Final = "/proc/net/dev"
 _REQUIRED_SECTIONS: Final = (BOOT, CLOCK, "date", _SNMP, _DEV, "iw station dump", "end")
-"""Sections that must be in both files or in neither. The same script writes both files, and each of them contains the
-sections that the host supports.
+"""Sections that must be in both files of an attempt or in neither. The same script writes both files, and each file
+contains the sections that the host supports.
 """
 
 
@@ -75,19 +75,19 @@ class Counters:
 
     @property
     def udp_undelivered(self) -> int | None:
-        """Datagrams that arrived but were not delivered to their socket; None if the kernel has no such counter."""
+        """Datagrams that arrived, but were not delivered to their socket; None if the kernel does not count them."""
         counts = [count for count in (self.udp_buffer_errors, self.udp_in_errors) if count is not None]
         return max(counts, default=None)
 
 
 @dataclass(frozen=True)
 class HostState:
-    """State of a host at one time, without its counters; attributes are None if the file does not contain them.
+    """State of a host at one time, without its counters. An attribute is None if the file does not contain it.
 
     Attributes:
         boot: Boot ID of the kernel.
         clock: Bounds of the clock.
-        endings: Terminations of the attempt's jobs, by name; only in the state after an attempt.
+        endings: Terminations of the attempt's jobs by name; only in the state after an attempt.
         sections: Names of the file's sections.
     """
 
@@ -100,7 +100,7 @@ class HostState:
 def before_file(role: Role) -> str:
     """Return the name of the file with a robot's state before an attempt.
 
-    The file has sections, each with a line `==> FILE <==` and its text.
+    The file has sections. Each section has a line `==> FILE <==` and the text of this file.
     """
     return f"{role}-before.txt"
 
@@ -126,7 +126,8 @@ def state(path: Path) -> HostState:
 def incomplete_sections(before: HostState, after: HostState) -> Iterator[str]:
     """Yield the names of sections that are in only one of the two states of an attempt.
 
-    A section that the host does not support is in neither state. Files of versions without the boot ID have no jobs.
+    A section that the host does not support is in neither state. Files of versions without the boot ID contain no
+    section of jobs.
     """
     for name in _REQUIRED_SECTIONS:
         if name in before.sections ^ after.sections:
@@ -160,7 +161,7 @@ def job_times_ns(path: Path) -> Mapping[str, tuple[int, int]]:
 
 
 def stations(path: Path) -> str:
-    """Return the output of `iw station dump`, empty if it is missing; raises `EvidenceError` as `state`."""
+    """Return the output of `iw station dump`, or an empty text if it is missing; raises as `state`."""
     return _sections(reading.text(path)).get("iw station dump", "")
 
 
@@ -196,7 +197,7 @@ def parse(text: str) -> Counters:
 
 
 def received_bytes(path: Path, interface: str) -> int | None:
-    """Return the number of bytes that an interface has received (/proc/net/dev); None if it does not exist.
+    """Return the number of bytes that an interface has received (/proc/net/dev), or None if there is no interface.
 
     Raises:
         EvidenceError: The file is missing or cannot be read.
@@ -207,7 +208,7 @@ def received_bytes(path: Path, interface: str) -> int | None:
 
 
 def difference(before: Counters, after: Counters) -> Counters:
-    """Return the increments of the counters; None if a counter is missing or has decreased (the host restarted)."""
+    """Return the increments of the counters; None for a counter that is missing, or decreased by a restart."""
     return Counters(
         udp_buffer_errors=_increment(before.udp_buffer_errors, after.udp_buffer_errors),
         reassembly_failures=_increment(before.reassembly_failures, after.reassembly_failures),
@@ -233,8 +234,8 @@ def _parse_snmp(snmp: str) -> dict[tuple[str, str], int]:
     names: dict[str, list[str]] = {}
     counters: dict[tuple[str, str], int] = {}
     for line in snmp.splitlines():
-        group, _, rest = line.partition(":")
-        words = rest.split()
+        group, _, text = line.partition(":")
+        words = text.split()
         if group not in names:
             names[group] = words
             continue
@@ -247,7 +248,8 @@ def _parse_snmp(snmp: str) -> dict[tuple[str, str], int]:
 def without_shared_counters(measured: Measured) -> Measured:
     """Return the columns of `measure` for a repeat in which other steps also send UDP to the receiver.
 
-    A counter above 0 becomes missing, because it may count the datagrams of other steps; 0 is valid for every step.
+    A counter above 0 is removed, because it may include datagrams of other steps. A counter of 0 is valid for every
+    step.
     """
     names = (column.name for column in COLUMNS)
     return measured.without({name: _SHARED_REASON for name in names if measured.values.get(name)})

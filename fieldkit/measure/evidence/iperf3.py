@@ -1,9 +1,9 @@
 """Output of `iperf3 --json` from either end of a test, for version 3.1 and later.
 
-Versions differ in their totals at the end: the server of a UDP test reports 0 bytes, and 3.1 has one total for both
-ends. The counters of each interval are the same in all versions (checked with 3.1.3, 3.7, 3.12 and 3.17), so the
-columns are sums over the intervals. If the connection of a test broke, the last interval is missing and the JSON has
-the key `error`.
+The totals at the end differ between versions: the server of a UDP test reports 0 bytes, and 3.1 has one total for
+both ends. The counters of each interval are the same in all versions (checked with 3.1.3, 3.7, 3.12 and 3.17), so the
+columns are sums over the intervals. If the connection of a test was interrupted, the last interval is missing and the
+JSON has the key `error`.
 """
 
 import json
@@ -35,7 +35,10 @@ COLUMNS: Final = columns(
     (
         "iperf3_throughput_bit_s",
         "bit/s",
-        "Payload rate at iperf3's receiver, over its full seconds without the first one if there are at least three.",
+        (
+            "Payload rate at iperf3's receiver over the full seconds of the test; the first second is excluded if "
+            "there are at least three."
+        ),
         Figure("iperf3 throughput", Kind.MEDIAN, rank=60),
     ),
     (
@@ -48,7 +51,11 @@ COLUMNS: Final = columns(
     ("iperf3_sent_bytes", "B", "Payload sent, as reported by iperf3's sender."),
     ("iperf3_received_bytes", "B", "Payload received, as reported by iperf3's receiver."),
     ("iperf3_datagrams_sent", "count", "UDP datagrams that iperf3's receiver expected. Empty for TCP."),
-    ("iperf3_datagrams_received", "count", "iperf3_datagrams_sent that iperf3's receiver received. Empty for TCP."),
+    (
+        "iperf3_datagrams_received",
+        "count",
+        "Datagrams of iperf3_datagrams_sent that iperf3's receiver received. Empty for TCP.",
+    ),
     (
         "iperf3_loss",
         "share",
@@ -59,8 +66,8 @@ COLUMNS: Final = columns(
         "iperf3_jitter_s",
         "s",
         (
-            "Interarrival jitter (RFC 3550, section 6.4.1) as reported by iperf3 after the last datagram; about the "
-            "last 16 datagrams determine it. For the whole test see iperf3_captured_jitter_mean_s. Empty for TCP."
+            "Interarrival jitter (RFC 3550, section 6.4.1) as reported by iperf3 after the last datagram. It depends "
+            "on about the last 16 datagrams; for the whole test see iperf3_captured_jitter_mean_s. Empty for TCP."
         ),
         Figure("iperf3's last jitter value (RFC 3550)", Kind.MEDIAN, rank=63),
     ),
@@ -75,13 +82,13 @@ COLUMNS: Final = columns(
 _UDP_COLUMNS: Final = ("iperf3_datagrams_sent", "iperf3_datagrams_received", "iperf3_loss", "iperf3_jitter_s")
 _TCP_COLUMNS: Final = ("iperf3_retransmits",)
 _MAX_BYTES: Final = 16 << 20
-"""One hour of 1 s intervals with 8 streams is 8 MB."""
+"""Maximum size of the JSON. One hour with 8 streams and intervals of 1 s has 8 MB."""
 # cJSON before 1.5.9 printed nan and inf, which are not valid JSON.
 _INVALID_NUMBER: Final = re.compile(r"(?<=[:,\[])(\s*)[-+]?(?:nan|inf(?:inity)?)\b(?=\s*[,\]}])", re.IGNORECASE)
 _MIN_INTERVALS: Final = 3
 _MIN_LENGTH_SHARE: Final = 0.5
-"""An interval shorter than this share of the longest is a remainder at the end. On a link with losses, this remainder
-contains some tenths of a second without data, until the receiver is notified of the end of the test.
+"""An interval that is shorter than this share of the longest one is not a full interval, but the end of the test. On
+a link with losses, it contains some tenths of a second without data, until the receiver is notified of the end.
 """
 
 
@@ -92,10 +99,10 @@ def json_file(role: Role) -> str:
 
 @dataclass(frozen=True)
 class IperfInterval:
-    """One interval of a test at one end, with sums over all streams. A value is None if that end does not count it.
+    """One interval of a test at one end, summed over all streams. A value is None if this end does not report it.
 
     Attributes:
-        lasted_s: Length in seconds.
+        duration_s: Duration in seconds.
         payload_bytes: Payload sent or received.
         datagrams: UDP datagrams; at the receiver, the datagrams that it expected.
         lost: Expected datagrams that the receiver did not receive.
@@ -103,10 +110,10 @@ class IperfInterval:
         start_s: Start in seconds; None if the JSON does not contain it.
         end_s: End in seconds; None if the JSON does not contain it.
         stream_bytes: Sum of the payloads of the streams; None without streams.
-        rate_bit_s: Payload bits per second as written by iperf3.
+        rate_bit_s: Payload bits per second as printed by iperf3.
     """
 
-    lasted_s: float
+    duration_s: float
     payload_bytes: int
     datagrams: int | None
     lost: int | None
@@ -119,7 +126,7 @@ class IperfInterval:
     @property
     def bit_s(self) -> float:
         """Payload bits per second."""
-        return 8 * self.payload_bytes / self.lasted_s
+        return 8 * self.payload_bytes / self.duration_s
 
 
 @dataclass(frozen=True)
@@ -144,14 +151,14 @@ class IperfTest:
 
     @property
     def _full_intervals(self) -> tuple[IperfInterval, ...]:
-        longest_s = max((interval.lasted_s for interval in self.intervals), default=0.0)
-        return tuple(interval for interval in self.intervals if interval.lasted_s >= _MIN_LENGTH_SHARE * longest_s)
+        longest_s = max((interval.duration_s for interval in self.intervals), default=0.0)
+        return tuple(interval for interval in self.intervals if interval.duration_s >= _MIN_LENGTH_SHARE * longest_s)
 
     @property
-    def steady(self) -> tuple[IperfInterval, ...]:
-        """The full intervals, without the first one if there are at least three.
+    def steady_intervals(self) -> tuple[IperfInterval, ...]:
+        """The full intervals; the first one is excluded if there are at least three.
 
-        In the first one, TCP increases its rate from slow start, and the receiver waits for the first packet.
+        In the first interval, TCP is in slow start, and the receiver waits for the first packet.
         """
         full = self._full_intervals
         return full[1:] if len(full) >= _MIN_INTERVALS else full
@@ -160,9 +167,10 @@ class IperfTest:
     def window_s(self) -> tuple[float, float]:
         """Start and end of the steady intervals, in seconds after the first packet."""
         start_s = sum(
-            interval.lasted_s for interval in self._full_intervals[: len(self._full_intervals) - len(self.steady)]
+            interval.duration_s
+            for interval in self._full_intervals[: len(self._full_intervals) - len(self.steady_intervals)]
         )
-        return start_s, start_s + sum(interval.lasted_s for interval in self.steady)
+        return start_s, start_s + sum(interval.duration_s for interval in self.steady_intervals)
 
 
 def read(path: Path) -> IperfTest:
@@ -183,7 +191,7 @@ def parse(text: str) -> IperfTest:
     """Return the result in a text, which may start with lines that are not JSON.
 
     Raises:
-        EvidenceError: It is not JSON of iperf3.
+        EvidenceError: The text is not JSON of iperf3.
     """
     try:
         document, _ = json.JSONDecoder().raw_decode(_INVALID_NUMBER.sub(r"\1null", text), max(text.find("{"), 0))
@@ -207,13 +215,13 @@ def parse(text: str) -> IperfTest:
 def _intervals(document: Mapping[str, Any]) -> Iterator[IperfInterval]:
     for interval in items(document, "intervals"):
         total = mapping(interval, "sum")
-        lasted_s, payload_bytes = number(total, "seconds"), count(total, "bytes")
-        if total.get("omitted") is True or not lasted_s or payload_bytes is None:
+        duration_s, payload_bytes = number(total, "seconds"), count(total, "bytes")
+        if total.get("omitted") is True or not duration_s or payload_bytes is None:
             continue
         datagrams, lost, retransmits = (count(total, name) for name in ("packets", "lost_packets", "retransmits"))
         streams = [count(stream, "bytes") for stream in items(interval, "streams")]
         yield IperfInterval(
-            lasted_s,
+            duration_s,
             payload_bytes,
             datagrams,
             lost,
@@ -233,17 +241,17 @@ def _ports(start: Mapping[str, Any]) -> Iterator[tuple[int, int]]:
 
 
 def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | None) -> Measured:
-    """Return the columns of a test from the results of both ends; None for an end whose result is not available."""
+    """Return the columns of a test. `sender` or `receiver` is None if the result of this end is not available."""
     sent, received = (test.intervals if test else () for test in (sender, receiver))
     received_bytes = sum(interval.payload_bytes for interval in received) if received else None
-    steady = receiver.steady if receiver else ()
-    rates = [interval.bit_s for interval in steady]
-    lasted_s = sum(interval.lasted_s for interval in steady)
+    steady_intervals = receiver.steady_intervals if receiver else ()
+    rates = [interval.bit_s for interval in steady_intervals]
+    duration_s = sum(interval.duration_s for interval in steady_intervals)
     datagrams, lost = (_sum([getattr(interval, name) for interval in received]) for name in ("datagrams", "lost"))
     arrived = None if datagrams is None or lost is None else max(datagrams - lost, 0)
     values = {
-        "iperf3_throughput_bit_s": 8 * sum(interval.payload_bytes for interval in steady) / lasted_s
-        if steady
+        "iperf3_throughput_bit_s": 8 * sum(interval.payload_bytes for interval in steady_intervals) / duration_s
+        if steady_intervals
         else None,
         "iperf3_interval_min_bit_s": min(rates, default=None),
         "iperf3_interval_median_bit_s": median(rates) if rates else None,
@@ -255,15 +263,15 @@ def measure(protocol: Protocol, sender: IperfTest | None, receiver: IperfTest | 
         "iperf3_jitter_s": receiver.jitter_s if receiver else None,
         "iperf3_retransmits": _sum([interval.retransmits for interval in sent]),
     }
-    inapplicable = _TCP_COLUMNS if protocol is Protocol.UDP else _UDP_COLUMNS
-    applicable = {name: value for name, value in values.items() if name not in inapplicable}
-    inapplicable_columns = [column for column in COLUMNS if column.name in inapplicable]
+    other_protocol_names = _TCP_COLUMNS if protocol is Protocol.UDP else _UDP_COLUMNS
+    applicable = {name: value for name, value in values.items() if name not in other_protocol_names}
+    other_columns = [column for column in COLUMNS if column.name in other_protocol_names]
     return Measured.from_optional(applicable, "iperf3 does not report it") | Measured.all_missing(
-        inapplicable_columns, f"not for {protocol}"
+        other_columns, f"not for {protocol}"
     )
 
 
 def _sum(counts: list[int | None]) -> int | None:
-    """Return the sum of the counts, or None if there are none or any of them is None."""
+    """Return the sum of the counts, or None if there are no counts or one of them is None."""
     present = [count for count in counts if count is not None]
     return sum(present) if present and len(present) == len(counts) else None

@@ -1,4 +1,4 @@
-"""Parts of iperf3's JSON: fields, each checked for its type before use, parameters (`start`) and totals (`end`)."""
+"""Parts of iperf3's JSON: fields of a checked type, the parameters of the test (`start`) and its totals (`end`)."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -9,13 +9,13 @@ _MAX_COUNT: Final = 2**53
 
 
 def mapping(document: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    """Return the object under a key; an empty one if there is no object."""
+    """Return the object under a key, or an empty object if the value is not an object."""
     value = document.get(key)
     return value if isinstance(value, dict) else {}
 
 
 def items(document: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
-    """Return the objects of the list under a key; an empty list if there is no list."""
+    """Return the objects in the list under a key, or an empty list if the value is not a list."""
     value = document.get(key)
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
@@ -23,8 +23,8 @@ def items(document: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
 def number(document: Mapping[str, Any], key: str) -> float | None:
     """Return the number under a key; None if it is missing, not finite, negative, or not below 2**53."""
     value = document.get(key)
-    fits = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT
-    return float(value) if fits and value is not None and math.isfinite(value) else None
+    is_in_range = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < _MAX_COUNT
+    return float(value) if is_in_range and value is not None and math.isfinite(value) else None
 
 
 def count(document: Mapping[str, Any], key: str) -> int | None:
@@ -35,19 +35,19 @@ def count(document: Mapping[str, Any], key: str) -> int | None:
 
 @dataclass(frozen=True)
 class IperfStart:
-    """Parameters of a test; None, or an empty text, if the JSON does not contain them.
+    """Parameters of a test. A parameter that the JSON does not contain is None or an empty text.
 
     Attributes:
         cookie: Random text that is the same at both ends of a test.
-        began_utc_s: Start, in seconds since 1970 UTC.
+        start_utc_s: Start, in seconds since 1970 UTC.
         protocol: `tcp` or `udp`.
         streams: Number of parallel streams.
         block_bytes: Bytes per write; for UDP, the payload of a datagram.
-        reverse: Whether the server sends.
+        reverse: True if the server sends.
     """
 
     cookie: str = ""
-    began_utc_s: int | None = None
+    start_utc_s: int | None = None
     protocol: str = ""
     streams: int | None = None
     block_bytes: int | None = None
@@ -65,8 +65,8 @@ class IperfTotals:
         lost: Expected datagrams that the receiver did not receive.
         jitter_s: Jitter at the receiver, in seconds.
         retransmits: Retransmitted segments.
-        out_of_order: Datagrams of all streams that arrived out of order, including duplicates.
-        ends_s: End times of all summaries, in seconds from the start.
+        out_of_order: Number of datagrams in all streams that arrived out of order, including duplicates.
+        summary_ends_s: End times in all summaries, in seconds from the start.
     """
 
     sent_bytes: int | None = None
@@ -76,7 +76,7 @@ class IperfTotals:
     jitter_s: float | None = None
     retransmits: int | None = None
     out_of_order: int = 0
-    ends_s: tuple[float, ...] = ()
+    summary_ends_s: tuple[float, ...] = ()
 
 
 def parse_start(document: Mapping[str, Any]) -> IperfStart:
@@ -86,7 +86,7 @@ def parse_start(document: Mapping[str, Any]) -> IperfStart:
     cookie, protocol, reverse = start.get("cookie"), test.get("protocol"), number(test, "reverse")
     return IperfStart(
         cookie=cookie if isinstance(cookie, str) else "",
-        began_utc_s=count(mapping(start, "timestamp"), "timesecs"),
+        start_utc_s=count(mapping(start, "timestamp"), "timesecs"),
         protocol=protocol.lower() if isinstance(protocol, str) else "",
         streams=count(test, "num_streams"),
         block_bytes=count(test, "blksize"),
@@ -97,21 +97,21 @@ def parse_start(document: Mapping[str, Any]) -> IperfStart:
 def parse_totals(document: Mapping[str, Any]) -> IperfTotals:
     """Return the totals of a test."""
     end = mapping(document, "end")
-    both, sent, received = (mapping(end, name) for name in ("sum", "sum_sent", "sum_received"))
-    udp_part = received if count(received, "packets") else both
+    combined, sent, received = (mapping(end, name) for name in ("sum", "sum_sent", "sum_received"))
+    udp_part = received if count(received, "packets") else combined
     return IperfTotals(
-        sent_bytes=count(sent or both, "bytes") or None,
+        sent_bytes=count(sent or combined, "bytes") or None,
         received_bytes=count(received, "bytes") or None,
         datagrams=count(udp_part, "packets") or None,
         lost=count(udp_part, "lost_packets") if count(udp_part, "packets") else None,
-        jitter_s=next((ms / 1e3 for part in (received, both) if (ms := number(part, "jitter_ms"))), None),
+        jitter_s=next((ms / 1e3 for part in (received, combined) if (ms := number(part, "jitter_ms"))), None),
         retransmits=count(sent, "retransmits"),
         out_of_order=sum(count(mapping(stream, "udp"), "out_of_order") or 0 for stream in items(end, "streams")),
-        ends_s=tuple(_ends_s(end)),
+        summary_ends_s=tuple(_summary_ends_s(end)),
     )
 
 
-def _ends_s(end: Mapping[str, Any]) -> Iterator[float]:
+def _summary_ends_s(end: Mapping[str, Any]) -> Iterator[float]:
     sums = [mapping(end, name) for name in ("sum", "sum_sent", "sum_received")]
     parts = [mapping(stream, name) for stream in items(end, "streams") for name in ("udp", "sender", "receiver")]
     yield from (end_s for part in (*sums, *parts) if (end_s := number(part, "end")) is not None)

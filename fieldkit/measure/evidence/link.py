@@ -1,7 +1,8 @@
 """Columns of the Wi-Fi links of sender and receiver during an attempt, computed from samples.
 
-A radio can have several peers. For an access point, the link to the station with which it exchanged the most packets
-is used. The link of a station continues when the station roams to another access point.
+A radio can have several peers. For an access point, the columns describe the link to the station with which it
+exchanged the most packets. For a station, they describe its link to its access point, including the links after it
+roamed to another one.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,9 +14,9 @@ from fieldkit.core.columns import BACKGROUND, Column, Figure, Kind, Measured, Va
 from fieldkit.core.model import LinkSample, Role, StationSample
 
 _DBM: Final = (-300.0, 100.0)
-_NOT_SAMPLED: Final = "its radio was not sampled: it has no Wi-Fi, or no iw, or was not associated"
-_NOT_REPORTED: Final = "its radio does not report it"
-_RESET: Final = "its link was established again, and the last counts before that were not sampled"
+_NOT_SAMPLED: Final = "the robot's radio was not sampled: the robot has no Wi-Fi or no iw, or was not associated"
+_NOT_REPORTED: Final = "the robot's radio does not report it"
+_RESET: Final = "the link was established again, and the last counts before were not sampled"
 _COUNTERS: Final = {
     "radio_tx_packets": "tx_packets",
     "radio_rx_packets": "rx_packets",
@@ -25,8 +26,8 @@ _COUNTERS: Final = {
 }
 """Attribute of `StationSample` by column."""
 _MAX_UNSAMPLED_NS: Final = 2 * 10**9
-"""If counters are reset, the counts since the last sample are lost. They are negligible if the two samples around the
-reset are at most this time apart. The slowest shell samples once a second.
+"""If counters are reset, the counts since the last sample are lost. These counts are negligible if at most this time
+is between the samples before and after the reset. Even a slow shell takes one sample per second.
 """
 
 
@@ -39,8 +40,8 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             "dBm",
             (
                 f"Median over the repeat of the signal that the {role}'s radio receives from its peer, the station "
-                "or access point with which it exchanges the most packets. The columns of a radio are empty for a "
-                "robot without Wi-Fi or iw, and if its driver does not report the value."
+                "or access point with which it exchanges the most packets. Columns of radios are empty for a robot "
+                "without Wi-Fi or iw, and if the driver does not report the value."
             ),
             Figure(f"signal, {role}", Kind.MEDIAN, rank=BACKGROUND),
             _DBM,
@@ -51,7 +52,7 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
         (
             f"{role}_busy_share",
             "share",
-            f"Share of the time in which the {role}'s radio found its channel busy, its own transmissions included.",
+            f"Share of the time in which the channel of the {role}'s radio was busy, including its transmissions.",
             Figure(f"channel busy, {role}", Kind.MEAN, rank=BACKGROUND + 3),
         ),
         (
@@ -61,7 +62,7 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             Figure(f"PHY rate, {role}", Kind.MEDIAN, rank=BACKGROUND + 1),
         ),
         (f"{role}_rx_rate_bit_s", "bit/s", "Median over the samples of the PHY rate of the peer's last frame."),
-        (f"{role}_radio_tx_packets", "count", f"Packets that the {role}'s radio sent to the peer, of all programs."),
+        (f"{role}_radio_tx_packets", "count", f"Packets of all programs that the {role}'s radio sent to the peer."),
         (f"{role}_radio_rx_packets", "count", f"Packets that the {role}'s radio received from the peer."),
         (
             f"{role}_tx_retries",
@@ -80,7 +81,7 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
             "count",
             f"Number of times that the {role} roamed to another access point; empty if it is not a station.",
         ),
-        (f"{role}_link_samples", "count", f"Samples of the {role}'s radio that the columns include."),
+        (f"{role}_link_samples", "count", f"Samples of the {role}'s radio from which the columns are computed."),
     )
 
 
@@ -88,7 +89,7 @@ ROLES: Final = (Role.SENDER, Role.RECEIVER)
 """Roles whose links have columns."""
 
 _COLUMNS: Final = {role: _role_columns(role) for role in ROLES}
-COLUMNS: Final = tuple(column for declared in _COLUMNS.values() for column in declared)
+COLUMNS: Final = tuple(column for role_columns in _COLUMNS.values() for column in role_columns)
 
 
 def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
@@ -102,7 +103,7 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
         return Measured.all_missing(_COLUMNS[role], _NOT_SAMPLED)
     link = link_history(samples)
     signals = _present(station.signal_dbm for _, station in link)
-    counts, lost = _counts(link)
+    counts, has_lost_counts = _counts(link)
     values: dict[str, Value | None] = {
         "signal_median_dbm": median(signals) if signals else None,
         "signal_min_dbm": min(signals, default=None),
@@ -116,9 +117,9 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
         "link_samples": len(samples),
     }
     measured = Measured.from_optional({f"{role}_{name}": value for name, value in values.items()}, _NOT_REPORTED)
-    if lost:
+    if has_lost_counts:
         measured = measured.without({f"{role}_{name}": _RESET for name, count in counts.items() if count is not None})
-    # Impossible values of a driver are removed, because a table that contains them cannot be read again.
+    # Impossible values that a driver reports are removed, because a table with such values cannot be read again.
     impossible = (
         column.name
         for column in _COLUMNS[role]
@@ -128,7 +129,7 @@ def measure(role: Role, samples: Sequence[LinkSample]) -> Measured:
 
 
 def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample]]:
-    """Return the statistics of a radio's link with their times in ns, in the order of time.
+    """Return the times in ns and the statistics of a radio's link, in the order of time.
 
     A station is associated with one access point at a time, although its samples can contain others.
     """
@@ -136,12 +137,12 @@ def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample
     if any(sample.cell for sample in samples):
         station_names = {station.station for sample in samples for station in sample.stations}
     else:
-        station_names = {_busiest(samples), ""}
+        station_names = {_busiest_station(samples), ""}
     link = []
     for sample in samples:
         associated = sample.cell or associated
         candidates = [station for station in sample.stations if station.station in station_names]
-        # A sample of /proc/net/wireless has no station name and only a signal, so it is the last choice.
+        # A sample of /proc/net/wireless has a signal, but no station name, so it is used if there is no other sample.
         candidates.sort(key=lambda station: (station.station != "", station.station == associated))
         if candidates:
             link.append((sample.utc_ns, candidates[-1]))
@@ -151,18 +152,18 @@ def link_history(samples: Sequence[LinkSample]) -> list[tuple[int, StationSample
 def _counts(link: Sequence[tuple[int, StationSample]]) -> tuple[Mapping[str, int | None], bool]:
     """Return the increments of a link's counters by column, and True if some counts were lost.
 
-    An increment is None if the counter was not reported at least twice. A link that is established again, to the same
-    peer or to another, counts from 0.
+    An increment is None if the counter was not reported at least twice. The counters start from 0 when a link is
+    established again, to the same peer or to another.
     """
     samples = [(at_ns, station) for at_ns, station in link if any(count is not None for count in _counters(station))]
     links: list[list[StationSample]] = [[station for _, station in samples[:1]]]
-    lost = False
-    for (before_ns, before), (at_ns, station) in pairwise(samples):
-        if _is_new_link(before, station):
+    has_lost_counts = False
+    for (previous_ns, previous), (at_ns, station) in pairwise(samples):
+        if _is_new_link(previous, station):
             links.append([])
-            lost = lost or at_ns - before_ns > _MAX_UNSAMPLED_NS
+            has_lost_counts = has_lost_counts or at_ns - previous_ns > _MAX_UNSAMPLED_NS
         links[-1].append(station)
-    return {column: _total_increment(counter, links) for column, counter in _COUNTERS.items()}, lost
+    return {column: _total_increment(counter, links) for column, counter in _COUNTERS.items()}, has_lost_counts
 
 
 def _counters(station: StationSample) -> tuple[int | None, ...]:
@@ -176,30 +177,33 @@ def _is_new_link(before: StationSample, after: StationSample) -> bool:
 
 
 def _total_increment(counter: str, links: Sequence[Sequence[StationSample]]) -> int | None:
-    by_link: list[list[int]] = [
+    counts_by_link: list[list[int]] = [
         [count for station in link if (count := getattr(station, counter)) is not None] for link in links
     ]
-    if sum(map(len, by_link)) < 2:
+    if sum(map(len, counts_by_link)) < 2:
         return None
-    return sum(counts[-1] for counts in by_link if counts) - (by_link[0][0] if by_link[0] else 0)
+    return sum(counts[-1] for counts in counts_by_link if counts) - (counts_by_link[0][0] if counts_by_link[0] else 0)
 
 
-def _busiest(samples: Sequence[LinkSample]) -> str:
-    """Return the station with which the most packets were exchanged, the first one if several are equal."""
+def _busiest_station(samples: Sequence[LinkSample]) -> str:
+    """Return the station with which the most packets were exchanged, or the first of several such stations."""
     names = dict.fromkeys(station.station for sample in samples for station in sample.stations)
 
     def packets(name: str) -> int:
         peer_samples = [station for sample in samples for station in sample.stations if station.station == name]
         return sum(
             _increment(counts) or 0
-            for counts in ([s.tx_packets for s in peer_samples], [s.rx_packets for s in peer_samples])
+            for counts in (
+                [sample.tx_packets for sample in peer_samples],
+                [sample.rx_packets for sample in peer_samples],
+            )
         )
 
     return max(names, key=packets, default="")
 
 
 def busy_share(samples: Sequence[LinkSample]) -> float | None:
-    """Return the share of the time in which the channel was busy; None if its counters were not reported twice."""
+    """Return the share of the time in which the channel was busy, or None without two reports of its counters."""
     counters = [
         (sample.active_ns, sample.busy_ns)
         for sample in samples
@@ -211,7 +215,7 @@ def busy_share(samples: Sequence[LinkSample]) -> float | None:
 
 
 def _increment(counts: Iterable[int | None]) -> int | None:
-    """Return the increment of a counter; if it decreases, it has restarted from 0. None if not reported twice."""
+    """Return the increment of a counter, or None without two reports. A counter that decreases restarted from 0."""
     present = [count for count in counts if count is not None]
     if len(present) < 2:
         return None
@@ -219,14 +223,14 @@ def _increment(counts: Iterable[int | None]) -> int | None:
 
 
 def access_points(samples: Sequence[LinkSample]) -> list[tuple[int, str]]:
-    """Return the times in ns at which a station was associated, each with its access point; empty if it is none."""
+    """Return the times in ns at which a robot was associated as a station, each with its access point."""
     if not any(sample.cell for sample in samples):
         return []
-    # A station dump also lists the access point, and may be the only sample of an association.
-    names = [{station.station for station in sample.stations if station.station} for sample in samples]
+    # A station dump also contains the access point, and may be the only sample of an association.
+    peers_by_sample = [{station.station for station in sample.stations if station.station} for sample in samples]
     cells = [
         sample.cell or ("".join(peers) if len(peers) == 1 else "")
-        for sample, peers in zip(samples, names, strict=True)
+        for sample, peers in zip(samples, peers_by_sample, strict=True)
     ]
     return [(sample.utc_ns, cell) for sample, cell in zip(samples, cells, strict=True) if cell]
 

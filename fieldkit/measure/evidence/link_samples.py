@@ -1,7 +1,7 @@
-"""Samples of the radios' links during an attempt: names of their files, and the file of a testbed.
+"""Samples of the radios' links during an attempt: names of their files, and the file that a testbed writes.
 
-The samples are written by a robot's sampler (`robot_link_samples`) or by its testbed (`Oracle.links`). A testbed's
-`link.csv` has a line per time and peer station. If the testbed has access points, lines end with a column `cell`.
+The samples are from the robot's sampler (`robot_link_samples`) or from the testbed (`Oracle.links`). A testbed's
+`link.csv` has a line per time and peer station. If the testbed has access points, the last column is `cell`.
 """
 
 import re
@@ -38,8 +38,10 @@ def robot_file(role: Role) -> str:
 
 def text(samples: Mapping[Role, Sequence[LinkSample]]) -> str:
     """Return the file text for samples of a testbed."""
-    has_cells = any(sample.cell for of_role in samples.values() for sample in of_role)
-    lines = (line for role, of_role in samples.items() for line in _rows(role, of_role, has_cells=has_cells))
+    has_cells = any(sample.cell for role_samples in samples.values() for sample in role_samples)
+    lines = (
+        line for role, role_samples in samples.items() for line in _rows(role, role_samples, has_cells=has_cells)
+    )
     return reading.counted_csv_text(_CELL_HEADER if has_cells else _HEADER, lines)
 
 
@@ -62,7 +64,7 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
     """Return the samples in a testbed's file by role, in the order of time.
 
     Raises:
-        EvidenceError: The file is missing, truncated, or has other contents.
+        EvidenceError: The file is missing, truncated, or not a file of link samples.
     """
     has_cells = f"{_CELL_HEADER}\n" in reading.text(path)
     header, pattern = (_CELL_HEADER, _CELL_ROW) if has_cells else (_HEADER, _ROW)
@@ -70,7 +72,7 @@ def read(path: Path) -> Mapping[Role, Sequence[LinkSample]]:
     samples: dict[Role, list[LinkSample]] = {}
     for (role, _), group in groupby(rows, key=lambda row: (row[0], row[1].utc_ns)):
         samples.setdefault(role, []).append(merge(sample for _, sample in group))
-    return {role: sorted(of_role, key=lambda sample: sample.utc_ns) for role, of_role in samples.items()}
+    return {role: sorted(role_samples, key=lambda sample: sample.utc_ns) for role, role_samples in samples.items()}
 
 
 def _parse_row(match: re.Match[str]) -> tuple[Role, LinkSample]:
@@ -93,7 +95,7 @@ def _parse_dbm(text: str | None) -> float | None:
 
 
 def merge(samples: Iterable[LinkSample]) -> LinkSample:
-    """Merge samples of the same time; later values replace earlier ones."""
+    """Merge samples of the same time into one; later values replace earlier ones."""
     return reduce(_merge_two, samples)
 
 

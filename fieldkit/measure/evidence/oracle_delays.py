@@ -1,9 +1,9 @@
 """Delays that a testbed's oracle reports: lateness of deliveries, and air delay of a transfer's packets.
 
-The lateness of the deliveries during a repeat is relative to the radio model (`Oracle.lateness`). In a co-simulation,
+A packet is late if it is delivered later than the radio model determines (`Oracle.lateness`). In a co-simulation,
 windows also have a lateness, and the sync policy adds to the delay of packets. The air delay has four components
-(`Oracle.delays`). Its file has one line per number: `packets 215`, then the components summed over all packets, in
-integer nanoseconds.
+(`Oracle.delays`). Its file has a line with the number of packets, `packets 215`, and a line for each component, which
+is summed over all packets, in integer nanoseconds.
 """
 
 import re
@@ -27,15 +27,18 @@ LATENESS_COLUMNS: Final = columns(
         "emulator_late_p99_s",
         "s",
         (
-            "99th percentile of the lateness with which packets were delivered to the robots, compared with the "
-            "emulator's radio model, over the whole repeat; rounded up by at most an eighth. Empty for real radios."
+            "99th percentile over the repeat of the time by which packets were delivered to the robots later than in "
+            "the emulator's radio model; rounded up by at most an eighth. Empty for real radios."
         ),
     ),
-    ("emulator_late_max_s", "s", "Largest lateness of these packets; see emulator_late_p99_s."),
+    ("emulator_late_max_s", "s", "Largest such time over the repeat; see emulator_late_p99_s."),
     (
         "emulator_too_late",
         "count",
-        "Packets later than emulated.late_bound of the site file; above 0 the repeat is void. Empty for real radios.",
+        (
+            "Packets that were later than emulated.late_bound of the site file; if there are any, the repeat is "
+            "void. Empty for real radios."
+        ),
     ),
 )
 
@@ -45,16 +48,17 @@ WINDOW_COLUMNS: Final = columns(
         "cosim_late_p99_s",
         "s",
         (
-            "99th percentile of the time by which the results of a window of the co-simulation were later than its "
-            "end in real time, over the whole repeat; rounded up by at most an eighth. Empty without a co-simulation."
+            "99th percentile over the repeat of the time by which the results of a window of the co-simulation were "
+            "later than the end of the window in real time; rounded up by at most an eighth. Empty without a "
+            "co-simulation."
         ),
     ),
     (
         "cosim_late_max_s",
         "s",
         (
-            "Largest such time; above emulated.late_bound of the site file the repeat is void. Empty without a "
-            "co-simulation."
+            "Largest such time over the repeat; see cosim_late_p99_s. If it is above emulated.late_bound of the site "
+            "file, the repeat is void."
         ),
     ),
 )
@@ -78,15 +82,15 @@ def lateness_text(before: Lateness, after: Lateness) -> str:
 
 
 def _histogram_lines(word: str, before: Mapping[int, int], after: Mapping[int, int]) -> list[str]:
-    added = {late_ns: count - before.get(late_ns, 0) for late_ns, count in sorted(after.items())}
-    return [f"{word} {late_ns} {count}\n" for late_ns, count in added.items() if count]
+    increments = {late_ns: count - before.get(late_ns, 0) for late_ns, count in sorted(after.items())}
+    return [f"{word} {late_ns} {count}\n" for late_ns, count in increments.items() if count]
 
 
 def read_lateness(path: Path) -> Lateness:
     """Return the lateness in a file.
 
     Raises:
-        EvidenceError: The file is missing, truncated, or has other contents.
+        EvidenceError: The file is missing, truncated, or not a file of packet lateness.
     """
     match = _LATENESS_TEXT.match(reading.text(path))
     if match is None:
@@ -102,19 +106,19 @@ def read_lateness(path: Path) -> Lateness:
 def _histogram(path: Path, line_count: str | None, body: str) -> dict[int, int]:
     lines = body.splitlines()
     if line_count is not None and int(line_count) != len(lines):
-        raise EvidenceError(f"has {len(lines)} lines of {line_count}: truncated", where=str(path))
+        raise EvidenceError(f"is truncated: it has {len(lines)} of {line_count} lines", where=str(path))
     return {int(late_ns): int(count) for _, late_ns, count in map(str.split, lines)}
 
 
 def lateness_quantile_ns(histogram: Mapping[int, int], share: float) -> int | None:
-    """Return the quantile of a histogram of lateness at `share` (0 to 1) in ns; None if it is empty."""
+    """Return the quantile `share` (0 to 1) of a histogram of lateness in ns, or None if the histogram is empty."""
     counts = sorted((late_ns, count) for late_ns, count in histogram.items() if count)
     cumulative = accumulate(count for _, count in counts)
     min_total = share * sum(count for _, count in counts)
     return next((late_ns for (late_ns, _), total in zip(counts, cumulative, strict=True) if total >= min_total), None)
 
 
-def too_late(lateness: Lateness) -> int:
+def late_packet_count(lateness: Lateness) -> int:
     """Return the number of packets that were later than the bound."""
     return sum(count for late_ns, count in lateness.packets.items() if late_ns > lateness.bound_ns)
 
@@ -127,7 +131,7 @@ def measure_lateness(lateness: Lateness | None) -> Measured:
     values = {
         "emulator_late_p99_s": None if late_ns[0.99] is None else late_ns[0.99] / 1e9,
         "emulator_late_max_s": None if late_ns[1.0] is None else late_ns[1.0] / 1e9,
-        "emulator_too_late": too_late(lateness),
+        "emulator_too_late": late_packet_count(lateness),
     }
     return Measured.from_optional(values, "no packet was delivered")
 
@@ -145,16 +149,16 @@ def measure_window_lateness(lateness: Lateness | None) -> Measured:
 
 
 def lateness_problem(lateness: Lateness) -> str | None:
-    """Return the reason why the emulation did not follow its model, or None if it did."""
-    bound_ns, late = lateness.bound_ns, ""
+    """Return the reason why the emulation was later than its model, or None if it was not."""
+    bound_ns, problem = lateness.bound_ns, ""
     packet_ns = lateness_quantile_ns(lateness.packets, 1.0)
     window_ns = lateness_quantile_ns(lateness.windows or {}, 1.0)
     if packet_ns is not None and packet_ns > bound_ns:
-        late = f"{too_late(lateness)} packets were delivered too late, by up to {packet_ns / 1e6:.3g} ms"
+        problem = f"{late_packet_count(lateness)} packets were delivered too late, by up to {packet_ns / 1e6:.3g} ms"
     elif window_ns is not None and window_ns > bound_ns:
         windows = sum(count for late_ns, count in (lateness.windows or {}).items() if late_ns > bound_ns)
-        late = f"{windows} windows of the co-simulation ended too late, by up to {window_ns / 1e6:.3g} ms"
-    return f"{late}; the bound is {bound_ns / 1e6:g} ms" if late else None
+        problem = f"{windows} windows of the co-simulation ended too late, by up to {window_ns / 1e6:.3g} ms"
+    return f"{problem}; the bound is {bound_ns / 1e6:g} ms" if problem else None
 
 
 AIR_DELAY_FILE: Final = laptop_files.MEDIUM
@@ -165,16 +169,16 @@ AIR_DELAY_COLUMNS: Final = columns(
         "delay_s",
         "s",
         (
-            "Mean one-way delay of the transfer's packets, the sum of the four components of the paper's eq. 2. "
-            "Empty if the testbed cannot measure it, as in the field."
+            "Mean one-way delay of the transfer's packets: the sum of the four components of the paper's eq. 2. "
+            "Empty if the testbed cannot measure it, for example with real radios."
         ),
         Figure("air delay", Kind.MEDIAN, rank=34),
     ),
-    ("delay_processing_s", "s", "Part of delay_s: processing in the stations."),
+    ("delay_processing_s", "s", "Part of delay_s: processing by the stations."),
     ("delay_transmission_s", "s", "Part of delay_s: transmission of the packet's bits at the rate of the link."),
     ("delay_propagation_s", "s", "Part of delay_s: propagation on the medium."),
     ("delay_queuing_s", "s", "Part of delay_s: waiting for earlier packets."),
-    ("delay_packets", "count", "Number of packets of which delay_s is the mean: those that were delivered."),
+    ("delay_packets", "count", "Number of delivered packets, over which delay_s is the mean."),
 )
 
 POLICY_COLUMNS: Final = columns(
@@ -183,8 +187,8 @@ POLICY_COLUMNS: Final = columns(
         "delay_policy_s",
         "s",
         (
-            "Mean time that the sync policy of a co-simulation added to the path of the transfer's packets, which is "
-            "not in delay_s. Empty without a co-simulation."
+            "Mean time that the sync policy of a co-simulation added to the delay of the transfer's packets; delay_s "
+            "does not include it. Empty without a co-simulation."
         ),
         Figure("policy delay", Kind.MEDIAN, rank=34),
     ),
@@ -204,7 +208,7 @@ def read_air_delay(path: Path) -> DelayParts:
     """Return the delays in a file.
 
     Raises:
-        EvidenceError: The file is missing, incomplete, or contains delays of 0 packets.
+        EvidenceError: The file is missing or incomplete, or contains delays, but 0 packets.
     """
     match = _AIR_DELAY_TEXT.match(reading.text(path))
     if match is None:
@@ -216,7 +220,7 @@ def read_air_delay(path: Path) -> DelayParts:
     }
     parts = DelayParts(**numbers)
     if not parts.packets and air_delay_ns(parts):
-        raise EvidenceError("contains delays, but of 0 packets", where=str(path))
+        raise EvidenceError("contains delays, but 0 packets", where=str(path))
     return parts
 
 
@@ -246,8 +250,8 @@ def measure_air_delay(parts: DelayParts | None) -> Measured:
         "delay_queuing_s": parts.queuing_ns / scale if is_divided else None,
         "delay_packets": parts.packets,
     }
-    missing = "the network does not report the components" if scale else "no packet was delivered"
-    return Measured.from_optional(values, missing)
+    reason = "the network does not report the components" if scale else "no packet was delivered"
+    return Measured.from_optional(values, reason)
 
 
 def measure_policy_delay(parts: DelayParts | None) -> Measured:

@@ -1,7 +1,7 @@
-"""Outage of a robot caused by an injected fault, from the file of an observer with one clock.
+"""Outage of a robot caused by an injected fault, computed from the file of an observer.
 
-The resolution is the observer's interval: if two consecutive answers are a time G apart, the outage was at most G and
-at least G minus two intervals.
+All times are of the observer's clock, and the resolution is the observer's interval: if the time G is between two
+consecutive answers, the outage was at most G and at least G minus two intervals.
 """
 
 import re
@@ -15,12 +15,12 @@ from fieldkit.core.columns import Measured, fault_column_name, step_prefixed
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import FaultKind
 from fieldkit.measure.evidence import ping, reading
-from fieldkit.measure.evidence.outage_columns import declared
+from fieldkit.measure.evidence.outage_columns import fault_columns
 
-SILENT_S: Final = 1.0
-"""A robot has not recovered if its last answer is older than this at the end of the observation."""
+MIN_SILENCE_S: Final = 1.0
+"""A robot has not recovered if its last answer is at least this old at the end of the observation."""
 
-# Gaps of this length also occur without a fault; a reboot or a time out of range takes longer.
+# Gaps up to this length also occur without a fault. A reboot or a time out of range takes longer.
 _MAX_NORMAL_GAP_INTERVALS: Final = 3
 
 _NUMBER: Final = r"[0-9]{1,9}(?:\.[0-9]{1,9})?"
@@ -36,8 +36,8 @@ def note_file(kind: FaultKind) -> str:
 def observed_file(kind: FaultKind) -> str:
     """Return the name of the observer's file.
 
-    It contains the output of ping. For a killed process it has a line per observation: seconds since boot, and `up`
-    with the process IDs if there are any.
+    It contains the output of ping. For a killed process, it has a line per observation: the seconds since boot and,
+    if the process runs, `up` and the process IDs.
     """
     return f"fault-{kind}-{'watch' if kind is FaultKind.KILL else 'ping'}.txt"
 
@@ -55,7 +55,7 @@ class Recovery:
         outage_s: Longest time between two answers, in seconds; None if the robot did not recover.
         recovery_s: Part of the outage after the end of the cause, never negative; None if `outage_s` is None or the
             duration of the cause is unknown.
-        recovered: Whether the robot answered at the end of the observation.
+        recovered: True if the robot answered at the end of the observation.
         recovery_at_least_s: Lower bound of `recovery_s` if the robot did not recover.
     """
 
@@ -69,13 +69,13 @@ class Recovery:
 class _Note:
     """Duration of the cause (None if unknown) and interval of the observer, in seconds."""
 
-    lasted_s: float | None
+    cause_s: float | None
     interval_s: float
 
 
 @dataclass(frozen=True)
 class _Answers:
-    """Times of the answers and end of the observation, in seconds of one clock; process IDs that did not change."""
+    """Times of the answers and end of the observation by the observer's clock; process IDs that did not change."""
 
     at_s: Sequence[float]
     end_s: float
@@ -88,47 +88,47 @@ def read(folder: Path, kind: FaultKind, name: str = "") -> Recovery:
     Args:
         folder: The attempt's folder.
         kind: Kind of the fault.
-        name: Name of the step; empty if it has none.
+        name: Name of the step; empty if the step has no name.
 
     Raises:
         EvidenceError: A file is missing or incomplete, or shows no effect of the fault.
     """
-    note = _note(folder / step_prefixed(name, note_file(kind)))
+    note = _read_note(folder / step_prefixed(name, note_file(kind)))
     path = folder / step_prefixed(name, observed_file(kind))
     answers = _process_answers(path) if kind is FaultKind.KILL else _ping_answers(path, note)
     if not answers.at_s:
         raise EvidenceError("the robot or process did not answer before the fault", where=path.name)
-    silent_s = answers.end_s - answers.at_s[-1]
-    if silent_s >= SILENT_S:
-        bound_s = None if note.lasted_s is None else max(0.0, silent_s - note.lasted_s)
+    silence_s = answers.end_s - answers.at_s[-1]
+    if silence_s >= MIN_SILENCE_S:
+        bound_s = None if note.cause_s is None else max(0.0, silence_s - note.cause_s)
         return Recovery(outage_s=None, recovery_s=None, recovered=False, recovery_at_least_s=bound_s)
     outage_s = max((after - before for before, after in pairwise(answers.at_s)), default=0.0)
     if answers.unchanged_pids or (kind is not FaultKind.KILL and outage_s < _min_outage_s(note)):
-        raise EvidenceError("the fault had no effect: its target answered all the time", where=path.name)
-    recovery_s = None if note.lasted_s is None else max(0.0, outage_s - note.lasted_s)
+        raise EvidenceError("the fault had no effect: its target answered during the whole fault", where=path.name)
+    recovery_s = None if note.cause_s is None else max(0.0, outage_s - note.cause_s)
     return Recovery(outage_s=outage_s, recovery_s=recovery_s, recovered=True)
 
 
-def cause_lasted_s(path: Path) -> float | None:
+def cause_duration_s(path: Path) -> float | None:
     """Return the duration of the cause of a fault from its note, in seconds; None if unknown.
 
     Raises:
         EvidenceError: The note is missing or incomplete.
     """
-    return _note(path).lasted_s
+    return _read_note(path).cause_s
 
 
 def _min_outage_s(note: _Note) -> float:
-    """Return the shortest plausible outage; half of the cause's duration, because an operator reacts late."""
-    return max((note.lasted_s or 0.0) / 2, _MAX_NORMAL_GAP_INTERVALS * note.interval_s)
+    """Return the shortest plausible outage in seconds. An operator may be late by half of the cause's duration."""
+    return max((note.cause_s or 0.0) / 2, _MAX_NORMAL_GAP_INTERVALS * note.interval_s)
 
 
-def _note(path: Path) -> _Note:
+def _read_note(path: Path) -> _Note:
     match = _NOTE.match(reading.text(path))
     if match is None:
         raise EvidenceError("does not contain the duration of the fault", where=path.name)
-    lasted = match["lasted"]
-    return _Note(None if lasted == "unknown" else float(lasted), float(match["interval"]))
+    duration = match["lasted"]
+    return _Note(None if duration == "unknown" else float(duration), float(match["interval"]))
 
 
 def _ping_answers(path: Path, note: _Note) -> _Answers:
@@ -155,9 +155,9 @@ def _process_answers(path: Path) -> _Answers:
 
 
 def measure(kind: FaultKind, effect: Recovery | None) -> Measured:
-    """Return the columns of a kind of fault; `effect` is None if the evidence is not available."""
+    """Return the columns of a kind of fault. `effect` is None if the evidence is not available."""
     if effect is None:
-        return Measured.all_missing(declared(kind), "the observation is not available")
+        return Measured.all_missing(fault_columns(kind), "the observation is not available")
     outage = {
         fault_column_name(kind, "outage_s"): effect.outage_s,
         fault_column_name(kind, "recovered"): effect.recovered,

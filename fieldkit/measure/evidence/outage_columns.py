@@ -9,7 +9,7 @@ _KINDS_IN_ORDER: Final = (FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE, FaultKind
 
 
 def _recovered_state(kind: FaultKind) -> str:
-    """Return the state of a robot or process that has recovered, for labels."""
+    """Return the state of a robot or process that has recovered, as used in labels."""
     return "process runs" if kind is FaultKind.KILL else "reachable"
 
 
@@ -18,10 +18,10 @@ def _observer(kind: FaultKind) -> str:
     return "process" if kind is FaultKind.KILL else "ping"
 
 
-def declared(kind: FaultKind) -> tuple[Column, ...]:
+def fault_columns(kind: FaultKind) -> tuple[Column, ...]:
     """Return the columns of a kind of fault."""
     outage_meaning = f"Longest time without a reply around the fault {kind}; empty if the robot did not recover."
-    recovery_meaning = f"Part of this outage after the end of the cause of {kind}; empty if that end is unknown."
+    recovery_meaning = f"Part of this outage after the end of the fault's cause ({kind}); empty if that is unknown."
     recovered_meaning = f"True if the robot recovered from the fault {kind} within the time limit."
     bound_meaning = f"Lower bound of the recovery time if the robot did not recover from {kind}; otherwise empty."
     index, bound = list(FaultKind).index(kind), fault_column_name(kind, "recovery_at_least_s")
@@ -36,4 +36,4 @@ def declared(kind: FaultKind) -> tuple[Column, ...]:
     return (*times, *columns(110, (bound, "s", bound_meaning)))
 
 
-COLUMNS: Final = tuple(column for kind in _KINDS_IN_ORDER for column in declared(kind))
+COLUMNS: Final = tuple(column for kind in _KINDS_IN_ORDER for column in fault_columns(kind))

@@ -1,7 +1,7 @@
-"""Parser for the standard output of ping (`LC_ALL=C ping -n -D`) of iputils, old and new, and of busybox.
+"""Parser for the standard output of ping (`LC_ALL=C ping -n -D`) of old and new iputils, and of busybox.
 
-The old iputils s20101006 prints `icmp_req` instead of `icmp_seq`; busybox counts from 0, iputils from 1. Unknown
-lines are kept and are never an error.
+iputils s20101006 prints `icmp_req` instead of `icmp_seq`. busybox counts from 0, iputils from 1. Unknown lines are
+stored and cause no error.
 """
 
 import re
@@ -102,8 +102,8 @@ class Reply:
         seq: Sequence number, 16 bits.
         rtt_s: Round-trip time in seconds; None if the payload is too short for a time stamp.
         at_utc_ns: Time of printing, nanoseconds since 1970 UTC; None without `-D`.
-        duplicate: Whether the request had been answered before.
-        damaged: Whether its checksum was wrong; ping does not count it as received.
+        duplicate: True if the request had been answered before.
+        damaged: True if the checksum of the reply was wrong; ping does not count it as received.
     """
 
     seq: int
@@ -138,11 +138,11 @@ class Ping:
         payload_bytes: ICMP payload of a request; None without the header line.
         replies: All replies in the order of arrival, including duplicates.
         problems: All ICMP errors.
-        transmitted: Number of sent requests according to the summary; None if ping was killed before it.
+        transmitted: Number of sent requests according to the summary; None if ping was killed before the summary.
         received: Number of answered requests according to the summary.
-        unknown: Unknown lines, unchanged.
+        unknown_lines: Unknown lines, unchanged.
         first_seq: Sequence number of the first request: 1, or 0 for busybox.
-        summary_s: Shortest, mean and longest round-trip time according to the summary; None if it has none.
+        summary_s: Shortest, mean and longest round-trip time according to the summary; None without these.
     """
 
     payload_bytes: int | None
@@ -150,13 +150,13 @@ class Ping:
     problems: tuple[Problem, ...]
     transmitted: int | None
     received: int | None
-    unknown: tuple[str, ...]
+    unknown_lines: tuple[str, ...]
     first_seq: int = 1
     summary_s: tuple[float, float, float] | None = None
 
     @property
     def answers(self) -> tuple[Reply, ...]:
-        """The replies that count: neither duplicate nor damaged."""
+        """The replies that are neither duplicate nor damaged."""
         return tuple(reply for reply in self.replies if not (reply.duplicate or reply.damaged))
 
     @property
@@ -166,12 +166,12 @@ class Ping:
 
     @property
     def gaps(self) -> tuple[int, ...]:
-        """Sequence numbers without an answer, from the first request to the last known request."""
-        answered = {reply.seq for reply in self.answers}
-        seen = answered | {problem.seq for problem in self.problems}
-        end = max(seen, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
+        """Sequence numbers without an answer, from the first request to the last request in the output."""
+        answered_seqs = {reply.seq for reply in self.answers}
+        printed_seqs = answered_seqs | {problem.seq for problem in self.problems}
+        end = max(printed_seqs, default=-1) + 1 if self.transmitted is None else self.first_seq + self.transmitted
         # The number has 16 bits and wraps to 0 in a longer run.
-        return tuple(seq for seq in range(self.first_seq, min(end, 0x10000)) if seq not in answered)
+        return tuple(seq for seq in range(self.first_seq, min(end, 0x10000)) if seq not in answered_seqs)
 
 
 def read(path: Path) -> Ping:
@@ -184,13 +184,13 @@ def read(path: Path) -> Ping:
 
 
 def parse(text: str) -> Ping:
-    """Return the parsed output of a run of ping; raises no error for any text."""
+    """Return the parsed output of a run of ping. No text causes an error."""
     payload_bytes = transmitted = received = None
     first_seq = 1
     summary_s = None
     replies: list[Reply] = []
     problems: list[Problem] = []
-    unknown: list[str] = []
+    unknown_lines: list[str] = []
     for line in text.split("\n"):
         if match := _REPLY.match(line):
             replies.append(_reply(match))
@@ -205,8 +205,8 @@ def parse(text: str) -> Ping:
         elif match := _TIMES.match(line):
             summary_s = (float(match["min"]) / 1e3, float(match["avg"]) / 1e3, float(match["max"]) / 1e3)
         elif not _IGNORED_LINE.fullmatch(line):
-            unknown.append(line)
-    parsed = tuple(replies), tuple(problems), transmitted, received, tuple(unknown)
+            unknown_lines.append(line)
+    parsed = tuple(replies), tuple(problems), transmitted, received, tuple(unknown_lines)
     return Ping(payload_bytes, *parsed, first_seq, summary_s)
 
 
@@ -226,17 +226,17 @@ def _at_utc_ns(match: re.Match[str]) -> int | None:
     return int(match["seconds"]) * 1_000_000_000 + int(match["micros"]) * 1_000
 
 
-def measure(pings: Ping | None) -> Measured:
-    """Return the columns of a run of ping; `pings` is None if its output is not available."""
-    # Without the header line ping did not run, so the absence of answers is not a measured loss.
-    if pings is None or pings.payload_bytes is None:
+def measure(output: Ping | None) -> Measured:
+    """Return the columns of a run of ping. `output` is None if it is not available."""
+    # Without the header line, ping did not run, so missing answers are not a measured loss.
+    if output is None or output.payload_bytes is None:
         return Measured.all_missing((*COLUMNS, *SENT_COLUMNS), "ping did not run")
-    rtt_s = pings.rtt_s
+    rtt_s = output.rtt_s
     counts = {
-        "rtt_sent": pings.transmitted,
-        "rtt_received": len(pings.answers),
-        "rtt_loss": 1 - len(pings.answers) / pings.transmitted if pings.transmitted else None,
-        "rtt_payload_bytes": pings.payload_bytes,
+        "rtt_sent": output.transmitted,
+        "rtt_received": len(output.answers),
+        "rtt_loss": 1 - len(output.answers) / output.transmitted if output.transmitted else None,
+        "rtt_payload_bytes": output.payload_bytes,
     }
     times = {
         "rtt_min_s": min(rtt_s, default=None),
@@ -246,7 +246,7 @@ def measure(pings: Ping | None) -> Measured:
         "rtt_max_s": max(rtt_s, default=None),
         "rtt_jitter_s": float(np.abs(np.diff(rtt_s)).mean()) if len(rtt_s) > 1 else None,
     }
-    of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, pings.transmitted or 0, 0.5)}
+    of_sent = {"rtt_median_sent_s": quantile_of_sent(rtt_s, output.transmitted or 0, 0.5)}
     return (
         Measured.from_optional(counts, "ping was killed before its summary")
         | Measured.from_optional(times, "too few replies have a time")

@@ -1,4 +1,4 @@
-"""Longest time without an answer of ping."""
+"""Longest time without an answer in the output of ping."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,8 +14,8 @@ GAP_COLUMNS: Final = columns(
         "rtt_gap_s",
         "s",
         (
-            "Longest time between consecutive replies; empty if ping printed no time stamps, or if it started or "
-            "ended without replies for a longer time, or for 1 s or more."
+            "Longest time between consecutive replies; empty if ping printed no time stamps, or if the time without "
+            "replies at its start or end was longer than this, or at least 1 s."
         ),
         Figure("longest gap between answers", Kind.MEDIAN, at_least="rtt_gap_at_least_s"),
     ),
@@ -41,7 +41,7 @@ OPEN_GAP_COLUMNS: Final = columns(
 _SEQUENCE_NUMBERS: Final = 1 << 16
 """Number of ICMP sequence numbers."""
 _MAX_LATE_NUMBERS: Final = 1 << 10
-"""An answer is late if its number is below the previous one by less than this; otherwise the numbers have wrapped."""
+"""An answer is late if its number is below the previous number by less than this; otherwise the numbers wrapped."""
 
 MIN_OPEN_GAP_S: Final = 1.0
 """A gap at the start or end of a ping is ignored if it is shorter than this and than the longest other gap."""
@@ -52,18 +52,18 @@ class AnswerGap:
     """The longest time without an answer in a run of ping.
 
     Attributes:
-        lasted_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
+        duration_s: Time in seconds between the answers before and after the gap; the observed time if it is open.
         lost: Number of unanswered requests in the gap.
-        is_open: Whether ping started or ended in the gap, so that both numbers are lower bounds.
+        is_open: True if ping started or ended in the gap, so that both numbers are lower bounds.
     """
 
-    lasted_s: float
+    duration_s: float
     lost: int
     is_open: bool
 
 
 def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
-    """Return the longest time without an answer, in the order of requests; None if answers have no time stamps.
+    """Return the longest time between the answers to consecutive answered requests; None without time stamps.
 
     A gap in which ping started or ended is open. It is returned if it is at least as long as the longest gap between
     two answers, or at least `MIN_OPEN_GAP_S` long.
@@ -76,33 +76,37 @@ def longest_gap(output: Ping, interval_s: float) -> AnswerGap | None:
     stamped = sorted(stamped_answers(output))
     if not stamped and (output.answers or not output.transmitted):
         return None
-    closed = [(later_ns - ns, later - seq - 1) for (seq, ns), (later, later_ns) in pairwise(stamped)]
-    gap_ns, lost = max(closed, default=(0, 0))
-    unanswered = _open_ends(output, [seq for seq, _ in stamped])
+    closed_gaps = [
+        (next_ns - answer_ns, next_seq - seq - 1) for (seq, answer_ns), (next_seq, next_ns) in pairwise(stamped)
+    ]
+    gap_ns, lost = max(closed_gaps, default=(0, 0))
+    unanswered = _open_gap_requests(output, [seq for seq, _ in stamped])
     open_s = unanswered * interval_s
     if unanswered and (unanswered >= lost or open_s >= MIN_OPEN_GAP_S):
         return AnswerGap(max(open_s, gap_ns / 1e9), max(unanswered, lost), is_open=True)
-    return AnswerGap(gap_ns / 1e9, lost, is_open=False) if closed else None
+    return AnswerGap(gap_ns / 1e9, lost, is_open=False) if closed_gaps else None
 
 
 def stamped_answers(output: Ping) -> Iterator[tuple[int, int]]:
     """Yield the unwrapped sequence number and the time stamp of each answer that has a time stamp."""
-    last: int | None = None
+    previous: int | None = None
     for answer in output.answers:
         if answer.at_utc_ns is not None:
             difference = (
-                0 if last is None else (answer.seq - last + _MAX_LATE_NUMBERS) % _SEQUENCE_NUMBERS - _MAX_LATE_NUMBERS
+                0
+                if previous is None
+                else (answer.seq - previous + _MAX_LATE_NUMBERS) % _SEQUENCE_NUMBERS - _MAX_LATE_NUMBERS
             )
-            last = answer.seq if last is None else last + difference
-            yield last, answer.at_utc_ns
+            previous = answer.seq if previous is None else previous + difference
+            yield previous, answer.at_utc_ns
 
 
-def _open_ends(output: Ping, answered: Sequence[int]) -> int:
+def _open_gap_requests(output: Ping, answered_seqs: Sequence[int]) -> int:
     """Return the number of unanswered requests before the first answer or after the last one, whichever is larger."""
     sent = output.transmitted or 0
-    if not answered:
+    if not answered_seqs:
         return sent
-    return max(answered[0] - output.first_seq, output.first_seq + sent - 1 - answered[-1], 0)
+    return max(answered_seqs[0] - output.first_seq, output.first_seq + sent - 1 - answered_seqs[-1], 0)
 
 
 def measure_gap(output: Ping | None, interval_s: float) -> Measured:
@@ -115,8 +119,10 @@ def measure_gap(output: Ping | None, interval_s: float) -> Measured:
     gap = None if output is None else longest_gap(output, interval_s)
     if gap is None:
         return Measured.all_missing((*GAP_COLUMNS, *OPEN_GAP_COLUMNS), "no two answers have a time stamp")
-    closed, bounds = (tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS))
-    filled, empty = (bounds, closed) if gap.is_open else (closed, bounds)
+    closed_names, open_names = (
+        tuple(column.name for column in columns) for columns in (GAP_COLUMNS, OPEN_GAP_COLUMNS)
+    )
+    filled, empty = (open_names, closed_names) if gap.is_open else (closed_names, open_names)
     reason = "ping started or ended in the gap" if gap.is_open else "ping neither started nor ended in the gap"
-    values = dict(zip(filled, (gap.lasted_s, gap.lost), strict=True))
+    values = dict(zip(filled, (gap.duration_s, gap.lost), strict=True))
     return Measured(values, dict.fromkeys(empty, reason))

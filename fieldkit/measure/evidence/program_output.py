@@ -1,8 +1,9 @@
 """Extraction of a value from a program's output: by a path into JSON, or by a regular expression.
 
 Output of a robot is not trusted, and expressions can be inefficient. Paths are JMESPath (jmespath.org/specification),
-whose only loops are over the data. Expressions are RE2 (github.com/google/re2/wiki/Syntax), whose time is linear in
-the length of the text; Python's `re` needs years to match `(a+)+$` with some texts of forty letters.
+which has no loops except over the data. Expressions are RE2 (github.com/google/re2/wiki/Syntax): matching takes a
+time that is linear in the length of the text. Python's `re` needs years to match `(a+)+$` with some texts of forty
+letters.
 """
 
 import json
@@ -16,13 +17,13 @@ from fieldkit.core.text import shorten
 from fieldkit.measure.evidence import reading
 
 MAX_OUTPUT_BYTES: Final = 1 << 20
-"""Maximum size of a program's output; the rest is discarded on the robot."""
+"""Maximum size of a program's output; the robot discards the output beyond it."""
 
 _TOO_DEEP: Final = "it is nested too deeply"
 
 
 def path_error(text: str) -> str | None:
-    """Return the reason why a text is not a path into JSON, or None if it is."""
+    """Return the reason why a text is not a JMESPath, or None if it is one."""
     try:
         _compile_path(text)
     except ValueError as error:
@@ -31,7 +32,7 @@ def path_error(text: str) -> str | None:
 
 
 def expression_error(text: str) -> str | None:
-    """Return the reason why a text is not a regular expression with one group, or None if it is."""
+    """Return the reason why a text is not a regular expression with one group, or None if it is one."""
     try:
         groups = _compile_expression(text).groups
     except ValueError as error:
@@ -41,7 +42,7 @@ def expression_error(text: str) -> str | None:
 
 @cache
 def _compile_path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types)
-    """Return a compiled path; raises ValueError, like jmespath, for any other text."""
+    """Return a compiled path; raises ValueError, like jmespath, if the text is not a path."""
     import jmespath  # noqa: PLC0415 (takes 20 ms, and most commands need no path)
 
     try:
@@ -52,7 +53,7 @@ def _compile_path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types
 
 @cache
 def _compile_expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
-    """Return a compiled expression; raises ValueError for any other text."""
+    """Return a compiled expression; raises ValueError if the text is not a regular expression."""
     import re2  # noqa: PLC0415 (as jmespath)
 
     options = re2.Options()
@@ -68,7 +69,7 @@ def text(path: Path) -> str:
     """Return the output of a program; bytes that are not UTF-8 are replaced.
 
     Raises:
-        EvidenceError: The file is missing, cannot be read, or has the maximum size, so that output was discarded.
+        EvidenceError: The file is missing, cannot be read, or has the maximum size, because output was discarded.
     """
     if reading.size(path) >= MAX_OUTPUT_BYTES:
         raise EvidenceError(f"the program printed more than {MAX_OUTPUT_BYTES >> 20} MiB", where=str(path))
@@ -76,7 +77,7 @@ def text(path: Path) -> str:
 
 
 def document(path: Path) -> object:
-    """Return the value of the JSON that a program printed.
+    """Return the parsed JSON that a program printed.
 
     Raises:
         EvidenceError: As `text`, or the output is not JSON.
@@ -88,7 +89,7 @@ def document(path: Path) -> object:
 
 
 def parse_json(output: str) -> object:
-    """Return the value of JSON text; raises ValueError with the reason if it is not JSON."""
+    """Return the parsed JSON of a text; raises ValueError with the reason if the text is not JSON."""
     try:
         parsed: object = json.loads(output.removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
@@ -98,7 +99,7 @@ def parse_json(output: str) -> object:
 
 
 def at_path(path: Path, where: str) -> object:
-    """Return the value at the path `where` in the JSON that a program printed; None if there is none.
+    """Return the value at the path `where` in the JSON that a program printed, or None if there is no value.
 
     Raises:
         EvidenceError: As `document`, or a function in the path was applied to a value of the wrong type.
@@ -111,10 +112,10 @@ def at_path(path: Path, where: str) -> object:
 
 
 def search_json(printed: object, where: str) -> object:
-    """Return the value at the path `where` in a JSON value; None if there is none.
+    """Return the value at the path `where` in parsed JSON, or None if there is no value.
 
     Raises:
-        ValueError: A function in the path was applied to a value of the wrong type, or it is nested too deeply.
+        ValueError: A function in the path was applied to a value of the wrong type, or the JSON is nested too deeply.
     """
     try:
         result: object = _compile_path(where).search(printed)
@@ -125,7 +126,7 @@ def search_json(printed: object, where: str) -> object:
 
 
 def by_expression(path: Path, expression: str) -> object:
-    """Return the text of the expression's group in its first match; None if it does not match.
+    """Return the text of the expression's group in the first match in a program's output, or None without a match.
 
     Raises:
         EvidenceError: As `text`.
@@ -134,7 +135,7 @@ def by_expression(path: Path, expression: str) -> object:
 
 
 def search_text(output: str, expression: str) -> str | None:
-    """Return the text of the expression's group in its first match in a text; None if it does not match."""
+    """Return the text of the expression's group in the first match in a text, or None without a match."""
     match = _compile_expression(expression).search(output)
     group: str | None = None if match is None else match[1]
     return group
@@ -144,22 +145,22 @@ def value(column: Column, extracted: object) -> Value:
     """Convert an extracted value to a value of a column.
 
     Raises:
-        EvidenceError: It is not a value of the column: missing, a list, or a text instead of a number.
+        EvidenceError: The value is missing, a list or an object, or has another type than the column.
     """
     if extracted is None:
         raise EvidenceError("the value is missing")
     if isinstance(extracted, list | dict):
-        raise EvidenceError("it is not one value, but several")
+        raise EvidenceError("it is a list or an object instead of a single value")
     text = json.dumps(extracted) if isinstance(extracted, bool | int | float) else str(extracted).strip()
-    shown = shorten(text)
+    shortened = shorten(text)
     if text in MISSING:
         raise EvidenceError("the value is missing")
     if column.type is str:
-        return shown
+        return shortened
     if isinstance(extracted, bool) != (column.type is bool) and not isinstance(extracted, str):
-        raise EvidenceError(f"it is {shown}, which has another type than the column")
+        raise EvidenceError(f"it is {shortened}, which has another type than the column")
     if reason := column.invalid_value_reason(text):
-        raise EvidenceError(f"it is {shown!r}, {reason}")
+        raise EvidenceError(f"it is {shortened!r}, {reason}")
     if column.type is bool:
         return text.lower() in {"true", "1"}
     return float(text) if column.type is float else int(text) if text.lstrip("+-").isdigit() else int(float(text))

@@ -1,4 +1,4 @@
-"""Reading of evidence files, with errors that contain a remedy, and checks that a file is complete."""
+"""Reading of evidence files: errors contain a remedy, and incomplete files are detected."""
 
 import gzip
 import os
@@ -20,7 +20,7 @@ MAX_TEXT_BYTES: Final = 64 << 20
 
 _CHUNK_BYTES: Final = 1 << 20
 _MAX_READ_BYTES: Final = 1 << 24
-"""Files up to this size are read into memory, larger ones are mapped; most captures are smaller."""
+"""Files up to this size are read into memory; larger ones are mapped. Most captures are smaller."""
 
 
 def size(path: Path) -> int:
@@ -84,7 +84,7 @@ def compressed(path: Path) -> bytes:
     Raises:
         EvidenceError: The file is missing, cannot be read, or has another format.
     """
-    size(path)  # raises an error if it is not a readable file
+    size(path)  # raises an error if the file cannot be read
     try:
         with gzip.open(path, "rb") as file:
             return file.read(MAX_TEXT_BYTES)
@@ -115,22 +115,22 @@ _COUNT: Final = re.compile(r"# lines ([0-9]{1,9})\n", re.ASCII)
 
 
 def counted_csv_text(header: str, lines: Iterable[str]) -> str:
-    """Return the text of a file with this header and these lines."""
-    listed = list(lines)
-    return "".join(f"{line}\n" for line in (f"# lines {len(listed)}", header, *listed))
+    """Return the text of a CSV file that starts with its number of lines, which shows whether it is complete."""
+    data_lines = list(lines)
+    return "".join(f"{line}\n" for line in (f"# lines {len(data_lines)}", header, *data_lines))
 
 
 def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: str) -> list[re.Match[str]]:
-    """Return the matches of a pattern with the lines of a file.
+    """Return the lines of a CSV file with a number of lines, as matches of a pattern.
 
     Args:
         path: The file.
-        header: Its header line.
+        header: Header line of the file.
         pattern: Pattern that all other lines must match.
-        error: Message if they do not: `is not a track of robots`.
+        error: Message if the file has another content, for example `is not a track of robots`.
 
     Raises:
-        EvidenceError: The file is missing, truncated, or has other contents.
+        EvidenceError: The file is missing, truncated, or has another content.
     """
     content = text(path)
     count = _COUNT.match(content)
@@ -139,5 +139,5 @@ def read_counted_csv(path: Path, header: str, pattern: re.Pattern[str], error: s
     if first != header or lines[-1:] != [""] or len(matches) < len(lines) - 1:
         raise EvidenceError(error, where=str(path))
     if count and int(count[1]) != len(matches):
-        raise EvidenceError(f"has {len(matches)} lines of {count[1]}: truncated", where=str(path))
+        raise EvidenceError(f"is truncated: it has {len(matches)} of {count[1]} lines", where=str(path))
     return matches

@@ -1,4 +1,4 @@
-"""Contents of recordings of sensors; packages add readers of their formats by entry points (`plugins.RECORDINGS`)."""
+"""Contents of recordings of sensors. Packages add readers for formats by entry points (`plugins.RECORDINGS`)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -28,11 +28,11 @@ class RecordingContents:
 
 
 RecordingReader = Callable[[Path], RecordingContents]
-"""Returns the contents of a recording, with the errors of `read`."""
+"""Function that returns the contents of a recording, and raises the same errors as `read`."""
 
 
 def read(path: Path) -> RecordingContents:
-    """Return the contents of a recording, whose format is known from its suffix.
+    """Return the contents of a recording. The suffix of its name determines the format.
 
     Raises:
         EvidenceError: The file is missing, damaged or without messages, or no package reads its format.
@@ -46,5 +46,5 @@ def read(path: Path) -> RecordingContents:
 
 @cache
 def _readers() -> Mapping[str, EntryPoint]:
-    """Return the readers by the suffix of the files."""
+    """Return the entry points of the readers by file name suffix."""
     return {f".{point.name}": point for point in plugins.entry_points(plugins.RECORDINGS)}

@@ -1,11 +1,11 @@
-"""Samples of a robot's radio link that the robot takes during an attempt, and the parsers of their sources.
+"""Samples of a radio link that a robot takes during an attempt, and the parsers of the programs' output.
 
-A robot's `ROLE-link.txt`, which is usually compressed, has sections, each with a line `==> SECONDS NAME <==` and the
-output of that time: `link`, `survey` and `station` of iw, `wireless` of /proc/net/wireless. The seconds are counted
-from boot; the host state before the attempt gives the time of boot.
+A robot's `ROLE-link.txt`, which is usually compressed, has sections. Each section has a line `==> SECONDS NAME <==`
+and the output at this time: `link`, `survey` and `station` of iw, or `wireless` of /proc/net/wireless. The seconds
+are counted from boot; the time of boot is computed from the host state before the attempt.
 
-The lines of iw are documented by its station.c, link.c and survey.c; versions 3 to 6 differ only in added lines.
-Drivers omit values that they do not support. A received power of 0 dBm or more is invalid: some drivers print 0, or a
+The source files station.c, link.c and survey.c of iw document its lines; versions 3 to 6 differ only in added lines.
+Drivers omit values that they do not support. A received power of 0 dBm or more is invalid: some drivers print 0 or a
 percentage.
 """
 
@@ -76,7 +76,7 @@ def parse_cell(text: str) -> StationSample | None:
 
 
 def parse_channel(text: str) -> tuple[float | None, int | None, int | None]:
-    """Return noise in dBm, active time in ns and busy time in ns of the channel in use; None if not reported.
+    """Return noise in dBm, active time in ns and busy time in ns of the channel in use; None for missing values.
 
     Args:
         text: Output of `iw dev INTERFACE survey dump`.
@@ -101,7 +101,7 @@ def parse_wireless(line: str) -> tuple[float | None, float | None]:
 
 
 def _lines(text: str) -> dict[str, str]:
-    """Return the first value of each name in lines `NAME: VALUE`; later values are of single antennas."""
+    """Return the first value of each name in lines `NAME: VALUE`; later values belong to single antennas."""
     lines: dict[str, str] = {}
     for name, value in _LINE.findall(text):
         lines.setdefault(name, value)
@@ -119,7 +119,7 @@ def _rate_bit_s(lines: Mapping[str, str], name: str) -> float | None:
 
 
 def read(folder: Path, role: Role) -> Sequence[LinkSample]:
-    """Return the samples of a robot's sampler and of the host states before and after, in the order of time.
+    """Return the samples of a robot's sampler and of its states before and after an attempt, in the order of time.
 
     Raises:
         EvidenceError: The files are missing, or do not contain the robot's clock.
@@ -139,7 +139,7 @@ def read(folder: Path, role: Role) -> Sequence[LinkSample]:
 
 
 def _sampler_text(path: Path) -> str:
-    """Return the text of a robot's sampler, empty if there is no file."""
+    """Return the text that a robot's sampler wrote; empty if there is no file."""
     if path.is_file():
         return reading.text(path)
     compressed = path.with_name(f"{path.name}.gz")
@@ -149,7 +149,7 @@ def _sampler_text(path: Path) -> str:
 
 
 def parse(text: str) -> Sequence[LinkSample]:
-    """Return the samples in the text of a robot's sampler; their times are nanoseconds since boot.
+    """Return the samples in the text of a robot's sampler. Their times are in nanoseconds since boot.
 
     An incomplete last line, written when the sampler was stopped, is omitted.
     """

@@ -1,9 +1,9 @@
-"""Sandboxed reading of untrusted files, in a process with limits of memory, CPU time and disk.
+"""Sandboxed reading of untrusted files, in a process with limits for memory, CPU time and disk.
 
-A library without precautions decompresses a file as a whole, runs queries that the file's database schema can change,
-and follows every reference. A check of the file in advance cannot detect all of this. A process is used because it
-can be killed, unlike a thread. The process starts with the first query, which takes 0.1 s, and also answers the
-following ones. It exits after an idle time, and after it ran out of memory.
+A library without precautions decompresses a whole file, runs queries that the file's database schema can change, and
+follows every reference. A check of the file in advance cannot detect all of this. The reader is a process because a
+process can be killed, unlike a thread. It is started by the first query, which takes 0.1 s, and also answers later
+queries. It exits if it is idle for some time, and if it runs out of memory.
 """
 
 import json
@@ -33,20 +33,21 @@ BYTES_PER_CPU_S: Final = 1 << 20
 """Additional limits per byte of the file; an index entry of 12 bytes in a bag becomes an object of 170 bytes."""
 MEMORY_SHARE: Final = 0.5
 MAX_CPU_S: Final = 3600
-"""Upper limits for any file: share of this machine's memory, and CPU time."""
+"""Upper limits for a file of any size: share of this machine's memory, and CPU time."""
 
-# The wall-clock limit is needed for a reader that waits without using CPU time, as for a named pipe; it allows for
-# other processes on a busy machine.
+# A reader that waits without using CPU time, for example for a named pipe, needs a limit of wall-clock time. This
+# limit is larger than the CPU time, because other processes may use the CPU.
 _WALL_PER_CPU_S: Final = 6
 _EXIT_WAIT_S: Final = 5.0
 ERROR_KEY: Final = "unanswered"
-"""Key of the reason in the answer to a query that failed."""
+"""Key of the error message in the answer to a query that failed."""
 _TIMED_OUT: Final = -signal.SIGXCPU
-# Exits that the file did not cause: idle time, out-of-memory killer of the kernel, a person, a service manager.
+# Exit codes that the file did not cause: the idle time, the kernel's out-of-memory killer, a person, a service
+# manager.
 _EXTERNAL_EXIT_CODES: Final = {0, -signal.SIGKILL, -signal.SIGTERM, -signal.SIGHUP, -signal.SIGINT}
 
 Json = dict[str, Any]
-"""A query or an answer; the keys depend on the module that answers."""
+"""A query or an answer. Each reader module defines its keys."""
 
 
 class ReaderError(Exception):
@@ -92,7 +93,7 @@ class SandboxedReader:
         """Stop the process, which otherwise exits after an idle time."""
         with self._query_lock:
             if self._process is not None and self._owner_pid == os.getpid():
-                self._end(self._process)
+                self._kill(self._process)
 
     def _exchange(self, question: Sequence[object], size_bytes: int) -> tuple[Json, int]:
         """Return the answer and 0, or an empty answer and the exit code if the process exited or was killed."""
@@ -107,23 +108,23 @@ class SandboxedReader:
             max_bytes = ANSWER_BYTES + ANSWER_PER_BYTE * size_bytes
             line = _read_line(process.stdout.fileno(), max_bytes, _WALL_PER_CPU_S * _cpu_s(size_bytes))
         except TimeoutError:
-            self._end(process)
+            self._kill(process)
             return {}, _TIMED_OUT
-        except BaseException:  # otherwise, after Ctrl-C, this answer would be read as the next one
-            self._end(process)
+        except BaseException:  # after Ctrl-C, the next query would otherwise read this answer
+            self._kill(process)
             raise
         if len(line) > max_bytes:
-            self._end(process)
-            return {ERROR_KEY: "its contents exceed the limit for a file of its size"}, 0
+            self._kill(process)
+            return {ERROR_KEY: "its contents exceed the limit for a file of this size"}, 0
         if line.endswith(b"\n"):
             return json.loads(line), 0
-        return {}, self._end(process, _EXIT_WAIT_S)
+        return {}, self._kill(process, _EXIT_WAIT_S)
 
-    def _end(self, process: subprocess.Popen[bytes], patience_s: float = 0.0) -> int:
-        """Kill the process unless it exits within `patience_s`, and return its exit code."""
+    def _kill(self, process: subprocess.Popen[bytes], wait_s: float = 0.0) -> int:
+        """Kill the process unless it exits within `wait_s`, and return its exit code."""
         self._process = None
         with suppress(subprocess.TimeoutExpired):
-            process.wait(patience_s)
+            process.wait(wait_s)
         process.kill()
         with process:  # closes the pipes of the process
             return process.wait()
@@ -133,7 +134,8 @@ class SandboxedReader:
 def _temporary_folder() -> Iterator[str | None]:
     """Create a folder for unpacked files, and remove it even if the reader is killed.
 
-    The folder is None if no disk has space for it. This is not an error, because few files need the folder.
+    The folder is None if it cannot be created, for example on a full disk. This is not an error, because few files
+    need the folder.
     """
     folder = None
     with suppress(OSError):
@@ -141,11 +143,11 @@ def _temporary_folder() -> Iterator[str | None]:
     try:
         yield folder
     finally:
-        remove(folder)
+        remove_folder(folder)
 
 
-def remove(folder: str | None) -> None:
-    """Remove a folder of unpacked files, if there is one."""
+def remove_folder(folder: str | None) -> None:
+    """Remove a folder of unpacked files; does nothing if `folder` is None."""
     if folder is not None:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -160,9 +162,9 @@ def _limits(size_bytes: int) -> tuple[int, int, int]:
 
 def _exit_reason(code: int, size_bytes: int) -> str:
     if code == _TIMED_OUT:
-        return f"reading it takes longer than {_cpu_s(size_bytes)} s, the limit for a file of its size"
+        return f"reading it takes longer than {_cpu_s(size_bytes)} s, the limit for a file of this size"
     if code in _EXTERNAL_EXIT_CODES:
-        return "another process or the kernel stopped its reader twice; is the memory of this machine full?"
+        return "another process or the kernel stopped its reader twice; check that this machine has free memory"
     return f"its reader exited with code {code}"
 
 
@@ -182,18 +184,18 @@ def _start(module: str) -> subprocess.Popen[bytes]:
     )
 
 
-def _read_line(descriptor: int, max_bytes: int, within_s: float) -> bytes:
-    """Return the bytes up to the end of a line or of the file, or until they are more than `max_bytes`.
+def _read_line(descriptor: int, max_bytes: int, timeout_s: float) -> bytes:
+    """Return the bytes up to the end of a line or of the file; reading stops after more than `max_bytes`.
 
     Raises:
-        TimeoutError: Neither end was reached in time.
+        TimeoutError: No end was reached within `timeout_s`.
     """
-    until_s = time.monotonic() + within_s
+    deadline_s = time.monotonic() + timeout_s
     line = bytearray()
     pipe = select.poll()
     pipe.register(descriptor, select.POLLIN)
     while not line.endswith(b"\n") and len(line) <= max_bytes:
-        if not pipe.poll(max(0.0, 1e3 * (until_s - time.monotonic()))):
+        if not pipe.poll(max(0.0, 1e3 * (deadline_s - time.monotonic()))):
             raise TimeoutError
         piece = os.read(descriptor, 1 << 16)
         if not piece:

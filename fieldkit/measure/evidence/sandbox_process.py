@@ -1,4 +1,4 @@
-"""The process of a sandboxed reader: it limits its resources, and answers the queries of `SandboxedReader`."""
+"""The process of a sandboxed reader: it limits its resources and answers the queries of `SandboxedReader`."""
 
 import json
 import math
@@ -11,15 +11,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from fieldkit.measure.evidence.sandbox import ERROR_KEY, Json, remove
+from fieldkit.measure.evidence.sandbox import ERROR_KEY, Json, remove_folder
 
 _IDLE_MS: Final = 60_000
-"""Idle time before the process exits: longer than a repeat, so that one process serves a whole trial. It also exits
-with its parent process, because its input is closed then."""
+"""Idle time in ms after which the process exits. It is longer than a repeat, so that one process serves a whole
+trial. The process also exits with its parent process, because its input is then closed."""
 
 
 def serve(answer: Callable[[Json], Json]) -> None:
-    """Answer queries from standard input until the idle time has passed, input ends, or memory was exhausted."""
+    """Answer queries from standard input until the process is idle, the input ends, or memory is exhausted.
+
+    Args:
+        answer: Function that returns the answer to a query.
+    """
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with suppress(OSError):  # if memory is short, the kernel should kill this process instead of its parent
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
@@ -34,7 +38,7 @@ def serve(answer: Callable[[Json], Json]) -> None:
         except Exception as error:  # noqa: BLE001 (the file may cause any exception)
             has_memory = not isinstance(error, MemoryError)
             reply = {ERROR_KEY: _error_text(error)}
-        remove(tempfile.tempdir)  # done here, because the parent process may have been killed
+        remove_folder(tempfile.tempdir)  # done here, because the parent process may have been killed
         sys.stdout.write(json.dumps(reply) + "\n")
         sys.stdout.flush()
 
@@ -56,5 +60,5 @@ def _apply_limits(memory_bytes: int, disk_bytes: int, cpu_s: int) -> None:
 
 def _error_text(error: Exception) -> str:
     if isinstance(error, MemoryError):
-        return "reading it needs more memory than the limit for a file of its size"
+        return "reading it needs more memory than the limit for a file of this size"
     return f"{type(error).__name__}: {' '.join(str(error)[:1000].split())}"[:300]

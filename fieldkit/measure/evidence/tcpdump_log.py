@@ -1,4 +1,4 @@
-"""Counters of a capture in tcpdump's standard error."""
+"""Counters of a capture that tcpdump prints to standard error."""
 
 import re
 from dataclasses import dataclass
@@ -26,23 +26,22 @@ def log_file(role: Role) -> str:
     return f"{role}-capture.log"
 
 
-def log_of(capture: str) -> str:
+def capture_log_file(capture: str) -> str:
     """Return the name of the log that belongs to a capture's file name, with or without the name of a step."""
     return f"{capture.removesuffix('.pcap')}-capture.log"
 
 
 @dataclass(frozen=True)
 class CaptureLog:
-    """Counters that tcpdump printed for a capture; they are None if it was killed before it printed them.
+    """Counters that tcpdump printed for a capture. They are None if tcpdump was killed before it printed them.
 
     Attributes:
-        listening: Whether it printed that it is listening; earlier packets are not captured.
-        captured: Packets that were written.
-        received_by_filter: Packets that the kernel passed to libpcap; each one twice on a loopback interface. The
-            count is larger than `captured` if other packets arrived between the opening of the socket and the
-            installation of the filter. libpcap discards these packets itself (pcap-linux.c,
-            `blocks_to_filter_in_userland`). At 5,000 other packets per second, this happened to one packet in 2 of 10
-            captures.
+        listening: True if tcpdump printed that it is listening; earlier packets are not captured.
+        captured: Packets that were written to the file.
+        received_by_filter: Packets that the kernel passed to libpcap; each packet is counted twice on a loopback
+            interface. The count is larger than `captured` if other packets arrived between the opening of the socket
+            and the installation of the filter. libpcap discards these packets (pcap-linux.c,
+            `blocks_to_filter_in_userland`). At 5,000 other packets per second, 2 of 10 captures had one such packet.
         dropped_by_kernel: Packets that matched the filter while the capture buffer was full.
         dropped_by_interface: Packets that the interface or its driver dropped.
     """
@@ -64,7 +63,7 @@ def read(path: Path) -> CaptureLog:
 
 
 def parse(text: str) -> CaptureLog:
-    """Return the counters in the text of a log; they are None if the text contains no counters."""
+    """Return the counters in the text of a log; they are None if the text does not contain them."""
     counts = {match["what"]: int(match["count"]) for match in _COUNT.finditer(text)}
     captured = counts.get("captured")
     return CaptureLog(

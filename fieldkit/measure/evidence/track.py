@@ -1,6 +1,7 @@
-"""Positions and velocities of robots during a repeat, recorded by a testbed that has this data (`Oracle.track`).
+"""Positions and velocities of robots during a repeat, recorded by a testbed that can measure them (`Oracle.track`).
 
-A CSV line is valid until the next line of the same robot; `east_m` to `up_m` are empty while it was out of range.
+A CSV line is valid until the next line of the same robot. `east_m`, `north_m` and `up_m` are empty while the robot is
+out of range.
 """
 
 import math
@@ -28,15 +29,15 @@ _LINE: Final = re.compile(rf"([0-9]{{1,19}}),({Role.PATTERN}),{_POSITION},{_NUMB
 
 @dataclass(frozen=True)
 class Separation:
-    """Distance and speeds of two robots during a time; the names of columns end with the names of the attributes.
+    """Distance and speeds of two robots during a time span. Names of columns end with the names of the attributes.
 
     Attributes:
-        distance_start_m: Distance at the start; None if a robot had no position then.
+        distance_start_m: Distance at the start; None if a robot had no position at this time.
         distance_min_m: Smallest distance.
-        distance_mean_m: Mean distance over the time.
+        distance_mean_m: Mean distance over the time span.
         distance_max_m: Largest distance.
-        relative_speed_m_s: Mean magnitude of their relative velocity over the time.
-        sender_speed_m_s: Mean speed of the sender over the time.
+        relative_speed_m_s: Mean magnitude of the relative velocity over the time span.
+        sender_speed_m_s: Mean speed of the sender over the time span.
     """
 
     distance_start_m: float | None
@@ -66,7 +67,7 @@ def read(path: Path) -> tuple[TrackPoint, ...]:
     """Return the track in a file, in the order of time.
 
     Raises:
-        EvidenceError: The file is missing, truncated, or has other contents.
+        EvidenceError: The file is missing, truncated, or not a track.
     """
     message = "is not a track of robots"
     track = tuple(map(_parse_line, reading.read_counted_csv(path, _HEADER, _LINE, message)))
@@ -87,7 +88,7 @@ def _vector(values: Sequence[float | None]) -> Vector | None:
 
 
 def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) -> Iterator[tuple[int, float | None]]:
-    """Yield the start in ns and the value of the distance between two robots, for each entry of either robot."""
+    """Yield the time in ns and the distance between two robots for each entry of either robot."""
     for utc_ns, sender, receiver in _joint_states(track, source, destination):
         yield utc_ns, _distance_m(sender, receiver)
 
@@ -95,9 +96,9 @@ def distances_m(track: Sequence[TrackPoint], source: Role, destination: Role) ->
 def separation_between(
     track: Sequence[TrackPoint], source: Role, destination: Role, start_ns: int, end_ns: int
 ) -> Separation | None:
-    """Return distance and speeds of two robots between two times.
+    """Return distance and speeds of two robots between two times, or None if they never both have a position.
 
-    Times in which a robot has no position are ignored; the result is None if there are no other times.
+    Times at which a robot has no position are ignored.
 
     Args:
         track: Positions of the robots.
@@ -108,14 +109,14 @@ def separation_between(
     """
     states = list(_joint_states(track, source, destination))
     first = bisect_right([utc_ns for utc_ns, *_ in states], start_ns) - 1
-    within = [state for state in states[max(first, 0) :] if state[0] <= end_ns]
-    if first < 0 or not within:
+    states_in_span = [state for state in states[max(first, 0) :] if state[0] <= end_ns]
+    if first < 0 or not states_in_span:
         return None
-    edges_ns = [start_ns, *(utc_ns for utc_ns, *_ in within[1:]), end_ns]
+    edges_ns = [start_ns, *(utc_ns for utc_ns, *_ in states_in_span[1:]), end_ns]
     pieces = [
-        # At least 1 ns, so that the mean is defined if start and end are equal.
+        # A piece lasts at least 1 ns, so that the mean is defined if start and end are equal.
         (max(stop_ns - begin_ns, 1), distance_m, sender, receiver)
-        for (begin_ns, stop_ns), (_, sender, receiver) in zip(pairwise(edges_ns), within, strict=True)
+        for (begin_ns, stop_ns), (_, sender, receiver) in zip(pairwise(edges_ns), states_in_span, strict=True)
         if (distance_m := _distance_m(sender, receiver)) is not None
     ]
     if not pieces:
@@ -123,7 +124,7 @@ def separation_between(
     total_ns = sum(ns for ns, *_ in pieces)
     distances = [distance_m for _, distance_m, *_ in pieces]
     return Separation(
-        distance_start_m=_distance_m(*within[0][1:]),
+        distance_start_m=_distance_m(*states_in_span[0][1:]),
         distance_min_m=min(distances),
         distance_mean_m=sum(ns * distance_m for ns, distance_m, *_ in pieces) / total_ns,
         distance_max_m=max(distances),
@@ -135,7 +136,10 @@ def separation_between(
 def _joint_states(
     track: Sequence[TrackPoint], source: Role, destination: Role
 ) -> Iterator[tuple[int, TrackPoint, TrackPoint]]:
-    """Yield the time in ns and the latest entries of both robots, for each entry of either one once both have one."""
+    """Yield the time in ns and the latest entries of both robots for each entry of either robot.
+
+    The first time is the one from which both robots have an entry.
+    """
     latest: dict[Role, TrackPoint] = {}
     for entry in track:
         latest[entry.role] = entry
@@ -151,26 +155,25 @@ def _distance_m(first: TrackPoint, second: TrackPoint) -> float | None:
 
 def measure(
     track: Sequence[TrackPoint] | None,
-    declared: Sequence[Column],
+    columns: Sequence[Column],
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
-    """Return the columns of distance and speeds of two robots between the first and the last of the given times.
-
-    The times are by a robot's clock, which is the laptop's clock on testbeds that record positions.
+    """Return the columns of distance and speeds of two robots between the earliest and the latest of several times.
 
     Args:
         track: Positions of the robots; None if they are unknown.
-        declared: The columns, `PREFIX_distance_start_m` and so on.
+        columns: The columns, `PREFIX_distance_start_m` and so on.
         ends: Sender and receiver.
-        times_ns: The times, nanoseconds since 1970 UTC.
+        times_ns: The times by a robot's clock, in nanoseconds since 1970 UTC. On testbeds that record positions, this
+            is the laptop's clock.
     """
     if track is None:
-        return Measured.all_missing(declared, "the positions of the robots are unknown")
+        return Measured.all_missing(columns, "the positions of the robots are unknown")
     if not len(times_ns):
-        return Measured.all_missing(declared, "no packet has a time")
+        return Measured.all_missing(columns, "no packet has a time")
     separation = separation_between(track, *ends, min(times_ns), max(times_ns))
     if separation is None:
-        return Measured.all_missing(declared, "a robot had no position")
-    values = {column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}
+        return Measured.all_missing(columns, "a robot had no position")
+    values = {column.name: getattr(separation, column.name.partition("_")[2]) for column in columns}
     return Measured.from_optional(values, "a robot had no position at the start")

@@ -1,4 +1,4 @@
-"""Reader of GPX files with gpxpy, run by `position_files` in a separate process. No other module imports gpxpy."""
+"""Reader of GPX files, which `position_files` runs in a separate process. No other module imports gpxpy."""
 
 from pathlib import Path
 
@@ -10,7 +10,9 @@ from fieldkit.measure.positions.samples import utc_ns
 
 
 def answer(request: Json) -> Json:
-    """Return the points of all tracks in the file at `path`: time, latitude, longitude, and height or None.
+    """Return the points of all tracks in the file at `path` of the request.
+
+    A point is a list of time in ns, latitude and longitude in degrees, and height in metres or None.
 
     Raises:
         Exception: The file cannot be read. gpxpy and its XML parser raise many types of errors for invalid content.
@@ -19,13 +21,15 @@ def answer(request: Json) -> Json:
         gpx = gpxpy.parse(file)
     points = [point for track in gpx.tracks for segment in track.segments for point in segment.points]
     if any(point.time is not None and point.time.tzinfo is None for point in points):
-        raise ValueError("a time has no time zone; GPX uses UTC, 2026-11-22T10:00:00Z")
-    timed = [point for point in points if point.time is not None]
-    if len(timed) < len(points):
-        raise ValueError(f"{len(points) - len(timed)} of {len(points)} points have no time")
+        raise ValueError("a time has no time zone; times in GPX are UTC, for example 2026-11-22T10:00:00Z")
+    timed_points = [point for point in points if point.time is not None]
+    if len(timed_points) < len(points):
+        raise ValueError(f"{len(points) - len(timed_points)} of {len(points)} points have no time")
     return {
         "points": [
-            (utc_ns(point.time), point.latitude, point.longitude, point.elevation) for point in timed if point.time
+            (utc_ns(point.time), point.latitude, point.longitude, point.elevation)
+            for point in timed_points
+            if point.time
         ]
     }
 

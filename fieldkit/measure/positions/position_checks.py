@@ -4,7 +4,7 @@ from typing import Final
 
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 
-OF_POSITIONS: Final = (
+POSITION_CHECKS: Final = (
     CrossCheck(
         "planned positions in the record",
         ("positions_from",),

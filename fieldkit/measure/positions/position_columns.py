@@ -1,4 +1,4 @@
-"""Columns of robots' positions during a measurement, from recorded positions or, without them, from the testbed."""
+"""Columns of robots' positions during a measurement, from recorded positions or, without these, from the testbed."""
 
 from collections.abc import Collection, Sequence
 from fnmatch import fnmatch
@@ -26,30 +26,30 @@ _ATTEMPTS: Final = "repeats"
 
 def measure(
     evidence: AttemptEvidence,
-    declared: Sequence[Column],
+    columns: Sequence[Column],
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
-    """Return the columns for the distance of two robots between the first and the last of the given times.
+    """Return the columns of distance and speeds of two robots between the earliest and the latest of several times.
 
     Args:
         evidence: The attempt's evidence.
-        declared: The columns, `PREFIX_distance_start_m` and so on.
-        ends: The sender, whose clock gives the times, and the receiver.
-        times_ns: The times, nanoseconds since 1970 UTC.
+        columns: The columns, `PREFIX_distance_start_m` and so on.
+        ends: Sender and receiver.
+        times_ns: The times by the sender's clock, in nanoseconds since 1970 UTC.
     """
     if not are_recorded(evidence):
-        return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
+        return track.measure(evidence.read_or_none(track.read, track.FILE), columns, ends, times_ns)
     from fieldkit.measure.positions import recorded_positions  # noqa: PLC0415 (few attempts have such positions)
 
-    return recorded_positions.measure(evidence, declared, ends, times_ns)
+    return recorded_positions.measure(evidence, columns, ends, times_ns)
 
 
 def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[tuple[int, float | None]]:
     """Return the distance of two robots over time, as (time, distance) pairs.
 
-    Times are nanoseconds since 1970 UTC by the first robot's clock. The distance is None from the start of a gap in
-    the positions. The list is empty if no distance is known.
+    Times are in nanoseconds since 1970 UTC by the first robot's clock. A gap in the positions is a pair without a
+    distance (None). The list is empty if no distance is known.
     """
     if not are_recorded(evidence):
         return list(track.distances_m(evidence.read_or_none(track.read, track.FILE) or (), *ends))

@@ -18,16 +18,16 @@ from fieldkit.measure.positions.position_sources import PositionSource
 from fieldkit.measure.positions.samples import MAX_SAMPLES, WGS84, Samples, read_csv, require_increasing
 
 MAX_STALE_S: Final = 10.0
-"""If stamps and reception times differ by more than this, the stamps are from another clock."""
+"""If time stamps and reception times differ by more than this, the time stamps are of another clock."""
 
 PositionReader = Callable[[Path, PositionSource], Samples]
-"""Returns the samples of a source in a file, with the errors of `read_topic`."""
+"""Function that returns the samples of a source in a file, and raises the same errors as `read_topic`."""
 
 _GPX_READER: Final = SandboxedReader("fieldkit.measure.positions.gpx_reader")
 
 
 def read_file(path: Path) -> Samples:
-    """Return the samples in a GPX or CSV file, distinguished by the file name's suffix, with the times in the file.
+    """Return the samples in a GPX or CSV file, with the times in the file. The file name's suffix gives the format.
 
     Raises:
         EvidenceError: The file has another suffix or is invalid.
@@ -46,7 +46,9 @@ def _read_gpx(path: Path) -> Samples:
     except ReaderError as error:
         raise EvidenceError(f"cannot be read as GPX: {error}", where=str(path)) from error
     if len(points) > MAX_SAMPLES:
-        raise EvidenceError(f"has more than {MAX_SAMPLES} points", where=str(path), remedy="cut it to the trial")
+        raise EvidenceError(
+            f"has more than {MAX_SAMPLES} points", where=str(path), remedy="remove the points outside of the trial"
+        )
     try:
         require_increasing(
             [at_ns for at_ns, *_ in points], [f"point {number}" for number in range(1, len(points) + 1)]
@@ -63,7 +65,9 @@ def _read_gpx(path: Path) -> Samples:
 
 
 def read_topic(path: Path, position_source: PositionSource) -> Samples:
-    """Return the samples in a topic of a bag, or of a message type in a telemetry log, by the recorder's clock.
+    """Return the samples in a topic of a bag or in the messages of a type in a telemetry log.
+
+    Their times are by the recorder's clock.
 
     Raises:
         EvidenceError: The file cannot be read or has no positions, or no package reads its format.
@@ -77,19 +81,19 @@ def read_topic(path: Path, position_source: PositionSource) -> Samples:
 
 @cache
 def _readers() -> Mapping[str, EntryPoint]:
-    """Return the readers by the suffix of the files."""
+    """Return the entry points of the readers by file name suffix."""
     return {f".{point.name}": point for point in plugins.entry_points(plugins.POSITIONS)}
 
 
 def to_placement_frame(samples: Samples, position_source: PositionSource) -> Samples:
-    """Transform odometry to the frame of the placement, with the robot's place and heading at the start of the step.
+    """Transform odometry to the frame of the placement.
 
     Args:
         samples: Odometry with times by the laptop's clock.
-        position_source: Source with the start time, place and heading.
+        position_source: Source with the place and heading of the robot at the start of the step, and the start time.
 
     Raises:
-        EvidenceError: The heading is unknown, or odometry has no sample at the start.
+        EvidenceError: The heading is unknown, or the odometry has no sample at the start.
     """
     assert samples.yaws_rad is not None
     if position_source.heading_rad is None:
@@ -100,16 +104,16 @@ def to_placement_frame(samples: Samples, position_source: PositionSource) -> Sam
     if at < 0:
         late_s = (int(samples.times_ns[0]) - position_source.began_utc_ns) / 1e9
         raise EvidenceError(
-            f"{position_source.topic} begins {late_s:.1f} s after the step started, so the start is unknown"
+            f"{position_source.topic} begins {late_s:.1f} s after the step started, so the robot's start is unknown"
         )
     turn_rad = position_source.heading_rad - float(samples.yaws_rad[at])
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
     from_start_m = samples.values - samples.values[at]
-    turned = np.column_stack(
+    rotated = np.column_stack(
         (
             cos * from_start_m[:, 0] - sin * from_start_m[:, 1],
             sin * from_start_m[:, 0] + cos * from_start_m[:, 1],
             from_start_m[:, 2],
         )
     )
-    return replace(samples, values=turned + np.array(position_source.start))
+    return replace(samples, values=rotated + np.array(position_source.start))

@@ -1,7 +1,7 @@
 """Sources of robots' positions, as stored in `positions.json` of an attempt or of a whole trial.
 
-Steps that follow robots write the attempt's file; `fieldkit positions` writes the trial's file. If both
-have the position of one robot, the trial's file takes precedence.
+Steps that record the positions of robots write the attempt's file; `fieldkit positions` writes the trial's file. If
+both files have a source for the same robot, the source in the trial's file is used.
 """
 
 import json
@@ -24,8 +24,8 @@ FILE: Final = laptop_files.POSITIONS
 Place = tuple[float, float, float | None]
 """Metres along three axes, or latitude and longitude in degrees and height in metres; the height may be None."""
 GAP_S: Final = 3.0
-"""Default for the longest time between two samples over which a position is interpolated. A satellite receiver that
-reports once a second has then missed two positions."""
+"""Default of the longest time between two samples over which a position is interpolated. With a satellite receiver
+that reports once a second, two consecutive positions may be missing."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +42,12 @@ class PositionSource:
         offset_s: Offset that is added to the times of a GPX or CSV file to convert them to the laptop's clock. Times
             in a bag are by the robot's clock.
         gap_s: Longest time between two samples over which the position is interpolated.
-        start: Place of the robot at the start of odometry.
-        heading_rad: Heading at the start of odometry, from the frame's first axis towards its second; may be None.
-        began_utc_ns: Start of odometry by the laptop's clock.
-        clock: Role of the robot whose clock gives the times; empty for the robot itself.
-        system: MAVLink system id of the autopilot in a telemetry log; 0 if the log has only one.
+        start: Place of the robot at the start of the odometry.
+        heading_rad: Heading at the start of the odometry, from the frame's first axis towards its second; None if
+            unknown.
+        began_utc_ns: Start of the odometry by the laptop's clock, nanoseconds since 1970 UTC.
+        clock: Role of the robot whose clock gives the times; empty if it is this robot.
+        system: MAVLink system ID of the autopilot in a telemetry log; 0 if the log has only one.
     """
 
     place: Place | None = None
@@ -65,7 +66,7 @@ class PositionSource:
 
     @property
     def description(self) -> str:
-        """Short text for reports: `/odom`, `positions-receiver.gpx`, `48.1, 11.5 in WGS 84`, `as placed`."""
+        """Short text for reports: `/odom`, `positions-receiver.gpx`, `48.1, 11.5 in WGS 84` or `as placed`."""
         if self.place is None:
             return self.topic or self.file
         return (
@@ -82,7 +83,7 @@ class PositionSources:
     Attributes:
         robots: Sources by role.
         clocks: Offsets of the robots' clocks from the laptop's, if they were measured.
-        heights: True if heights above the ellipsoid are used; they are often wrong by 10 m.
+        heights: True if heights above the ellipsoid are used. Their errors are often 10 m.
     """
 
     robots: Mapping[Role, PositionSource] = field(default_factory=lambda: MappingProxyType({}))
@@ -91,7 +92,10 @@ class PositionSources:
 
 
 def merge(base: PositionSources, override: PositionSources) -> PositionSources:
-    """Combine two sets of sources. `override` takes precedence, except if it only has the planned placement."""
+    """Combine two sets of sources.
+
+    For a robot in both sets, the source of `override` is used, unless it is only the planned placement.
+    """
     robots = {**base.robots}
     for role, position_source in override.robots.items():
         if role not in robots or position_source.frame != PLACED or position_source.place is None:
@@ -100,7 +104,7 @@ def merge(base: PositionSources, override: PositionSources) -> PositionSources:
 
 
 def text(position_sources: PositionSources) -> str:
-    """Return the sources as JSON for `read`."""
+    """Return the sources as JSON that `read` accepts."""
     defaults = asdict(PositionSource())
     robots = {
         role: {name: value for name, value in asdict(position_source).items() if value != defaults[name]}
@@ -138,17 +142,19 @@ def _record_from_json(record: type[Any], values: Mapping[str, Any]) -> Any:  # n
         ValueError: A value or key is invalid.
         TypeError: A value is missing.
     """
-    checked = {field.name: _value(field.type, values[field.name]) for field in fields(record) if field.name in values}
-    parts = PurePosixPath(checked.get("file", "")).parts  # two parts are allowed: a ROS 2 bag is a folder
-    if len(checked) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
+    checked_values = {
+        field.name: _typed_value(field.type, values[field.name]) for field in fields(record) if field.name in values
+    }
+    parts = PurePosixPath(checked_values.get("file", "")).parts  # two parts are allowed: a ROS 2 bag is a folder
+    if len(checked_values) < len(values) or len(parts) > 2 or {"..", "/"} & {*parts}:
         raise ValueError
-    if clock := checked.get("clock"):
+    if clock := checked_values.get("clock"):
         Role(clock)  # raises ValueError if it is not a role
-    return record(**checked)
+    return record(**checked_values)
 
 
-def _value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
-    """Return a JSON value converted to the type `kind`, or raise `ValueError`."""
+def _typed_value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
+    """Return a JSON value converted to the type `kind`; raises `ValueError` if it is not of this type."""
     if kind is str and isinstance(value, str):
         return value
     if kind is int and type(value) is int and 0 <= value < 2**62:
@@ -157,6 +163,6 @@ def _value(kind: Any, value: Any) -> Any:  # noqa: ANN401 (any JSON value)
         return float(value)
     if kind in {Vector, Place | None} and isinstance(value, list) and len(value) == 3:
         if value[2] is None and kind is not Vector:
-            return (_value(float, value[0]), _value(float, value[1]), None)
-        return tuple(_value(float, part) for part in value)
+            return (_typed_value(float, value[0]), _typed_value(float, value[1]), None)
+        return tuple(_typed_value(float, part) for part in value)
     raise ValueError

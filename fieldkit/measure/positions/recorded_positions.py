@@ -1,6 +1,6 @@
-"""Recorded positions of robots, from the sources that `positions.json` lists, and a check of travelled distances.
+"""Positions of robots from the sources in `positions.json`, and a check of travelled distances.
 
-Positions of the testbed are used for robots without such a source (`position_columns`).
+If no robot has such a source, the positions of the testbed are used (`position_columns`).
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,7 +26,7 @@ from fieldkit.measure.positions.trajectories import Trajectory
 
 def measure(
     evidence: AttemptEvidence,
-    declared: Sequence[Column],
+    columns: Sequence[Column],
     ends: tuple[Role, Role],
     times_ns: Collection[int],
 ) -> Measured:
@@ -34,21 +34,21 @@ def measure(
     try:
         sources = read_position_sources(evidence)
         if not sources.robots.keys() & set(ends):
-            return track.measure(evidence.read_or_none(track.read, track.FILE), declared, ends, times_ns)
+            return track.measure(evidence.read_or_none(track.read, track.FILE), columns, ends, times_ns)
         source, destination = trajectories_of_pair(evidence, ends)
     except EvidenceError as error:
-        return Measured.all_missing(declared, error.what)
+        return Measured.all_missing(columns, error.what)
     if not len(times_ns):
-        return Measured.all_missing(declared, "no packet has a time")
+        return Measured.all_missing(columns, "no packet has a time")
     offset_ns = _offset_ns(sources, ends[0])
     start_ns, end_ns = int(min(times_ns)) - offset_ns, int(max(times_ns)) - offset_ns
     for role, trajectory in zip(ends, (source, destination), strict=True):
         if problem := trajectory.coverage_problem(start_ns, end_ns):
             reason = f"the positions of the {role} from {sources.robots[role].description} {problem}"
-            return Measured.all_missing(declared, reason)
+            return Measured.all_missing(columns, reason)
     separation = trajectories.separation_between(source, destination, start_ns, end_ns)
     return Measured.from_optional(
-        {column.name: getattr(separation, column.name.partition("_")[2]) for column in declared}, ""
+        {column.name: getattr(separation, column.name.partition("_")[2]) for column in columns}, ""
     )
 
 
@@ -62,48 +62,50 @@ def distances_m(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> Sequence[
     except EvidenceError:
         return ()
     offset_ns, distances = _offset_ns(sources, ends[0]), list[tuple[int, float | None]]()
-    for at_ns, metres in zip(*trajectories.distances_m(source, destination), strict=True):
-        since_ns = distances[-1][0] - offset_ns if distances else int(at_ns)
-        if any(trajectory.coverage_problem(since_ns, int(at_ns)) for trajectory in (source, destination)):
-            distances.append((since_ns + offset_ns + 1, None))
-        distances.append((int(at_ns) + offset_ns, float(metres)))
+    for at_ns, distance_m in zip(*trajectories.distances_m(source, destination), strict=True):
+        previous_ns = distances[-1][0] - offset_ns if distances else int(at_ns)
+        if any(trajectory.coverage_problem(previous_ns, int(at_ns)) for trajectory in (source, destination)):
+            distances.append((previous_ns + offset_ns + 1, None))
+        distances.append((int(at_ns) + offset_ns, float(distance_m)))
     return distances
 
 
 def read_position_sources(evidence: AttemptEvidence) -> PositionSources:
-    """Return the sources of positions besides the testbed; most attempts have none.
+    """Return the sources of positions other than the testbed; most attempts have none.
 
     Raises:
-        EvidenceError: A file that lists them is damaged.
+        EvidenceError: A file with sources is damaged.
     """
     return evidence.cached(_read_sources)
 
 
 def _read_sources(evidence: AttemptEvidence) -> PositionSources:
-    of_attempt = (
+    attempt_sources = (
         evidence.read(position_sources.read, position_sources.FILE)
         if evidence.has(position_sources.FILE)
         else PositionSources()
     )
     trial = trial_folder(evidence)
-    of_trial = (
+    trial_sources = (
         position_sources.read(trial / position_sources.FILE)
         if trial and (trial / position_sources.FILE).is_file()
         else PositionSources()
     )
     return PositionSources(
-        {**of_attempt.robots, **of_trial.robots}, of_attempt.clocks, of_attempt.heights or of_trial.heights
+        {**attempt_sources.robots, **trial_sources.robots},
+        attempt_sources.clocks,
+        attempt_sources.heights or trial_sources.heights,
     )
 
 
 def sources_text(evidence: AttemptEvidence) -> str | None:
-    """Return the sources as text, `sender as placed, receiver /odom`, or None if there are none."""
+    """Return a text such as `sender as placed, receiver /odom`, or None if there are no sources."""
     robots = read_position_sources(evidence).robots
     return ", ".join(f"{role} {robots[role].description}" for role in sort_roles(robots)) or None
 
 
 def trajectories_of_pair(evidence: AttemptEvidence, ends: tuple[Role, Role]) -> tuple[Trajectory, Trajectory]:
-    """Return the trajectories of two robots by the laptop's clock, in one frame.
+    """Return the trajectories of two robots, with times by the laptop's clock, in one frame.
 
     Raises:
         EvidenceError: A robot has no source, a source cannot be read, or the frames differ.
@@ -140,7 +142,7 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
     """
     sources = read_position_sources(evidence)
     if (position_source := sources.robots.get(role)) is None:
-        raise EvidenceError(f"no source has the position of the {role}")
+        raise EvidenceError(f"there is no source for the position of the {role}")
     if position_source.place is not None:
         place = np.array([position_source.place], dtype=float)  # converts None to NaN
         return Samples(np.zeros(1, dtype=np.int64), place, position_source.frame)
@@ -151,12 +153,12 @@ def samples_of(evidence: AttemptEvidence, role: Role) -> Samples:
         )
         return samples if samples.yaws_rad is None else position_files.to_placement_frame(samples, position_source)
     folder = trial_folder(evidence)
-    assert folder is not None  # only the sources of a trial have neither a place nor a topic
+    assert folder is not None  # a source without place and topic is in the file of a trial
     return _shifted(_samples_in_trial(folder / position_source.file), round(position_source.offset_s * 1e9))
 
 
 def readable_samples(evidence: AttemptEvidence) -> Mapping[Role, Samples]:
-    """Return the samples of each robot with a readable source besides the testbed."""
+    """Return the samples of each robot that has a readable source other than the testbed."""
     samples_by_role: dict[Role, Samples] = {}
     with suppress(EvidenceError):
         for role in read_position_sources(evidence).robots:
@@ -170,7 +172,7 @@ def _shifted(samples: Samples, by_ns: int) -> Samples:
 
 
 def _samples_in_trial(path: Path) -> Samples:
-    """Return the samples in a file of a trial; cached, because all of the trial's attempts use it."""
+    """Return the samples in a file of a trial. They are cached, because all attempts of the trial use this file."""
     try:
         status = path.stat()
     except OSError as error:
@@ -184,31 +186,33 @@ def _read_cached(path: Path, _mtime_ns: int, _size_bytes: int) -> Samples:
 
 
 def _offset_ns(sources: PositionSources, role: Role) -> int:
-    """Return the offset of a robot's clock from the laptop's, positive if it was ahead; 0 if it was not measured."""
+    """Return the offset of a robot's clock from the laptop's, positive if it is ahead; 0 if it was not measured."""
     return round(sources.clocks[role].offset_s * 1e9) if role in sources.clocks else 0
 
 
 def clock_offset_ns(evidence: AttemptEvidence, role: Role) -> int:
-    """Return the offset of a robot's clock from the laptop's, or 0; raises as `read_position_sources`."""
+    """Return the offset of a robot's clock from the laptop's, or 0 if unknown; raises as `read_position_sources`."""
     return _offset_ns(read_position_sources(evidence), role)
 
 
 def clock_error_s(evidence: AttemptEvidence) -> float | None:
-    """Return the maximum error between the times of two robots, or None if no clock offset was measured."""
-    errors = sorted(offset.error_s for offset in read_position_sources(evidence).clocks.values())
-    return sum(errors[-2:]) if errors else None
+    """Return the maximum error of a time difference between two robots; None if no clock offset was measured."""
+    errors_s = sorted(offset.error_s for offset in read_position_sources(evidence).clocks.values())
+    return sum(errors_s[-2:]) if errors_s else None
 
 
 def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Floats, Floats]:
-    """Return positions of two robots in metres. Unless `heights` is set, both are at the median height.
+    """Return ECEF positions of two robots in metres.
+
+    If `heights` is False, the median height is used for all positions.
 
     Raises:
-        EvidenceError: `heights` is set, and some heights are unknown.
+        EvidenceError: `heights` is True, and some heights are unknown.
     """
     heights_m = np.concatenate((source.values[:, 2], destination.values[:, 2]))
     known_heights_m = heights_m[np.isfinite(heights_m)]
     if heights and len(known_heights_m) < len(heights_m):
-        raise EvidenceError("heights are required, but some positions have none")
+        raise EvidenceError("heights are required, but some positions have no height")
     median_m = float(np.median(known_heights_m)) if len(known_heights_m) else 0.0
 
     def place_m(samples: Samples) -> Floats:
@@ -219,47 +223,48 @@ def _ecef_m(source: Samples, destination: Samples, *, heights: bool) -> tuple[Fl
 
 
 DRIFT: Final = 0.1
-"""Upper limit of odometry drift as a share of the path, for wheels that do not slip."""
+"""Maximum drift of odometry as a share of the path, for wheels that do not slip."""
 PLACE_M: Final = 0.5
 SATELLITE_M: Final = 10.0
-"""Largest position errors: `PLACE_M` of local positions, `SATELLITE_M` of a satellite receiver (5 m at each end of
-the path)."""
-_AROUND_NS: Final = 1_000_000_000
+"""Maximum errors of a distance: `PLACE_M` with local positions, `SATELLITE_M` with a satellite receiver (5 m at each
+end of the path)."""
+_MARGIN_NS: Final = 1_000_000_000
 
 
-def distance_contradiction(
-    evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, during_ns: tuple[int, int] | None
+def travel_contradiction(
+    evidence: AttemptEvidence, role: Role, farthest_m: float, speed_m_s: float, log_span_ns: tuple[int, int] | None
 ) -> str | None:
-    """Return the reason why a robot cannot have been `farthest_m` away from its start, or None if it can.
+    """Return the reason why a robot cannot have travelled `farthest_m` away from its start, or None if it can.
 
     Args:
         evidence: The attempt's evidence.
         role: The robot.
-        farthest_m: The robot's largest distance from its start by its log.
-        speed_m_s: Its speed.
-        during_ns: First and last time of that log by the robot's clock; None if it has no times.
+        farthest_m: Largest distance from the start according to the robot's log.
+        speed_m_s: Speed of the robot.
+        log_span_ns: First and last time of the log by the robot's clock; None if the log has no times.
     """
     track_samples = evidence.read_or_none(track.read, track.FILE) if evidence.has(track.FILE) else None
-    if track_samples is not None and during_ns is not None:
+    if track_samples is not None and log_span_ns is not None:
         places_m = [
             sample.position_m
             for sample in track_samples
             if sample.role is role
             and sample.position_m is not None
-            and during_ns[0] - _AROUND_NS <= sample.utc_ns <= during_ns[1] + _AROUND_NS
+            and log_span_ns[0] - _MARGIN_NS <= sample.utc_ns <= log_span_ns[1] + _MARGIN_NS
         ]
-        other_m = _from_first_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
+        other_m = _max_distance_m(np.array(places_m, dtype=float)) if len(places_m) > 1 else None
         tolerance_m = PLACE_M + DRIFT * farthest_m + speed_m_s
         if other_m is not None and abs(other_m - farthest_m) > tolerance_m:
-            return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_m:.1f} m by {track.FILE}"
+            other_text = f"{other_m:.1f} m according to {track.FILE}"
+            return f"it was {farthest_m:.1f} m from its start according to its odometry, but {other_text}"
     return _recorded_contradiction(evidence, role, farthest_m)
 
 
 def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: float) -> str | None:
     """Return the reason why recorded positions of a robot contradict the distance, or None if they do not.
 
-    The recording may cover more of the attempt than the movement does. A larger recorded distance is therefore valid,
-    a smaller one is not.
+    The recording may be longer than the movement. A larger recorded distance is therefore no contradiction, but a
+    smaller one is.
     """
     try:
         position_source = read_position_sources(evidence).robots.get(role)
@@ -268,17 +273,17 @@ def _recorded_contradiction(evidence: AttemptEvidence, role: Role, farthest_m: f
         samples = samples_of(evidence, role)
     except EvidenceError:
         return None
-    on_earth = samples.frame == WGS84
+    is_geodetic = samples.frame == WGS84
     north, east, up_m = samples.values.T
-    places_m = ecef_m(north, east, np.zeros(len(up_m))) if on_earth else samples.values
-    other_m = _from_first_m(places_m)
-    if farthest_m - other_m > (SATELLITE_M if on_earth else PLACE_M) + DRIFT * farthest_m:
-        other_text = f"{other_m:.1f} m by {position_source.description}"
-        return f"it was {farthest_m:.1f} m from its place by its odometry, and {other_text}"
+    places_m = ecef_m(north, east, np.zeros(len(up_m))) if is_geodetic else samples.values
+    other_m = _max_distance_m(places_m)
+    if farthest_m - other_m > (SATELLITE_M if is_geodetic else PLACE_M) + DRIFT * farthest_m:
+        other_text = f"{other_m:.1f} m according to {position_source.description}"
+        return f"it was {farthest_m:.1f} m from its start according to its odometry, but {other_text}"
     return None
 
 
-def _from_first_m(places_m: Floats | Sequence[Sequence[float]]) -> float:
-    """Return the largest distance from the first place. Shape (n, 3)."""
-    ground_m = np.asarray(places_m)
-    return float(np.linalg.norm(ground_m - ground_m[0], axis=1).max())
+def _max_distance_m(places_m: Floats | Sequence[Sequence[float]]) -> float:
+    """Return the largest distance from the first place. Shape of `places_m`: (n, 3)."""
+    positions_m = np.asarray(places_m)
+    return float(np.linalg.norm(positions_m - positions_m[0], axis=1).max())

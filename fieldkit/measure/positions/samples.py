@@ -1,4 +1,4 @@
-"""Samples of one robot's positions, the reader for CSV files from a lab's tracking system, conversion to metres."""
+"""Samples of one robot's positions, a reader for CSV files of a tracking system, and a conversion to metres."""
 
 import csv
 import math
@@ -18,11 +18,11 @@ from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence import reading
 
 PLACED: Final = "as placed"
-"""Frame of the procedure's placement: metres from the sender towards the receiver, and to the left."""
+"""Frame of the procedure's placement in metres: from the sender towards the receiver, and to the left."""
 WGS84: Final = "WGS 84"
 """Frame of latitude and longitude in degrees and height above the ellipsoid in metres."""
 LOCAL: Final = "metres"
-"""Frame of a file that gives metres from an unknown origin."""
+"""Frame of a file with metres from an unknown origin."""
 
 MAX_SAMPLES: Final = 1_000_000
 _MAX_NS: Final = 2**62
@@ -55,10 +55,10 @@ def require_increasing(times_ns: Sequence[int], where: Sequence[str]) -> None:
 
     Args:
         times_ns: The times.
-        where: Place of each time in its file, for the error.
+        where: Place of each time in its file, for the error message.
 
     Raises:
-        EvidenceError: There are no times; two are equal or in the wrong order; or one is out of range.
+        EvidenceError: There are no times, two times are equal or in the wrong order, or a time is out of range.
     """
     if not times_ns:
         raise EvidenceError("has no position with a time", remedy="export the track again, with times")
@@ -77,12 +77,12 @@ def require_increasing(times_ns: Sequence[int], where: Sequence[str]) -> None:
 def read_csv(path: Path) -> Samples:
     """Return the samples in a CSV file with times and positions.
 
-    The position columns are `x_m`, `y_m` and optionally `z_m`, or `lat`, `lon` and optionally `alt_m`. `t` is an
-    ISO 8601 time with a time zone; `t_s`, `t_ms`, `t_us` and `t_ns` are times since 1970 UTC. The suffix of
-    a length column is its unit. Other columns are ignored.
+    The position columns are `x_m`, `y_m` and optionally `z_m`, or `lat`, `lon` and optionally `alt_m`. The suffix of
+    a column of lengths is its unit. `t` is an ISO 8601 time with a time zone; `t_s`, `t_ms`, `t_us` and `t_ns` are
+    times since 1970 UTC. Other columns are ignored.
 
     Raises:
-        EvidenceError: The file is invalid; the error names file and line.
+        EvidenceError: The file is invalid; the error contains the file and the line.
     """
     rows = csv.reader(reading.text(path).removeprefix("\ufeff").splitlines(), strict=True)
     lines = _lines(rows, path)
@@ -97,7 +97,8 @@ def read_csv(path: Path) -> Samples:
         if len(row) != len(names):
             raise EvidenceError(f"has {len(row)} cells, but the header has {len(names)}", where=where)
         if len(values) == MAX_SAMPLES:
-            raise EvidenceError(f"has more than {MAX_SAMPLES} lines", where=str(path), remedy="cut it to the trial")
+            remedy = "remove the lines outside of the trial"
+            raise EvidenceError(f"has more than {MAX_SAMPLES} lines", where=str(path), remedy=remedy)
         times_ns.append(_time_ns(names[columns.time], row[columns.time].strip(), where))
         values.append(columns.value(row, where))
         line_places.append(where)
@@ -123,8 +124,8 @@ class _Columns:
     Attributes:
         frame: Frame of the positions.
         time: Index of the time column.
-        axes: For each axis the column's index, the factor to metres or degrees, and the largest valid value; None if
-            the file has no height column.
+        axes: For each axis, the column's index, the factor to metres or degrees, and the largest valid value. The
+            third axis is None if the file has no column for it.
     """
 
     frame: str
@@ -144,7 +145,7 @@ class _Columns:
             value = float(row[index]) * factor
         except ValueError:
             value = math.nan
-        if not abs(value) <= bound:  # also True for NaN
+        if not abs(value) <= bound:  # the condition is also true for NaN
             raise EvidenceError(
                 f"{row[index][:40]!r} is not a valid coordinate", where=where, remedy="correct or delete the line"
             )
@@ -165,7 +166,8 @@ def _columns(names: Sequence[str], where: str) -> _Columns:
         elif name.removesuffix("_deg") in _DEGREES:
             axes[name.removesuffix("_deg")] = (index, 1.0, _DEGREES[name.removesuffix("_deg")])
     remedy = (
-        "name columns t (with its zone) or t_s, and x_m, y_m, z_m or lat, lon, alt_m; see: fieldkit docs positions"
+        "name the columns t (with a time zone) or t_s, and x_m, y_m, z_m or lat, lon, alt_m; "
+        "see: fieldkit docs positions"
     )
     if len(times) != 1:
         raise EvidenceError(f"has {len(times)} time columns; one is needed", where=where, remedy=remedy)
@@ -180,7 +182,7 @@ def _time_ns(name: str, text: str, where: str) -> int:
     """Return a time in nanoseconds since 1970 UTC."""
     invalid = EvidenceError(f"{text[:40]!r} is not a time", where=where, remedy="write it as 2026-11-22T10:00:00.5Z")
     if name != "t":
-        if not _UNIX_TIME.fullmatch(text):  # also rejects 1.7e9: a time with an exponent lacks digits
+        if not _UNIX_TIME.fullmatch(text):  # also rejects times with an exponent, which have too few digits: 1.7e9
             raise invalid
         return round(Decimal(text) * _NS_PER[name])  # a float cannot represent nanoseconds since 1970
     try:
@@ -195,15 +197,15 @@ def _time_ns(name: str, text: str, where: str) -> int:
 
 
 def utc_ns(moment: datetime) -> int:
-    """Return an aware datetime as nanoseconds since 1970 UTC, without rounding errors."""
-    whole = moment.replace(microsecond=0)
-    return round(whole.timestamp()) * 10**9 + moment.microsecond * 1000
+    """Return a datetime with a time zone as nanoseconds since 1970 UTC, without rounding errors."""
+    whole_seconds = moment.replace(microsecond=0)
+    return round(whole_seconds.timestamp()) * 10**9 + moment.microsecond * 1000
 
 
 SEMI_MAJOR_M: Final = 6_378_137.0
 """Semi-major axis of the ellipsoid (NIMA TR8350.2, table 3.1)."""
 FLATTENING: Final = 1 / 298.257223563
-"""Flattening of the ellipsoid (the same table)."""
+"""Flattening of the ellipsoid (NIMA TR8350.2, table 3.1)."""
 
 _ECCENTRICITY_2: Final = FLATTENING * (2 - FLATTENING)
 
@@ -211,8 +213,8 @@ _ECCENTRICITY_2: Final = FLATTENING * (2 - FLATTENING)
 def ecef_m(latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> Floats:
     """Return earth-centred, earth-fixed coordinates in metres (ECEF; TR8350.2, equation 4-14).
 
-    The distance between two such points is the true length of the straight line between them. Over 1 km this line is
-    1 um shorter than the path along the ground: d^3 / 24 R^2.
+    The distance between two such points is the length of the straight line between them. Over a distance d = 1 km,
+    this line is shorter than the path along the ground by d^3 / (24 R^2) = 1 um.
 
     Args:
         latitude_deg: Degrees north. Shape (n,).

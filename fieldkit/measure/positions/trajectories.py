@@ -1,4 +1,4 @@
-"""Trajectories of robots: linear interpolation between samples of their positions, undefined in gaps."""
+"""Trajectories of robots: linear interpolation between samples of their positions, except in gaps."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,7 +10,7 @@ from fieldkit.measure.captures.arrays import Floats, Ints
 from fieldkit.measure.evidence.track import Separation
 
 SPEED_SPAN_NS: Final = 200_000_000
-"""Shortest time over which a speed is computed: over shorter times, noise in the positions would appear as speed."""
+"""Shortest time over which a speed is computed. Over a shorter time, noise of the positions would appear as speed."""
 
 _ALWAYS: Final = np.array([0, 2**62])
 _STRAIGHT: Final = 1e-6
@@ -23,7 +23,8 @@ class Trajectory:
     Attributes:
         times_ns: Times, increasing. Shape (n,).
         places_m: Positions in metres. Shape (n, 3).
-        gap_ns: If two samples are further apart in time, the position between them is unknown.
+        gap_ns: Longest time between two samples over which positions are interpolated. In longer gaps, the position
+            is unknown.
     """
 
     times_ns: Ints
@@ -31,7 +32,7 @@ class Trajectory:
     gap_ns: int
 
     def at_m(self, times_ns: Ints) -> Floats:
-        """Return interpolated positions at times from the first to the last sample. Shapes (m,) and (m, 3)."""
+        """Return interpolated positions, shape (m, 3), at times between the first and the last sample, shape (m,)."""
         base_ns = int(times_ns[0])  # a float cannot represent nanoseconds since 1970
         relative_ns, sample_ns = times_ns - base_ns, self.times_ns - base_ns
         return np.column_stack([np.interp(relative_ns, sample_ns, axis) for axis in self.places_m.T])
@@ -39,7 +40,7 @@ class Trajectory:
     def coverage_problem(self, start_ns: int, end_ns: int) -> str | None:
         """Return the reason why the trajectory does not cover a time span, or None if it does.
 
-        The subject of the sentence, "the positions ...", is added by the caller.
+        The reason has no subject: the caller prepends one, such as "the positions of the sender".
         """
         first, last = int(self.times_ns[0]), int(self.times_ns[-1])
         if start_ns < first:
@@ -50,12 +51,12 @@ class Trajectory:
         end = int(np.searchsorted(self.times_ns, end_ns, side="left"))
         widest_ns = int(np.diff(self.times_ns[begin : end + 1]).max(initial=0))
         if widest_ns > self.gap_ns:
-            return f"have a gap of {widest_ns / 1e9:.1f} s, and {self.gap_ns / 1e9:g} s are allowed"
+            return f"have a gap of {widest_ns / 1e9:.1f} s, but at most {self.gap_ns / 1e9:g} s are allowed"
         return None
 
 
 def stationary(place_m: Floats) -> Trajectory:
-    """Return the trajectory of a robot that does not move. Shape (3,)."""
+    """Return the trajectory of a robot that does not move from `place_m`, shape (3,)."""
     return Trajectory(_ALWAYS, np.array([place_m, place_m]), gap_ns=2**62)
 
 
@@ -63,14 +64,14 @@ def separation_between(source: Trajectory, destination: Trajectory, start_ns: in
     """Return the distances and speeds of two robots during a time span that both trajectories cover.
 
     Args:
-        source: The sender; its speed over the ground is also returned.
+        source: The sender, whose speed over the ground is also returned.
         destination: The receiver.
         start_ns: Start of the time span.
         end_ns: End of the time span.
     """
-    knots_ns = np.concatenate((source.times_ns, destination.times_ns))
-    inside_ns = knots_ns[(knots_ns > start_ns) & (knots_ns < end_ns)]
-    times_ns = np.unique(np.concatenate(((start_ns, end_ns), inside_ns)))
+    sample_times_ns = np.concatenate((source.times_ns, destination.times_ns))
+    inner_times_ns = sample_times_ns[(sample_times_ns > start_ns) & (sample_times_ns < end_ns)]
+    times_ns = np.unique(np.concatenate(((start_ns, end_ns), inner_times_ns)))
     between_m = destination.at_m(times_ns) - source.at_m(times_ns)
     distances_m = np.linalg.norm(between_m, axis=1)
     lengths_ns = np.diff(times_ns)
@@ -88,7 +89,7 @@ def separation_between(source: Trajectory, destination: Trajectory, start_ns: in
 
 
 def distances_m(source: Trajectory, destination: Trajectory) -> tuple[Ints, Floats]:
-    """Return all sample times covered by both trajectories, and the distance at each; shape (n,) each."""
+    """Return all sample times that both trajectories cover, and the distances at these times; both of shape (n,)."""
     start_ns = max(int(source.times_ns[0]), int(destination.times_ns[0]))
     end_ns = min(int(source.times_ns[-1]), int(destination.times_ns[-1]))
     times_ns = np.unique(np.concatenate((source.times_ns, destination.times_ns)))
@@ -99,7 +100,7 @@ def distances_m(source: Trajectory, destination: Trajectory) -> tuple[Ints, Floa
 
 
 def _nearest_m(begin: Floats, end: Floats) -> float:
-    """Return the smallest distance of a straight path from the origin."""
+    """Return the smallest distance between a straight path and the origin."""
     path = end - begin
     square = float(path @ path)
     share = min(max(-float(begin @ path) / square, 0.0), 1.0) if square > 0 else 0.0
@@ -109,8 +110,8 @@ def _nearest_m(begin: Floats, end: Floats) -> float:
 def _mean_m(begin: Floats, end: Floats) -> float:
     """Return the mean distance from the origin along a straight path at constant speed.
 
-    The integral of sqrt(w^2 + h^2), where w is the position along the path from its point nearest to the origin, and
-    h is that point's distance.
+    It is the integral of sqrt(w^2 + h^2) along the path, divided by the length of the path. h is the distance of the
+    point that is nearest to the origin, and w is the position along the path relative to this point.
     """
     path = end - begin
     length_m, first_m = float(np.linalg.norm(path)), float(np.linalg.norm(begin))
@@ -127,7 +128,10 @@ def _mean_m(begin: Floats, end: Floats) -> float:
 
 
 def _speed_m_s(robot: Trajectory, reference: Trajectory | None, start_ns: int, end_ns: int) -> float:
-    """Return the mean speed of a robot relative to `reference` or the ground, over `SPEED_SPAN_NS` or more."""
+    """Return the mean speed of a robot relative to `reference` or, if it is None, to the ground.
+
+    A time span shorter than `SPEED_SPAN_NS` is extended to this length if the trajectories cover it.
+    """
     missing_ns = max(SPEED_SPAN_NS - (end_ns - start_ns), 0) // 2
     trajectories = [trajectory for trajectory in (robot, reference) if trajectory is not None]
     first_ns = max(start_ns - missing_ns, *(int(trajectory.times_ns[0]) for trajectory in trajectories))

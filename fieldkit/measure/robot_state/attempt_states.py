@@ -1,6 +1,6 @@
-"""Measure the state of the robots before and after an attempt, and mark the attempt.
+"""Columns and marks of an attempt that follow from the states of the robots before and after it.
 
-Parsers are imported only if a robot has their source.
+A parser is imported only if a robot has the source that it parses.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,67 +25,84 @@ _Snapshots = Mapping[Role, tuple[Snapshot, Snapshot]]
 
 
 def measure(evidence: AttemptEvidence, names: Mapping[Role, str], measured: Measured) -> Measured:
-    """Return the columns of an attempt, with those of the robots' reports.
+    """Return the columns of an attempt, and the columns of the robots' states.
 
-    If a one-way delay is withheld because no offset of the clocks is known, its reason also names wrong clocks and
-    missing time sources.
+    If a one-way delay is withheld because the offset of the clocks is unknown, the reason also contains wrong clocks
+    and missing time sources.
 
     Args:
         evidence: The attempt.
         names: Name of the robot in each role.
-        measured: The columns of its steps.
+        measured: Columns of the attempt's steps.
     """
-    of_robots = {role: snapshots.of_attempt(evidence, role) for role in names}
-    of_clocks, clock_marks, has_clocks = _measure_clocks(evidence, names, of_robots, measured)
-    computers = {role: (health.parse(before), health.parse(after)) for role, (before, after) in of_robots.items()}
+    snapshots_by_role = {role: snapshots.read_attempt(evidence, role) for role in names}
+    clock_columns, clock_marks, has_clocks = _measure_clocks(evidence, names, snapshots_by_role, measured)
+    computers = {
+        role: (health.parse(before), health.parse(after)) for role, (before, after) in snapshots_by_role.items()
+    }
     flags = {role: health.flags_during(*states) for role, states in computers.items()}
-    of_radios, radio_marks, has_airtime = _measure_radios(names, of_robots)
+    radio_columns, radio_marks, has_airtime = _measure_radios(names, snapshots_by_role)
     all_marks = (*clock_marks, *health.marks(names, flags), *radio_marks)
     is_known = has_clocks or has_airtime or any(value is not None for value in flags.values())
-    measured = _with_clock_reasons(measured, "; ".join(mark.reason for mark in clock_marks)) | of_clocks | of_radios
+    measured = (
+        _with_clock_reasons(measured, "; ".join(mark.reason for mark in clock_marks)) | clock_columns | radio_columns
+    )
     for role in names:
         measured |= health.measure(role, *computers[role]) | Measured.all_missing(declare_columns(role), _NO_SOURCE)
     return measured | marks.measure(all_marks, is_known=is_known)
 
 
-def problems(evidence: AttemptEvidence, names: Mapping[Role, str]) -> Iterator[str]:
-    """Yield each reason why the states of the robots make an attempt void; arguments as for `measure`."""
+def problems(
+    evidence: AttemptEvidence, names: Mapping[Role, str], radios: Mapping[Role, Mapping[str, str]]
+) -> Iterator[str]:
+    """Yield each reason why the states of the robots make an attempt void.
+
+    Args:
+        evidence: The attempt.
+        names: Name of the robot in each role.
+        radios: Settings of the robots' radios at the start of the trial.
+    """
     for role, name in names.items():
-        pair = snapshots.of_attempt(evidence, role)
+        pair = snapshots.read_attempt(evidence, role)
         if any(RADIO_SOURCES & snapshot.keys() for snapshot in pair):
             from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (few robots have iw)
 
-            if reason := neighbourhood.channel_problem(tuple(map(neighbourhood.parse, pair))):
+            states = tuple(map(neighbourhood.parse, pair))
+            if reason := neighbourhood.setting_problem(states, radios.get(role, {})):
                 yield f"{name}: {reason}"
 
 
 def _measure_clocks(
-    evidence: AttemptEvidence, names: Mapping[Role, str], of_robots: _Snapshots, measured: Measured
+    evidence: AttemptEvidence, names: Mapping[Role, str], snapshots_by_role: _Snapshots, measured: Measured
 ) -> tuple[Measured, list[RepeatMark], bool]:
-    """Return the columns of the clocks, their marks, and whether a program reports on a clock."""
+    """Return the columns of the clocks, their marks, and True if a program reports on a clock."""
     offsets = {role: exchanges.laptop_offset(evidence, role) for role in names}
     result = Measured()
     for role, offset in offsets.items():
         result |= exchanges.measure(role, offset)
-    has_source = any(CLOCK_SOURCES & snapshot.keys() for pair in of_robots.values() for snapshot in pair)
+    has_source = any(CLOCK_SOURCES & snapshot.keys() for pair in snapshots_by_role.values() for snapshot in pair)
     if not has_source and not any(offset and exchanges.is_wrong(offset) for offset in offsets.values()):
         return result, [], False
     from fieldkit.measure.robot_state import clock_states  # noqa: PLC0415 (see the docstring)
 
-    robot_clocks = {role: clock_states.read(name, of_robots[role], offsets[role]) for role, name in names.items()}
+    robot_clocks = {
+        role: clock_states.read(name, snapshots_by_role[role], offsets[role]) for role, name in names.items()
+    }
     for role, clock in robot_clocks.items():
         result |= clock_states.measure(role, clock)
     is_known = any(clock.report is not None for clock in robot_clocks.values())
     return result, list(clock_states.marks(robot_clocks, measured)), is_known
 
 
-def _measure_radios(names: Mapping[Role, str], of_robots: _Snapshots) -> tuple[Measured, list[RepeatMark], bool]:
-    """Return the columns of the radios, their marks, and whether an airtime is known."""
-    if not any(RADIO_SOURCES & snapshot.keys() for pair in of_robots.values() for snapshot in pair):
+def _measure_radios(
+    names: Mapping[Role, str], snapshots_by_role: _Snapshots
+) -> tuple[Measured, list[RepeatMark], bool]:
+    """Return the columns of the radios, their marks, and True if an airtime is known."""
+    if not any(RADIO_SOURCES & snapshot.keys() for pair in snapshots_by_role.values() for snapshot in pair):
         return Measured(), [], False
     from fieldkit.measure.robot_state import neighbourhood  # noqa: PLC0415 (see the docstring)
 
-    radios = {role: tuple(map(neighbourhood.parse, pair)) for role, pair in of_robots.items()}
+    radios = {role: tuple(map(neighbourhood.parse, pair)) for role, pair in snapshots_by_role.items()}
     result = Measured()
     for role, states in radios.items():
         result |= neighbourhood.measure(role, states)

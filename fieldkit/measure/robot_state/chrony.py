@@ -1,12 +1,12 @@
-"""Parser of `chronyc -n -c tracking`, and of the same without `-c`.
+"""Parser of the output of `chronyc -n -c tracking` and `chronyc -n tracking`.
 
-The fields with `-c` are those of the report in its order (chronyc(1), `tracking`): reference ID, name or address,
-stratum, reference time, system time, last offset, RMS offset, frequency, residual frequency, skew, root delay, root
-dispersion, update interval, leap status. The system time is the correction that is not applied yet: with `-c` it is
-negative if the clock is fast, otherwise it has the word `fast` or `slow`. Its maximum error is root dispersion + root
-delay / 2 (chronyc(1)).
+The fields with `-c` have the order of the report (chronyc(1), `tracking`): reference ID, name or address, stratum,
+reference time, system time, last offset, RMS offset, frequency, residual frequency, skew, root delay, root
+dispersion, update interval, leap status. The system time is the correction that is not applied yet: with `-c`, it is
+negative if the clock is fast; without `-c`, the word `fast` or `slow` follows it. Its maximum error is root
+dispersion + root delay / 2 (chronyc(1)).
 
-Without a source, chronyd prints 0 as the system time, which is not an offset.
+If chronyd has no source, it prints 0 as the system time, which is not an offset.
 """
 
 import re
@@ -34,7 +34,7 @@ _NO_DAEMON: Final = "Cannot talk to daemon"
 
 
 def parse(output: SourceOutput) -> ClockReport:
-    """Return the report of chrony; its attribute `problem` states why there is no offset."""
+    """Return the report of chrony. If it has no offset, `problem` states the reason."""
     if _NO_DAEMON in output.text:
         return ClockReport(NAME, problem="chronyd does not run")
     if output.failure:

@@ -1,4 +1,4 @@
-"""The report of a program on a robot's clock, which the parsers of `chronyc`, `timedatectl` and `pmc` return."""
+"""Report of a program on a robot's clock. The parsers of `chronyc`, `timedatectl` and `pmc` return it."""
 
 from dataclasses import dataclass
 
@@ -8,11 +8,11 @@ class ClockReport:
     """Report of one program on the clock of its robot.
 
     Attributes:
-        program: Name of the program that sets the clock: `chrony`, `systemd-timesyncd` or `ptp4l`.
-        reference: Name or address of its time source; empty if it has none.
-        offset_s: Clock minus time source in seconds; None if unknown.
-        error_s: Maximum error of `offset_s` in seconds, if the time source is correct; None if unknown.
-        problem: Why the clock is not synchronized, such as `chrony has no source`; empty if it is.
+        program: Name of the program that sets the clock: `chrony`, `systemd-timesyncd` or `ptp4l`. reference: Name or
+        address of the time source; empty if there is no time source. offset_s: Clock minus time source in seconds;
+        None if unknown. error_s: Maximum error of `offset_s` in seconds if the time source is correct; None if
+        unknown. problem: Reason why the clock is not synchronized, such as `chrony has no source`; empty if it is
+        synchronized.
     """
 
     program: str
@@ -23,5 +23,5 @@ class ClockReport:
 
     @property
     def is_synchronized(self) -> bool:
-        """Whether the program has a time source and an offset from it."""
+        """True if the program has a time source and reports an offset from it."""
         return not self.problem and self.offset_s is not None

@@ -1,4 +1,4 @@
-"""Clocks of the robots in an attempt: reports of their programs, compared with the offsets that fieldkit measures."""
+"""Clocks of the robots in an attempt: reports of the robots' programs, and offsets that fieldkit measures."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,8 +25,8 @@ class RobotClock:
     """Clock of one robot in an attempt.
 
     Attributes:
-        name: The robot's name.
-        reports: Its chosen report before and after the attempt; a report is missing if no program gave one.
+        name: Name of the robot.
+        reports: Reports before and after the attempt (`choose_report`), without those that no program gave.
         laptop: Offset from the laptop's clock; None if unknown.
     """
 
@@ -36,7 +36,7 @@ class RobotClock:
 
     @property
     def report(self) -> ClockReport | None:
-        """The report that is least favourable: one with a problem, or with the larger possible offset."""
+        """The less favourable report: a report with a problem, or the one with the larger possible offset."""
         problems = [report for report in self.reports if not report.is_synchronized]
         return problems[0] if problems else max(self.reports, key=_largest_offset_s, default=None)
 
@@ -47,34 +47,34 @@ def _largest_offset_s(report: ClockReport) -> float:
 
 def reports(snapshot: Snapshot) -> tuple[ClockReport, ...]:
     """Return the reports of all programs in a snapshot."""
-    found: list[ClockReport | None] = []
+    parsed_reports: list[ClockReport | None] = []
     if (output := snapshot.get(chrony.NAME)) is not None:
-        found.append(chrony.parse(output))
+        parsed_reports.append(chrony.parse(output))
     if (output := snapshot.get(ptp.NAME)) is not None:
-        found.append(ptp.parse(output))
+        parsed_reports.append(ptp.parse(output))
     state = snapshot.get(timesyncd.STATE_NAME)
     if (output := snapshot.get(timesyncd.NAME)) is not None:
-        found.append(timesyncd.parse(output, state))
-    known = tuple(report for report in found if report is not None)
-    if not known and state is not None and timesyncd.is_synchronized(state) is False:
+        parsed_reports.append(timesyncd.parse(output, state))
+    program_reports = tuple(report for report in parsed_reports if report is not None)
+    if not program_reports and state is not None and timesyncd.is_synchronized(state) is False:
         return (ClockReport("", problem="no program synchronizes the clock"),)
-    return known
+    return program_reports
 
 
-def chosen(of_programs: Sequence[ClockReport]) -> ClockReport | None:
-    """Return the first report with a time source, or else the first one; None if there is none."""
-    return next((report for report in of_programs if report.is_synchronized), of_programs[0] if of_programs else None)
+def choose_report(candidates: Sequence[ClockReport]) -> ClockReport | None:
+    """Return the first report of a synchronized clock or, without one, the first report; None without reports."""
+    return next((report for report in candidates if report.is_synchronized), candidates[0] if candidates else None)
 
 
 def read(name: str, pair: Sequence[Snapshot], laptop: Offset | None) -> RobotClock:
     """Return the clock of a robot in an attempt.
 
     Args:
-        name: Its name.
-        pair: Its snapshots before and after the attempt.
-        laptop: Offset of its clock from the laptop's; None if unknown.
+        name: Name of the robot.
+        pair: Snapshots of the robot before and after the attempt.
+        laptop: Offset of the robot's clock from the laptop's; None if unknown.
     """
-    reports_of_pair = (chosen(reports(snapshot)) for snapshot in pair)
+    reports_of_pair = (choose_report(reports(snapshot)) for snapshot in pair)
     return RobotClock(name, tuple(report for report in reports_of_pair if report is not None), laptop)
 
 
@@ -107,7 +107,7 @@ def marks(clocks: Mapping[Role, RobotClock], measured: Measured) -> Iterator[Rep
 
 
 def wrong_clock(clock: RobotClock) -> str | None:
-    """Return a sentence on a clock that is wrong by more than `exchanges.WRONG_S`, or None if none is known."""
+    """Return a sentence if a clock is known to be wrong by more than `exchanges.WRONG_S`; otherwise None."""
     report = clock.report
     offset_s = None
     if clock.laptop is not None and exchanges.is_wrong(clock.laptop):
@@ -146,9 +146,9 @@ def contradiction(
     """Return a sentence if the reports of two robots contradict the measured offset between their clocks, or None.
 
     Args:
-        names: Names of the robots.
-        reports_of_pair: The report of each.
-        measured: Clock of the second minus clock of the first.
+        names: Names of the two robots.
+        reports_of_pair: Reports of the two robots; None for a robot without a report.
+        measured: Clock of the second robot minus clock of the first.
     """
     first, second = reports_of_pair
     if first is None or second is None or not (first.is_synchronized and second.is_synchronized):
@@ -159,11 +159,11 @@ def contradiction(
         return None
     return (
         f"the clocks of {names[0]} and {names[1]} differ by {measured.offset_s:+.3f} s "
-        f"(error {measured.error_s:.3f} s), but {_programs(first, second)} {reported_s:+.3f} s "
+        f"(error {measured.error_s:.3f} s), but {_programs_report(first, second)} {reported_s:+.3f} s "
         f"(error {error_s:.3f} s)"
     )
 
 
-def _programs(*of_robots: ClockReport) -> str:
-    names = list(dict.fromkeys(report.program for report in of_robots))
+def _programs_report(*reports: ClockReport) -> str:
+    names = list(dict.fromkeys(report.program for report in reports))
     return f"{names[0]} reports" if len(names) == 1 else f"{' and '.join(names)} report"

@@ -1,7 +1,7 @@
-"""Exchanges of time with each robot at the start of an attempt, over the control connection.
+"""Exchanges of time stamps with each robot at the start of an attempt, over the control connection.
 
-The laptop writes its clock before the request that creates the attempt's folder, and after the answer. The robot read
-its clock in between, and `ROLE-before.txt` contains these readings.
+A request creates the attempt's folder on the robot. The laptop records its clock before this request and after the
+response. Between these times, the robot reads its clock; `ROLE-before.txt` contains its readings.
 """
 
 import re
@@ -20,16 +20,16 @@ from fieldkit.measure.robot_clock import Offset
 FILE: Final = laptop_files.EXCHANGES
 
 WRONG_S: Final = 0.1
-"""Offset above which a clock is wrong: far above the errors of NTP, and visible in time stamps of topics."""
+"""Offset above which a clock is wrong. It is far above the errors of NTP, and visible in time stamps of topics."""
 
 _LINE: Final = re.compile(rf"({Role.PATTERN}) ([0-9]{{1,19}}) ([0-9]{{1,19}})", re.ASCII)
 
 Exchanges = Mapping[Role, tuple[int, int]]
-"""Laptop's clock before the request and after the answer, in nanoseconds since 1970 UTC, by role."""
+"""Laptop's clock before the request and after the response, in nanoseconds since 1970 UTC, by role."""
 
 
 def text(exchanges: Exchanges) -> str:
-    """Return the text of the file."""
+    """Return the text of the file with the exchanges."""
     return "".join(f"{role} {request_ns} {response_ns}\n" for role, (request_ns, response_ns) in exchanges.items())
 
 
@@ -61,7 +61,7 @@ def laptop_offset(evidence: AttemptEvidence, role: Role) -> Offset | None:
 
 
 def is_wrong(clock_offset: Offset) -> bool:
-    """Return True if an offset is above `WRONG_S` for any error."""
+    """Return True if an offset is above `WRONG_S`, whatever its error within the bounds is."""
     return abs(clock_offset.offset_s) - clock_offset.error_s > WRONG_S
 
 
@@ -71,4 +71,4 @@ def measure(role: Role, clock_offset: Offset | None) -> Measured:
         f"{role}_laptop_offset_s": None if clock_offset is None else clock_offset.offset_s,
         f"{role}_laptop_offset_error_s": None if clock_offset is None else clock_offset.error_s,
     }
-    return Measured.from_optional(values, "its clock was not read, or was set meanwhile")
+    return Measured.from_optional(values, "the robot's clock was not read, or was set during the reading")

@@ -1,9 +1,9 @@
 """State of a robot's computer: processor load, temperature, supply voltage, throttling, batteries and disk space.
 
 The source `health` prints lines of values from /proc, /sys and `df` (`fieldkit/remote/snapshot.sh`). `vcgencmd
-get_throttled` prints the flags of a Raspberry Pi: bit 0 under-voltage, 1 frequency capped, 2 throttled, 3 soft
-temperature limit; bits 16 to 19 are the same since the last boot (raspberrypi.com, "vcgencmd"). Its kernel reports
-under-voltage in the driver `rpi_volt` too.
+get_throttled` prints the flags of a Raspberry Pi: bit 0 is under-voltage, bit 1 frequency capped, bit 2 throttled,
+bit 3 soft temperature limit; bits 16 to 19 are the same flags since the last boot (raspberrypi.com, "vcgencmd"). The
+kernel driver `rpi_volt` also reports under-voltage.
 """
 
 import re
@@ -25,7 +25,7 @@ UNDER_VOLTAGE: Final = "under-voltage"
 THROTTLED: Final = "throttled"
 _FLAGS: Final = ("under-voltage", "frequency capped", "throttled", "soft temperature limit")
 _SINCE_BOOT: Final = 16
-"""Position of the first flag that is set since the last boot."""
+"""Position of the first of the flags since the last boot."""
 
 _HEX: Final = re.compile(r"throttled=0x([0-9a-fA-F]{1,8})", re.ASCII)
 _CPU: Final = re.compile(r"^cpu((?: +[0-9]{1,18}){4,12})$", re.MULTILINE | re.ASCII)
@@ -34,22 +34,22 @@ _BATTERY: Final = re.compile(r"^battery (?:([0-9]{1,3})|-) (?:([0-9]{1,9})|-)$",
 _ALARM: Final = re.compile(r"^undervoltage ([01])$", re.MULTILINE | re.ASCII)
 _DISK: Final = re.compile(r"^disk ([0-9]{1,13})$", re.MULTILINE | re.ASCII)
 _SENSOR_C: Final = (-60.0, 200.0)
-"""Range of plausible temperatures; drivers print other values for a sensor that is off."""
+"""Range of plausible temperatures. Drivers print values outside of it for a sensor that is switched off."""
 
 
 @dataclass(frozen=True)
 class Health:
-    """State of a robot's computer at one time; attributes are None if unknown.
+    """State of a robot's computer at one time. Unknown attributes are None.
 
     Attributes:
         busy_ticks: Processor time in use since boot, in clock ticks.
-        all_ticks: All processor time since boot, in clock ticks.
-        temperature_c: Highest temperature of its sensors in degrees Celsius.
-        flags: Flags of the present state as in `_FLAGS`.
-        earlier_flags: The same since boot.
-        battery_share: Lowest charge of its batteries.
-        battery_v: Lowest voltage of its batteries.
-        disk_free_bytes: Free space in the user's home.
+        all_ticks: Total processor time since boot, in clock ticks.
+        temperature_c: Highest temperature of the sensors in degrees Celsius.
+        flags: Flags that are set now, as named in `_FLAGS`.
+        earlier_flags: Flags that were set at any time since boot.
+        battery_share: Lowest charge of the batteries.
+        battery_v: Lowest voltage of the batteries.
+        disk_free_bytes: Free space in the user's home folder.
     """
 
     busy_ticks: int | None = None
@@ -76,7 +76,7 @@ def parse(snapshot: Snapshot) -> Health:
     disk = _DISK.search(text)
     now, earlier = _flags(snapshot)
     return Health(
-        # idle and iowait are the fourth and fifth value (proc(5)); guest time is contained in the first two.
+        # The fourth and fifth values are idle and iowait; the first two values include the guest time (proc(5)).
         busy_ticks=sum(ticks[:8]) - sum(ticks[3:5]) if ticks else None,
         all_ticks=sum(ticks[:8]) if ticks else None,
         temperature_c=max(plausible_c, default=None),
@@ -89,7 +89,7 @@ def parse(snapshot: Snapshot) -> Health:
 
 
 def _flags(snapshot: Snapshot) -> tuple[frozenset[str] | None, frozenset[str] | None]:
-    """Return the flags of the present state and of those since boot; None if the robot reports none."""
+    """Return the flags that are set now, and those that were set since boot; None for flags that are not reported."""
     output, health = snapshot.get(THROTTLED_NAME), snapshot.get(NAME)
     match = None if output is None or output.failure else _HEX.search(output.text)
     if match is not None:
@@ -106,7 +106,7 @@ def _flags(snapshot: Snapshot) -> tuple[frozenset[str] | None, frozenset[str] | 
 
 
 def flags_during(before: Health, after: Health) -> frozenset[str] | None:
-    """Return the flags that were set before or after the attempt, or since it began; None if they are unknown."""
+    """Return the flags that were set before, during or after the attempt; None if they are unknown."""
     if before.flags is None or after.flags is None:
         return None
     new = (after.earlier_flags or frozenset()) - (before.earlier_flags or frozenset())
@@ -116,8 +116,8 @@ def flags_during(before: Health, after: Health) -> frozenset[str] | None:
 def _busy_share(before: Health, after: Health) -> float | None:
     if before.busy_ticks is None or after.busy_ticks is None or before.all_ticks is None or after.all_ticks is None:
         return None
-    busy, passed = after.busy_ticks - before.busy_ticks, after.all_ticks - before.all_ticks
-    return busy / passed if 0 <= busy <= passed and passed > 0 else None
+    busy_ticks, all_ticks = after.busy_ticks - before.busy_ticks, after.all_ticks - before.all_ticks
+    return busy_ticks / all_ticks if 0 <= busy_ticks <= all_ticks and all_ticks > 0 else None
 
 
 def measure(role: Role, before: Health, after: Health) -> Measured:
@@ -137,9 +137,14 @@ def measure(role: Role, before: Health, after: Health) -> Measured:
 
 
 def marks(names: Mapping[Role, str], flags_by_role: Mapping[Role, frozenset[str] | None]) -> Iterator[RepeatMark]:
-    """Yield the marks that throttled computers cause, from name and result of `flags_during` of each robot."""
+    """Yield the marks of low supply voltages and throttled processors.
+
+    Args:
+        names: Name of the robot in each role.
+        flags_by_role: Results of `flags_during`.
+    """
     for role, flags in flags_by_role.items():
         if UNDER_VOLTAGE in (flags or ()):
             yield RepeatMark(UNDER_VOLTAGE, f"{names[role]}: the supply voltage is too low")
         if limits := [flag for flag in _FLAGS[1:] if flag in (flags or ())]:
-            yield RepeatMark(THROTTLED, f"{names[role]}: its processor is slowed down ({', '.join(limits)})")
+            yield RepeatMark(THROTTLED, f"{names[role]}: the processor is throttled ({', '.join(limits)})")

@@ -9,11 +9,11 @@ from fieldkit.measure.robot_state.state_columns import MARK_SEPARATOR, MARKS, NO
 
 @dataclass(frozen=True)
 class RepeatMark:
-    """One mark.
+    """Mark of a repeat.
 
     Attributes:
-        name: Its name in the column `marks`.
-        reason: A sentence with the name of the robot, without a full stop.
+        name: Name of the mark in the column `marks`.
+        reason: Sentence without a full stop that contains the name of the robot.
     """
 
     name: str
@@ -21,7 +21,12 @@ class RepeatMark:
 
 
 def measure(marks: Iterable[RepeatMark], *, is_known: bool) -> Measured:
-    """Return the columns of the marks; `is_known` if a source answered, so that the value without marks is `none`."""
+    """Return the columns of the marks.
+
+    Args:
+        marks: The marks.
+        is_known: True if a source of a robot answered. The value without marks is then `none`, otherwise it is empty.
+    """
     all_marks = list(marks)
     names = MARK_SEPARATOR.join(dict.fromkeys(mark.name for mark in all_marks))
     reasons = "; ".join(dict.fromkeys(mark.reason for mark in all_marks))

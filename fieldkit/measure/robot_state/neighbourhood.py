@@ -1,10 +1,10 @@
-"""Networks and airtime of others on the channel of a robot's radio, before and after an attempt, and its channel.
+"""Channel of a robot's radio before and after an attempt, and the networks and the airtime of others on this channel.
 
-`iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw); it
-sends no packet. Own networks have the state `associated` or `joined`, or the radio's own address. `iw dev INTERFACE
-survey dump` is printed twice, 0.5 s apart, while the robots send nothing for the attempt: the time in which the
-channel was busy, without own transmissions, is the airtime of others (and of own beacons). A driver that resets its
-counters gives no value.
+`iw dev INTERFACE scan freq MHZ passive` lists the networks that the radio receives on its channel (scan.c of iw),
+without sending packets. The robots' networks have the state `associated` or `joined`, or the address of the radio.
+`iw dev INTERFACE survey dump` is run twice, 0.5 s apart, while the robots send nothing for the attempt. The time in
+which the channel was busy, minus the radio's transmissions, is the airtime of others; it includes beacons of the
+robots' network. If a driver resets its counters, there is no value.
 """
 
 import re
@@ -26,9 +26,12 @@ SCAN_NAME: Final = "iw-scan"
 SURVEY_NAME: Final = "iw-survey"
 """Name of the source with two outputs of `iw dev INTERFACE survey dump`."""
 
+SETTINGS: Final = ("channel", "regulatory_domain")
+"""Settings of a radio that must not change during a trial."""
+
 BUSY_CHANNEL: Final = "busy channel"
 BUSY_SHARE: Final = 0.2
-"""Share of the airtime that others use above which a repeat is marked."""
+"""A repeat is marked if others use more than this share of the airtime."""
 
 _CHANNEL: Final = re.compile(
     r"^[ \t]*channel ([0-9]{1,3}) \(([0-9]{4,5})(?:\.[0-9])? MHz\), width: ([0-9]{1,3}) MHz(?: \(no HT\))?"
@@ -51,9 +54,9 @@ _IN_USE: Final = "[in use]"
 _SEPARATOR: Final = "=="
 """Line between the two outputs of the survey."""
 _STALE_MS: Final = 5000
-"""Age from which a network in the list of a scan was not received by this scan."""
+"""A network of this age or more in the list was received before this scan."""
 _HALF_WIDTH_MHZ: Final = 10.0
-"""Half of the width of the channel on which every network sends its beacons."""
+"""Half of the width of the 20 MHz channel on which a network sends its beacons."""
 
 
 @dataclass(frozen=True)
@@ -61,10 +64,10 @@ class WifiChannel:
     """Channel of a radio.
 
     Attributes:
-        number: Its number.
-        frequency_mhz: Centre of its primary channel of 20 MHz.
-        width_mhz: Its width.
-        centre_mhz: Its centre.
+        number: Channel number.
+        frequency_mhz: Centre frequency of the primary channel of 20 MHz.
+        width_mhz: Channel width.
+        centre_mhz: Centre frequency of the whole channel.
     """
 
     number: int
@@ -76,25 +79,31 @@ class WifiChannel:
         return f"{self.number} ({self.frequency_mhz} MHz), width {self.width_mhz} MHz"
 
     def overlaps(self, frequency_mhz: float) -> bool:
-        """Return True if the beacons of a network at this frequency are in the channel, at least in part."""
+        """Return True if the beacons of a network at this frequency overlap with the channel."""
         return abs(frequency_mhz - self.centre_mhz) < self.width_mhz / 2 + _HALF_WIDTH_MHZ
 
 
 @dataclass(frozen=True)
 class RadioState:
-    """State of a radio and its channel at one time; attributes are None if unknown.
+    """State of a radio and its channel at one time. Unknown attributes are None.
 
     Attributes:
         channel: Channel of the radio.
-        country: Regulatory domain: two letters of the country, `00` for the world.
-        signals_dbm: Received power of each network of others on the channel; None in it if it is not reported.
-        others_share: Share of the airtime that was busy without own transmissions.
+        country: Regulatory domain: two letters of the country, or `00` for the world.
+        signals_dbm: Received power of each network of others on the channel; None for a power that is not reported.
+        others_share: Share of the airtime in which the channel was busy, minus the radio's transmissions.
     """
 
     channel: WifiChannel | None = None
     country: str | None = None
     signals_dbm: tuple[float | None, ...] | None = None
     others_share: float | None = None
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """Its known settings, by the names in `SETTINGS`."""
+        values = (str(self.channel or ""), self.country or "")
+        return {name: value for name, value in zip(SETTINGS, values, strict=True) if value}
 
 
 def parse(snapshot: Snapshot) -> RadioState:
@@ -104,13 +113,13 @@ def parse(snapshot: Snapshot) -> RadioState:
         for name in (INFO_NAME, REGULATORY_NAME, SCAN_NAME, SURVEY_NAME)
     )
     channel = _channel(info)
-    own = _ADDRESS.search(info)
+    own_address = _ADDRESS.search(info)
     has_scan = (output := snapshot.get(SCAN_NAME)) is not None and output.failure is None and channel is not None
     country = _COUNTRY.search(regulatory)
     return RadioState(
         channel,
         country[1] if country else None,
-        _signals(scan, channel, own[1] if own else "") if has_scan and channel is not None else None,
+        _signals(scan, channel, own_address[1] if own_address else "") if has_scan and channel is not None else None,
         _others_share(survey),
     )
 
@@ -149,7 +158,7 @@ def _others_share(survey: str) -> float | None:
 
 
 def _times_ms(survey: str) -> Mapping[str, int] | None:
-    """Return the times of the channel in use; None if active or busy time is missing."""
+    """Return the times of the channel in use, or None if the active or busy time is missing."""
     for section in _SURVEY.split(survey)[1:]:
         if _IN_USE in section:
             times = {name: int(value) for name, value in _TIME.findall(section)}
@@ -158,7 +167,7 @@ def _times_ms(survey: str) -> Mapping[str, int] | None:
 
 
 def measure(role: Role, states: Sequence[RadioState]) -> Measured:
-    """Return the columns of the neighbourhood of the robot in a role; of several states the largest values."""
+    """Return the columns of the neighbourhood of the robot in a role: the largest values of several states."""
     channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
     countries = list(dict.fromkeys(state.country for state in states if state.country))
     counts = [len(state.signals_dbm) for state in states if state.signals_dbm is not None]
@@ -172,21 +181,28 @@ def measure(role: Role, states: Sequence[RadioState]) -> Measured:
         "others_airtime_share": max(shares, default=None),
     }
     prefixed = {f"{role}_{name}": value for name, value in values.items()}
-    return Measured.from_optional(prefixed, "its radio does not report it, or received no other network")
+    return Measured.from_optional(prefixed, "the robot's radio does not report it, or received no network of others")
 
 
-def channel_problem(states: Sequence[RadioState]) -> str | None:
-    """Return a sentence if the channel or the regulatory domain changed between two states, or None."""
-    channels = list(dict.fromkeys(str(state.channel) for state in states if state.channel))
-    countries = list(dict.fromkeys(state.country for state in states if state.country))
-    for what, values in (("channel", channels), ("regulatory domain", countries)):
+def setting_problem(states: Sequence[RadioState], at_start: Mapping[str, str]) -> str | None:
+    """Return a sentence if a setting of a radio changed, or None.
+
+    Args:
+        states: The radio before and after an attempt.
+        at_start: Its settings at the start of the trial; a missing one is not compared.
+    """
+    for name in SETTINGS:
+        label = name.replace("_", " ")
+        values = list(dict.fromkeys(state.settings[name] for state in states if name in state.settings))
         if len(values) > 1:
-            return f"the {what} of its radio changed during the repeat, from {values[0]} to {values[1]}"
+            return f"the {label} of its radio changed during the repeat, from {values[0]} to {values[1]}"
+        if values and values[0] != at_start.get(name, values[0]):
+            return f"the {label} of its radio is {values[0]}, but it was {at_start[name]} at the start of the trial"
     return None
 
 
 def marks(names: Mapping[Role, str], states_by_role: Mapping[Role, Sequence[RadioState]]) -> Iterator[RepeatMark]:
-    """Yield a mark for each robot on whose channel others use more airtime than `BUSY_SHARE`."""
+    """Yield a mark for each robot if others use more than `BUSY_SHARE` of the airtime on its channel."""
     for role, states in states_by_role.items():
         share = max((state.others_share or 0.0 for state in states), default=0.0)
         if share > BUSY_SHARE:

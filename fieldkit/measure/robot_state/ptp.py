@@ -1,8 +1,9 @@
-"""Parser of `pmc -u -b 0 'GET CURRENT_DATA_SET' 'GET TIME_STATUS_NP' 'GET PORT_DATA_SET'` of linuxptp.
+"""Parser of the output of `pmc -u -b 0 'GET CURRENT_DATA_SET' 'GET TIME_STATUS_NP' 'GET PORT_DATA_SET'` of linuxptp.
 
-Offsets and delays are in nanoseconds (pmc(8)). The error of the offset is at most the mean path delay, if all of it
-is in one direction. With hardware time stamps, the offset is that of the network card's clock, which phc2sys copies
-to the system clock. Only the first response of each kind is used, which is that of the local clock.
+Offsets and delays are in nanoseconds (pmc(8)). The error of the offset is at most the mean path delay; it has this
+value if the whole delay is in one direction. With hardware time stamps, the offset is that of the network adapter's
+clock, with which phc2sys synchronizes the system clock. Only the first response of each kind is used, which is that
+of the local clock.
 """
 
 import re
@@ -15,7 +16,7 @@ NAME: Final = "ptp"
 """Name of the source in a snapshot."""
 PROGRAM: Final = "ptp4l"
 
-# "MANAGMENT" in versions before 1.5.
+# Versions before 1.5 print "MANAGMENT".
 _RESPONSE: Final = re.compile(
     r"^[ \t]*\S{1,40} seq [0-9]{1,9} RESPONSE MANAGE?MENT ([A-Z_]{1,40})[ \t]*$", re.MULTILINE
 )
@@ -25,7 +26,7 @@ _CLOCK: Final = re.compile(r"[0-9a-f]{6}\.[0-9a-f]{4}\.[0-9a-f]{6}", re.ASCII)
 
 
 def parse(output: SourceOutput) -> ClockReport:
-    """Return the report of ptp4l; its attribute `problem` states why there is no offset."""
+    """Return the report of ptp4l. If it has no offset, `problem` states the reason."""
     if output.failure:
         return ClockReport(PROGRAM, problem=f"pmc {output.failure}")
     sections: dict[str, dict[str, str]] = {}
@@ -50,7 +51,7 @@ def parse(output: SourceOutput) -> ClockReport:
 
 
 def _problem(state: str, *, has_master: bool) -> str:
-    """Return why the clock is not synchronized, from the state of the port; empty if it is."""
+    """Return the reason why the clock is not synchronized, or an empty text if it is."""
     if state in {"MASTER", "GRAND_MASTER"}:
         return "ptp4l has no source and serves its own clock"
     if not has_master:

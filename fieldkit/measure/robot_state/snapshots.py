@@ -1,8 +1,8 @@
-"""Snapshots of a robot's sources: the outputs of its programs on its clock and computer at one time.
+"""Snapshots of a robot's sources: outputs of programs that report the state of its clock and computer at one time.
 
-`fieldkit/remote/snapshot.sh` has the command of each source, and writes a snapshot: a line `==> NAME <==` per source,
-then the lines of its output, each after a blank, and ` code CODE` as the last line. A source whose program
-the robot does not have is missing.
+`fieldkit/remote/snapshot.sh` runs the command of each source and writes the snapshot. For each source, it contains a
+line `==> NAME <==`, the lines of the output, each after a blank, and the line ` code CODE`. A source is missing if
+the robot does not have its program.
 """
 
 import re
@@ -18,9 +18,9 @@ from fieldkit.measure.evidence import reading
 _HEADER: Final = re.compile(r"==> ([a-z][a-z0-9-]{0,30}) <==", re.ASCII)
 _CODE: Final = re.compile(r" code ([0-9]{1,3})", re.ASCII)
 _FAILURES: Final = {None: "was interrupted", 137: "did not answer in time", 153: "printed too much"}
-"""Failure by exit code: 128 plus SIGKILL or SIGXFSZ."""
+"""Failure by exit code. 137 and 153 are 128 plus SIGKILL and SIGXFSZ."""
 _NOT_EXECUTABLE: Final = (126, 127)
-"""Exit codes of a program that cannot be started: BusyBox finds files that are not executable."""
+"""Exit codes of a program that cannot be started. 126 occurs because BusyBox finds files that are not executable."""
 MAX_SOURCES: Final = 50
 
 
@@ -29,8 +29,8 @@ class SourceOutput:
     """Output of one source.
 
     Attributes:
-        text: Its standard output and standard error.
-        code: Its exit code; None if the snapshot was interrupted.
+        text: Standard output and standard error.
+        code: Exit code; None if the snapshot was interrupted.
     """
 
     text: str
@@ -65,14 +65,14 @@ def read(path: Path) -> Snapshot:
     return parse(reading.text(path))
 
 
-def of_attempt(evidence: AttemptEvidence, role: Role) -> tuple[Snapshot, Snapshot]:
-    """Return the snapshots of a robot before and after an attempt; a missing one is empty."""
+def read_attempt(evidence: AttemptEvidence, role: Role) -> tuple[Snapshot, Snapshot]:
+    """Return the snapshots of a robot before and after an attempt. A missing snapshot is empty."""
     before, after = (evidence.read_or_none(read, file(role)) or {} for file in (before_file, after_file))
     return before, after
 
 
 def parse(text: str) -> Snapshot:
-    """Return the outputs in the text of a snapshot. If several have the same name, the first is used."""
+    """Return the outputs in the text of a snapshot. If a source occurs several times, the first output is used."""
     outputs: dict[str, SourceOutput] = {}
     name, lines = "", list[str]()
 

@@ -1,6 +1,6 @@
-"""Columns of the robots' reports on their state, and the marks of a repeat.
+"""Columns of the robots' states, and of the marks of a repeat.
 
-A mark names a condition that can explain a difference between repeats. A marked repeat is valid.
+A mark is the name of a condition that can explain a difference between repeats. A repeat with marks is valid.
 """
 
 from typing import Final
@@ -10,7 +10,7 @@ from fieldkit.core.columns import BACKGROUND, CLOCK_DIFFERENCE_BOUNDS_S, Column,
 MARKS: Final = "marks"
 MARK_SEPARATOR: Final = " and "
 NO_MARKS: Final = "none"
-"""Value of the column `marks` if sources of the robots answered and report nothing that needs a mark."""
+"""Value of the column `marks` if sources of the robots answered, and none of their reports causes a mark."""
 
 MARK_COLUMNS: Final = columns(
     160,
@@ -19,8 +19,8 @@ MARK_COLUMNS: Final = columns(
         "text",
         (
             "Conditions of the robots that can explain a difference between repeats, joined by `and`: wrong clock, "
-            "no time source, clocks disagree, under-voltage, throttled, busy channel. `none` if the robots report "
-            "none; empty if no robot has a program that reports any."
+            "no time source, clocks disagree, under-voltage, throttled, busy channel. `none` if no condition was "
+            "reported; empty if no robot has a program that reports conditions."
         ),
         Figure("marks", Kind.WORDS, rank=BACKGROUND + 10),
     ),
@@ -36,30 +36,30 @@ def declare_columns(role: str) -> tuple[Column, ...]:
             f"{role}_time_source",
             "text",
             (
-                f"Program that sets the clock of the {role}, and its time source: `chrony 10.0.0.1`. Empty if it has "
-                "no source."
+                f"Program that sets the clock of the {role}, and its time source, such as `chrony 10.0.0.1`. Empty "
+                "without a time source."
             ),
         ),
         (
             f"{role}_time_offset_s",
             "s",
             (
-                f"Clock of the {role} minus its time source, reported by that program before or after the repeat, "
-                "whichever may be larger. Empty if it has no source."
+                f"Clock of the {role} minus its time source, as reported by this program: the larger of the values "
+                "before and after the repeat. Empty without a time source."
             ),
             CLOCK_DIFFERENCE_BOUNDS_S,
         ),
         (
             f"{role}_time_error_s",
             "s",
-            f"Maximum error of {role}_time_offset_s, reported by that program, if the time source is correct.",
+            f"Maximum error of {role}_time_offset_s as reported by this program, if the time source is correct.",
         ),
         (
             f"{role}_laptop_offset_s",
             "s",
             (
-                f"Clock of the {role} minus the laptop's at the start of the repeat, from one exchange over the "
-                "control connection."
+                f"Clock of the {role} minus the laptop's clock at the start of the repeat, from one exchange of time "
+                "stamps over the control connection."
             ),
             CLOCK_DIFFERENCE_BOUNDS_S,
         ),
@@ -67,7 +67,7 @@ def declare_columns(role: str) -> tuple[Column, ...]:
         (
             f"{role}_cpu_share",
             "share",
-            f"Share of the processor time of the {role} that was in use during the repeat, by all programs.",
+            f"Share of the processor time of the {role} that all programs used during the repeat.",
         ),
         (
             f"{role}_temperature_c",
@@ -79,8 +79,8 @@ def declare_columns(role: str) -> tuple[Column, ...]:
             f"{role}_power_state",
             "text",
             (
-                f"Limits of the processor of the {role} during the repeat: under-voltage, frequency capped, "
-                "throttled, soft temperature limit; `normal` without one. Empty if it is not a Raspberry Pi."
+                f"Conditions of the processor of the {role} during the repeat: under-voltage, frequency capped, "
+                "throttled, soft temperature limit; `normal` without these. Empty if it is not a Raspberry Pi."
             ),
         ),
         (f"{role}_battery_share", "share", f"Lowest charge of the batteries of the {role} after the repeat."),
@@ -93,26 +93,26 @@ def declare_columns(role: str) -> tuple[Column, ...]:
         (
             f"{role}_regulatory_domain",
             "text",
-            f"Regulatory domain of the radio of the {role}: two letters of the country, `00` for the world.",
+            f"Regulatory domain of the radio of the {role}: two letters of the country, or `00` for the world.",
         ),
         (
             f"{role}_other_networks",
             "count",
-            f"Networks of others that the {role} receives on its channel, the larger number of before and after.",
+            f"Networks of others that the {role} receives on its channel: the larger number of before and after.",
         ),
         (
             f"{role}_other_networks_max_dbm",
             "dBm",
-            f"Strongest signal of these networks at the {role}; empty without such a network.",
+            f"Strongest signal of these networks at the {role}; empty if it receives no such network.",
             (-300.0, 100.0),
         ),
         (
             f"{role}_others_airtime_share",
             "share",
             (
-                f"Share of the airtime at the {role} that is busy without its own transmissions, in 0.5 s before and "
-                "after the repeat; the larger one."
+                f"Share of the airtime that others use on the channel of the {role}: the larger of the shares in "
+                "0.5 s before and 0.5 s after the repeat."
             ),
         ),
-        (f"{role}_disk_free_bytes", "B", f"Free disk space in the home of the {role} after the repeat."),
+        (f"{role}_disk_free_bytes", "B", f"Free disk space in the home folder of the {role} after the repeat."),
     )

@@ -1,8 +1,8 @@
-"""Parsers of `timedatectl timesync-status` and `timedatectl show` (systemd 239 and later).
+"""Parsers of the output of `timedatectl timesync-status` and `timedatectl show` (systemd 239 and later).
 
 `Offset` is the time of the server minus the clock at the last poll; timesyncd then corrects the clock by this amount.
-The present offset is therefore between the negative of it and 0. `Root distance` is the maximum error of the server;
-half of the round trip (`Delay`) is added (RFC 5905, section 11.2).
+The present offset of the clock is therefore between `-Offset` and 0. Its maximum error is the sum of `Root distance`,
+the maximum error of the server, half of the round trip (`Delay`; RFC 5905, section 11.2), and the correction itself.
 """
 
 import re
@@ -40,7 +40,7 @@ _NTP: Final = re.compile(r"^NTP=(yes|no)$", re.MULTILINE)
 
 
 def parse(status: SourceOutput, state: SourceOutput | None) -> ClockReport | None:
-    """Return the report of systemd-timesyncd; None if it is not in use.
+    """Return the report of systemd-timesyncd, or None if timesyncd is not in use.
 
     Args:
         status: Output of `timedatectl timesync-status`.
@@ -48,7 +48,7 @@ def parse(status: SourceOutput, state: SourceOutput | None) -> ClockReport | Non
     """
     if status.failure and state is not None and not state.failure:
         ntp = _NTP.search(state.text)
-        if ntp is None or ntp[1] == "no":  # it is disabled, and another program may set the clock
+        if ntp is None or ntp[1] == "no":  # timesyncd is disabled, and another program may set the clock
             return None
     if status.failure:
         return ClockReport(PROGRAM, problem=f"timedatectl {status.failure}")
@@ -68,7 +68,7 @@ def parse(status: SourceOutput, state: SourceOutput | None) -> ClockReport | Non
 
 
 def span_s(text: str) -> float | None:
-    """Return a time span such as `-1.087495s`, `2min 3s` or `0` in seconds; None if it is not a time span."""
+    """Return a time span such as `-1.087495s`, `2min 3s` or `0` in seconds; None if the text is not a time span."""
     text = text.strip()
     if text in {"0", "+0", "-0"}:
         return 0.0
@@ -82,6 +82,10 @@ def span_s(text: str) -> float | None:
 
 
 def is_synchronized(state: SourceOutput) -> bool | None:
-    """Return whether the kernel's clock is synchronized by any program, from `timedatectl show`; None if unknown."""
+    """Return True if any program synchronizes the kernel's clock; None if unknown.
+
+    Args:
+        state: Output of `timedatectl show`.
+    """
     match = None if state.failure else _SYNCHRONIZED.search(state.text)
     return None if match is None else match[1] == "yes"

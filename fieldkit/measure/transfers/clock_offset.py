@@ -1,20 +1,20 @@
 """Estimate of the offset between the receiver's and the sender's clock, from packets in both captures.
 
 No packet arrives before it was sent. The offset is therefore at most the apparent delay of any packet to the
-receiver, and at least the negative apparent delay of any packet from the receiver. With constant drift the offset is
-a straight line over time, and every line below all upper bounds and above all lower bounds is possible (Duda et al.,
-"Estimating global time in distributed systems", ICDCS 1987; the convex hulls are as in Moon, Skelly and Towsley,
-"Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). The captures contain no more
-information: the division of a round trip into its two directions is unobservable (Paxson, "On calibrating
+receiver, and at least the negative apparent delay of any packet from the receiver. If the drift is constant, the
+offset is a straight line over time, and every line below all upper bounds and above all lower bounds is possible
+(Duda et al., "Estimating global time in distributed systems", ICDCS 1987; the convex hulls are as in Moon, Skelly and
+Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999). The captures contain
+no more information: the division of a round trip into its two directions cannot be observed (Paxson, "On calibrating
 measurements of packet transit times", SIGMETRICS 1998).
 
-A single wrong time stamp can exclude the true line. Therefore a line counts as possible if it violates the bound of
-at most one packet: the true line is one of them if one time stamp is wrong, by any amount. This is the intersection
-algorithm of Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905, section
-11.2.1) with at most one faulty source, where each packet is a source. The possible lines are all lines in the
-polygons that result if one packet is left out; only packets on the convex hulls change the polygon. No smaller set of
-lines is sufficient, because each of these lines can be the true one if the time stamp of the packet that was left out
-is wrong.
+A single wrong time stamp can exclude the true line. A line is therefore considered possible if it violates the bound
+of at most one packet. The true line is then possible even if one time stamp is wrong by any amount. This is the
+intersection algorithm of Marzullo and Owicki ("Maintaining the time in a distributed system", PODC 1983; RFC 5905,
+section 11.2.1) with at most one faulty source, where each packet is a source. The possible lines are the lines in the
+polygons that result if any one packet is omitted; only packets on the convex hulls change the polygon. No smaller set
+of lines is sufficient, because each of these lines can be the true one if the time stamp of the omitted packet is
+wrong.
 """
 
 from collections.abc import Sequence
@@ -31,12 +31,12 @@ MAX_SKEW: Final = 500e-6
 """
 
 QUARTZ_SKEW: Final = 100e-6
-"""Usual upper limit of the skew of two quartz clocks. If the range of possible skews is wider than this, the packets
-do not determine the skew.
+"""Usual upper limit of the skew between two quartz clocks. If the range of possible skews is wider than this, the
+packets are not sufficient to estimate the skew.
 """
 
 STAMP_S: Final = 1e-6
-"""tcpdump truncates times to microseconds, so the difference of two times is wrong by up to this."""
+"""Maximum error of the difference of two times: tcpdump truncates times to microseconds."""
 
 _HULL_POINTS: Final = 1024
 
@@ -56,19 +56,20 @@ class StampPairs(Table):
 
 @dataclass(frozen=True, eq=False)
 class Clocks:
-    """Offset of the receiver's clock from the sender's over time: the best line, and the range of possible lines.
+    """Offset of the receiver's clock from the sender's over time: the estimated line and the range of possible lines.
 
-    Offsets are relative to `base_ns`, which keeps precision if clocks are decades apart. Times are seconds from
-    `middle_ns`. If a direction has a single packet, no other packet confirms its time, and the error is infinite.
+    Offsets are relative to `base_ns`, so that they are precise even if the clocks differ by decades. Times are in
+    seconds relative to `middle_ns`. If a direction has a single packet, no other packet confirms its time, and the
+    error is infinite.
 
     Attributes:
         middle_ns: Middle of the packets' times by the receiver's clock.
         base_ns: Integer part of the offset.
-        offset_s: Best estimate of the remaining offset at `middle_ns`.
-        skew: Best estimate of the skew: relative rate of the receiver's clock minus 1, in seconds per second.
+        offset_s: Estimate of the remaining offset at `middle_ns`.
+        skew: Estimate of the skew: relative rate of the receiver's clock minus 1, in seconds per second.
         skews: Skews at the corners of the polygons of possible lines, ascending. Shape (k,).
-        lowest_s: Lowest offset at `middle_ns` for each of these skews in its polygon. Shape (k,).
-        highest_s: Highest offset at `middle_ns` for each of these skews in its polygon. Shape (k,).
+        lowest_s: Lowest possible offset at `middle_ns` for each of these skews. Shape (k,).
+        highest_s: Highest possible offset at `middle_ns` for each of these skews. Shape (k,).
     """
 
     middle_ns: int
@@ -89,7 +90,7 @@ class Clocks:
         return self.offset_s + self.skew * self._elapsed_s(receiver_ns)
 
     def delays_s(self, sender_ns: Ints, receiver_ns: Ints) -> Floats:
-        """Return the one-way delays of packets from sender to receiver; each time is by the clock of its robot."""
+        """Return the one-way delays of packets from sender to receiver, given the times by each robot's clock."""
         return (receiver_ns - sender_ns - self.base_ns) / 1e9 - self.offset_at_s(receiver_ns)
 
     def error_s(self, receiver_ns: Ints) -> float:
@@ -108,13 +109,13 @@ class Clocks:
 def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
     """Return the offset between the clocks, or None if no line fits all packets because a clock was set.
 
-    The chosen skew maximizes the shortest round-trip time, computed without the fastest packet of each direction. If
-    both directions had undelayed packets early and late, any other skew shortens this time. Among equally good skews
-    the smallest is chosen. If the range of possible skews is wider than `QUARTZ_SKEW`, the smallest possible skew is
-    chosen. The offset is the middle of the range that is possible with this skew.
+    The estimated skew maximizes the shortest round-trip time, computed without the fastest packet of each direction.
+    If both directions have undelayed packets at the start and at the end, any other skew gives a shorter time. Of
+    equally good skews, the smallest one is used. If the range of possible skews is wider than `QUARTZ_SKEW`, the
+    smallest possible skew is used. The offset is the middle of the range that is possible with this skew.
 
     Args:
-        forward: Packets from sender to receiver, at least one, each frame in one pair only.
+        forward: Packets from sender to receiver, at least one. A frame is in one pair only.
         reverse: Packets from receiver to sender, under the same conditions.
     """
     times = np.concatenate((forward.receiver_ns, reverse.receiver_ns))
@@ -138,7 +139,7 @@ def estimate(forward: StampPairs, reverse: StampPairs) -> Clocks | None:
 
 
 def _best_skew(ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], first: float, last: float) -> float:
-    """Return the skew of the best line.
+    """Return the estimated skew.
 
     Args:
         ceilings: Hulls of packets from sender to receiver, from `_Hull.of_all_but_one`.
@@ -163,7 +164,7 @@ def _range(ceiling: "_Hull", floor: "_Hull", skews: Floats) -> tuple[Floats, Flo
 def _range_without_fastest(
     ceilings: Sequence["_Hull"], floors: Sequence["_Hull"], skews: Floats
 ) -> tuple[Floats, Floats]:
-    """Return the lowest and the highest offset with each skew if the fastest packet of each direction is left out."""
+    """Return the lowest and the highest offset with each skew if the fastest packet of each direction is omitted."""
     return (
         np.min([_range(ceilings[0], floor, skews)[0] for floor in floors], axis=0),
         np.max([_range(ceiling, floors[0], skews)[1] for ceiling in ceilings], axis=0),
@@ -171,7 +172,10 @@ def _range_without_fastest(
 
 
 def _polygon(ceiling: "_Hull", floor: "_Hull") -> Floats | None:
-    """Return the lines between two hulls: skews, lowest and highest offsets of the corners; None if there is none."""
+    """Return the corners of the polygon of lines between two hulls, or None if there is no such line.
+
+    The rows are skews, lowest offsets and highest offsets.
+    """
     slopes = np.concatenate(((-MAX_SKEW, MAX_SKEW), ceiling.slopes(), -floor.slopes()))
     skews = np.unique(np.clip(slopes, -MAX_SKEW, MAX_SKEW))
     lowest_s, highest_s = _range(ceiling, floor, skews)
@@ -184,12 +188,12 @@ def _polygon(ceiling: "_Hull", floor: "_Hull") -> Floats | None:
 
 
 def _points(pairs: StampPairs, middle_ns: int, base_ns: int) -> tuple[Floats, Floats]:
-    """Return times and the apparent offset of the receiver's clock."""
+    """Return times in seconds and the apparent offsets of the receiver's clock at these times in seconds."""
     return (pairs.receiver_ns - middle_ns) / 1e9, (pairs.receiver_ns - pairs.sender_ns - base_ns) / 1e9
 
 
 def _possible_skews(skews: Floats, width_s: Floats) -> tuple[float, float]:
-    """Return the range of skews in which `width_s`, concave and linear between `skews`, is not negative."""
+    """Return the range of skews in which `width_s` is not negative; it is concave, and linear between the skews."""
     peak = int(width_s.argmax())
     rising, falling = slice(None, peak + 1), slice(None, peak - 1 if peak else None, -1)
     return (
@@ -200,31 +204,31 @@ def _possible_skews(skews: Floats, width_s: Floats) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Hull:
-    """Lower convex hull of points, or of a sample of them; without points, every line is below it."""
+    """Lower convex hull of points, or of a selection of them. Without points, every line is below the hull."""
 
     x: Floats
     y: Floats
 
     @classmethod
     def of_all_but_one(cls, x: Floats, y: Floats) -> list[Self]:
-        """Return the hull of at most `_HULL_POINTS` points, then the hull without each of its points.
+        """Return the hull of at most `_HULL_POINTS` points, then a hull for each of its points that omits this point.
 
-        The points are the lowest of each group of neighbours. Omitted points can only raise the hull, so no possible
-        line is excluded.
+        The points are the lowest points of groups of neighbours. Omitting the other points can only raise the hull,
+        so no possible line is excluded.
         """
         size = -(-len(x) // _HULL_POINTS)
-        runs = np.append(y, np.full(-len(y) % size, np.inf)).reshape(-1, size)
-        lowest = runs.argmin(axis=1) + np.arange(len(runs)) * size
+        groups = np.append(y, np.full(-len(y) % size, np.inf)).reshape(-1, size)
+        lowest = groups.argmin(axis=1) + np.arange(len(groups)) * size
         points = sorted(zip(x[lowest].tolist(), y[lowest].tolist(), strict=True))
         outer = _lower_hull(points)
         on_hull = set(outer)
-        # If a point of this hull is left out, only points of the hull of all other points can be added to the hull.
+        # If a point of this hull is omitted, only points of the hull of the inner points can be added to the hull.
         inner_points = [point for index, point in enumerate(points) if index not in on_hull]
         inner_hull = [inner_points[index] for index in _lower_hull(inner_points)]
         hulls = [[points[index] for index in outer]]
-        for left_out in outer:
-            rest = sorted([points[index] for index in outer if index != left_out] + inner_hull)
-            hulls.append([rest[index] for index in _lower_hull(rest)])
+        for omitted in outer:
+            other_points = sorted([points[index] for index in outer if index != omitted] + inner_hull)
+            hulls.append([other_points[index] for index in _lower_hull(other_points)])
         return [cls(*np.array(hull).reshape(-1, 2).T) for hull in hulls]
 
     def slopes(self) -> Floats:
@@ -233,7 +237,7 @@ class _Hull:
         return slopes
 
     def intercepts(self, slopes: Floats) -> Floats:
-        """Return the intercepts at x = 0 of the lines with these slopes that touch the hull from below."""
+        """Return the intercepts at x = 0 of the lines that touch the hull from below and have these slopes."""
         intercepts: Floats = (self.y[:, None] - np.outer(self.x, slopes)).min(axis=0, initial=np.inf)
         return intercepts
 

@@ -23,8 +23,8 @@ COLUMNS: Final = columns(
         "one_way_min_s",
         "s",
         (
-            "Smallest one-way delay of the transfer's packets from one capture to the other (TCP: frames with "
-            "payload). Each one-way delay is empty if one_way_error_s is above a tenth of it."
+            "Smallest one-way delay of the transfer's packets between the two captures (TCP: frames with payload). "
+            "A column of one-way delays is empty if one_way_error_s is above a tenth of its value."
         ),
     ),
     (
@@ -35,19 +35,19 @@ COLUMNS: Final = columns(
     ),
     ("one_way_mean_s", "s", "Mean one-way delay; empty as for one_way_min_s."),
     ("one_way_p95_s", "s", "95th percentile of the one-way delay; empty as for one_way_min_s."),
-    ("one_way_error_s", "s", "Maximum error of each one-way delay that is caused by the clocks."),
+    ("one_way_error_s", "s", "Maximum error of the one-way delays that is caused by the clocks."),
     ("one_way_withheld", "text", "Reason why one-way delays are empty; empty if all of them have a value."),
     (
         "delay_variation_median_s",
         "s",
-        "Median delay of the transfer's packets relative to the fastest, which needs no common clock (RFC 5481).",
+        "Median delay of the transfer's packets relative to the fastest packet; needs no common clock (RFC 5481).",
         Figure("delay variation", Kind.MEDIAN, rank=32),
     ),
     ("delay_variation_p95_s", "s", "95th percentile of the delay relative to the fastest packet (RFC 5481)."),
     (
         "jitter_s",
         "s",
-        "Interarrival jitter of the transfer's packets, after the last one (RFC 3550, section 6.4.1).",
+        "Interarrival jitter of the transfer's packets after the last packet (RFC 3550, section 6.4.1).",
         Figure("last jitter value (RFC 3550)", Kind.MEDIAN, rank=33),
     ),
     (
@@ -61,8 +61,8 @@ COLUMNS: Final = columns(
         "clock_skew_ppm",
         "ppm",
         (
-            "Skew of the receiver's clock relative to the sender's, positive if it is faster. Empty if its error "
-            "can be above 100 ppm."
+            "Skew of the receiver's clock relative to the sender's; positive if the receiver's clock is faster. "
+            "Empty if its error can be above 100 ppm."
         ),
     ),
     ("clock_skew_error_ppm", "ppm", "Maximum error of clock_skew_ppm."),
@@ -74,17 +74,19 @@ SENT_COLUMNS: Final = columns(
         "s",
         (
             "Median one-way delay of all packets sent; a packet without a known arrival counts as later than all "
-            "others. Empty if half of the packets or more have none, and if one_way_median_s is empty."
+            "others. Empty if half of the packets or more have no known arrival, and if one_way_median_s is empty."
         ),
     ),
 )
 
 LARGEST_ERROR: Final = 0.1
-"""Maximum error of a one-way delay as a share of the delay; with a larger error the delay is withheld."""
+"""Maximum error of a one-way delay as a share of the delay. With a larger error, the delay is withheld."""
 
-UNSTEADY: Final = "no offset and drift fit: a clock was set during the attempt, or drifts by more than 500 ppm"
-"""Reason why no times of a transfer are known. Times by a single clock are also unknown, because either clock may be
-wrong.
+UNSTEADY: Final = (
+    "no offset and drift fit all times: a clock was set during the attempt, or drifts by more than 500 ppm"
+)
+"""Reason why no times of a transfer are known. Times by a single clock are also unknown, because any of the two
+clocks may be wrong.
 """
 
 SINGLE_PACKET: Final = "one direction has a single packet in both captures, and no other packet confirms its time"
@@ -95,14 +97,14 @@ _WEIGHTED_STEPS: Final = 1000
 
 
 def udp_packets(packets: udp.UdpPackets) -> StampPairs:
-    """Return the times of a UDP transfer's packets that are in both captures, each fragment separately."""
+    """Return the times of a UDP transfer's packets that are in both captures; fragments are separate packets."""
     sent, received = udp_copies(packets)
     return StampPairs(packets.sent.time_ns[sent], packets.received.time_ns[received])
 
 
 def udp_copies(packets: udp.UdpPackets) -> tuple[Ints, Ints]:
     """Return the indices of the packets of `udp_packets` among the sent and among the received packets."""
-    return _copies(packets.match, packets.chosen)
+    return _copies(packets.match, packets.is_transfer_packet)
 
 
 def tcp_frames(frames: tcp.TcpFrames) -> StampPairs:
@@ -143,7 +145,7 @@ def measure(
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
         transfer: Identifies the transfer's packets.
-        sent: Number of packets that the transfer sent.
+        sent: Number of packets that the sender sent.
         ambiguous: True if some packets are missing in `pairs` because they are ambiguous.
     """
     other_pairs = _other_pairs(sender, receiver, transfer)
@@ -162,7 +164,7 @@ def measure(
         return _withheld("a capture lacks times")
     pairs = pairs.where(np.argsort(pairs.receiver_ns, kind="stable"))
     transit_ns = pairs.receiver_ns - pairs.sender_ns
-    jitter = Measured.from_optional({"jitter_s": jitter_s(transit_ns)}, "a single packet has none")
+    jitter = Measured.from_optional({"jitter_s": jitter_s(transit_ns)}, "a single packet has no jitter")
     if not len(reverse_pairs):
         variation = _variation((transit_ns - transit_ns.min()) / 1e9)
         return jitter | variation | _withheld("no packet from receiver to sender is in both captures")
@@ -177,7 +179,7 @@ def measure(
 def packet_delays(
     pairs: StampPairs, sender: Packets, receiver: Packets, transfer: Transfer
 ) -> tuple[Floats, float] | None:
-    """Return the one-way delay of each packet, and the maximum error from the clocks, in seconds.
+    """Return the one-way delay of each packet and the maximum error that the clocks cause, in seconds.
 
     Return None if the clock offset cannot be estimated, or if its error is unlimited.
 
@@ -204,7 +206,7 @@ def clocks_between(sender: Packets, receiver: Packets, sender_address: str, rece
         sender: Packets of the sender's capture.
         receiver: Packets of the receiver's capture.
         sender_address: Address of the sender on the link under test.
-        receiver_address: Address of the receiver on it.
+        receiver_address: Address of the receiver on the link under test.
     """
     forward = _matched_pairs(
         *(packets.where(_is_between(packets, sender_address, receiver_address)) for packets in (sender, receiver))
@@ -217,7 +219,7 @@ def clocks_between(sender: Packets, receiver: Packets, sender_address: str, rece
 
 
 def _delays_s(pairs: StampPairs, clocks: Clocks) -> tuple[Floats, float]:
-    """Return delays and maximum error as for `packet_delays`."""
+    """Return delays and their maximum error in seconds, as `packet_delays` does."""
     return clocks.delays_s(pairs.sender_ns, pairs.receiver_ns), clocks.error_s(pairs.receiver_ns) + STAMP_S
 
 
@@ -235,16 +237,19 @@ def jitter_s(transit_ns: Ints) -> float | None:
     """
     if len(transit_ns) < 2:
         return None
-    # J += (|D| - J) / 16 from J = 0, in closed form; older steps have weights below the precision of a float.
+    # Closed form of J += (|D| - J) / 16 from J = 0. Older steps have weights below the precision of a float.
     recent_s = np.abs(np.diff(transit_ns[-_WEIGHTED_STEPS:])) / 1e9
     return float(_JITTER_GAIN * (1 - _JITTER_GAIN) ** np.arange(len(recent_s))[::-1] @ recent_s)
 
 
 def mean_jitter_s(transit_ns: Ints) -> float | None:
-    """Return the mean of `jitter_s` after each packet from the second on; argument as for `jitter_s`."""
+    """Return the mean of the values that `jitter_s` has after each packet from the second on.
+
+    The argument is that of `jitter_s`.
+    """
     if len(transit_ns) < 2:
         return None
-    # Each |D| contributes to J after it and after all later packets: its total weight is a geometric series.
+    # Each |D| contributes to J after its packet and after all later packets: its total weight is a geometric series.
     steps_s = np.abs(np.diff(transit_ns)) / 1e9
     weights = 1 - (1 - _JITTER_GAIN) ** np.arange(len(steps_s), 0, -1)
     return float(weights @ steps_s) / len(steps_s)
@@ -272,7 +277,7 @@ def _clock(clocks: Clocks) -> Measured:
         "clock_skew_ppm": 1e6 * clocks.skew if clocks.skew_error <= QUARTZ_SKEW else None,
         "clock_skew_error_ppm": 1e6 * clocks.skew_error,
     }
-    return Measured.from_optional(values, "it can be wrong by more than 100 ppm")
+    return Measured.from_optional(values, "its error can be above 100 ppm")
 
 
 def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
@@ -285,22 +290,22 @@ def _one_way(delay_s: Floats, error_s: float, sent: int) -> Measured:
     if not math.isfinite(error_s):
         names = (*figures, "one_way_error_s", "one_way_median_sent_s")
         return Measured({"one_way_withheld": SINGLE_PACKET}, dict.fromkeys(names, SINGLE_PACKET))
-    shown = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
-    withheld_names = ", ".join(name.split("_")[2] for name, value in shown.items() if value is None)
+    values = {name: value if error_s <= LARGEST_ERROR * value else None for name, value in figures.items()}
+    withheld_names = ", ".join(name.split("_")[2] for name, value in values.items() if value is None)
     reason = f"the error is above a tenth of: {withheld_names}" if withheld_names else None
-    of_sent = None if shown["one_way_median_s"] is None else quantile_of_sent(delay_s, sent, 0.5)
+    of_sent = None if values["one_way_median_s"] is None else quantile_of_sent(delay_s, sent, 0.5)
     return (
         Measured({"one_way_error_s": error_s})
         | Measured.from_optional(
             {"one_way_median_sent_s": of_sent}, "the median is withheld, or half of the packets were lost"
         )
-        | Measured.from_optional(shown, "its error is above a tenth of it")
+        | Measured.from_optional(values, "its error is above a tenth of its value")
         | Measured.from_optional({"one_way_withheld": reason}, "nothing is withheld")
     )
 
 
 def _other_pairs(sender: Packets, receiver: Packets, transfer: Transfer) -> StampPairs:
-    """Return the other packets from sender to receiver: packets without payload, and packets of ping."""
+    """Return the times of other packets from sender to receiver: packets without payload, and packets of ping."""
     ends = transfer.sender_address, transfer.receiver_address
     return _matched_pairs(
         *(
@@ -311,7 +316,7 @@ def _other_pairs(sender: Packets, receiver: Packets, transfer: Transfer) -> Stam
 
 
 def _reverse_pairs(sender: Packets, receiver: Packets, sender_address: str, receiver_address: str) -> StampPairs:
-    """Return the packets from receiver to sender."""
+    """Return the times of the packets from receiver to sender."""
     pairs = _matched_pairs(
         *(packets.where(_is_between(packets, receiver_address, sender_address)) for packets in (receiver, sender))
     )
@@ -335,9 +340,9 @@ def _may_be_transfer(packets: Packets, transfer: Transfer) -> Mask:
 def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
     """Return the times of the packets that are in both lists.
 
-    Each received frame occurs once, so that a wrong time of the frame makes only one pair wrong. If offload joined
-    several sent frames to a received frame, it is paired with the last of them, whose bound on the clock offset is
-    the strictest.
+    Each received frame is in one pair, so that a wrong time of the frame affects only one pair. If offload joined
+    several sent frames into a received frame, the pair contains the last sent frame, which gives the strictest bound
+    of the clock offset.
     """
     sent_index, received_index = _copies(match(sent, received))
     received_index, last = np.unique(received_index[::-1], return_index=True)
@@ -345,8 +350,13 @@ def _matched_pairs(sent: Packets, received: Packets) -> StampPairs:
     return StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
 
 
-def _copies(matched: Match, chosen: Mask | None = None) -> tuple[Ints, Ints]:
-    """Return the indices of matched packets among sent and among received packets, without ambiguous packets."""
+def _copies(matched: Match, selection: Mask | None = None) -> tuple[Ints, Ints]:
+    """Return the indices of matched packets among the sent and among the received packets, without ambiguous ones.
+
+    Args:
+        matched: The match.
+        selection: Mask of the sent packets to include; None for all.
+    """
     is_certain = matched.arrived & ~matched.ambiguous
-    index = np.flatnonzero(is_certain if chosen is None else is_certain & chosen)
+    index = np.flatnonzero(is_certain if selection is None else is_certain & selection)
     return index, matched.received_index[index]

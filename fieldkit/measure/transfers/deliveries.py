@@ -1,8 +1,9 @@
-"""Deliveries of new payload of a flow at its receiver, and the time from which each was due.
+"""Deliveries of new payload of a flow at its receiver, and the period in which payload was due.
 
 TCP delivers bytes in order, each once (RFC 9293, section 3.10.7.4): a frame is a delivery if it extends the
-contiguous received bytes. UDP delivers complete datagrams. A retransmitted copy, a duplicate, a fragment and a
-segment after a gap deliver nothing by themselves, so segmentation offload changes no time by more than one frame.
+contiguous received bytes. UDP delivers complete datagrams. A retransmitted copy, a duplicate, a fragment that does
+not complete its datagram and a segment after a gap are no deliveries. Segmentation offload changes the time of a
+delivery by at most one frame.
 
 All times are by the clock of the receiver's capture. The sender's times are converted with the fastest packet of the
 flow that is in both captures, so that a converted time is the earliest possible arrival.
@@ -27,36 +28,37 @@ fast retransmission is therefore not a stall."""
 
 _MIN_RTTS: Final = 2
 """A stall is longer than this many round trips: a fast retransmission delivers a lost segment one round trip late,
-and a queue may double that."""
+and a queue may double this delay."""
 
 _MIN_INTERVALS: Final = 3
-"""A stall of a flow with a fixed rate is longer than this many sending intervals: one or two payloads lost in a row
-are a loss, not a stall."""
+"""A stall of a flow with a fixed rate is longer than this many sending intervals: the loss of one or two consecutive
+payloads is not a stall."""
 
 _EDGE_PACKETS: Final = 100
-"""Number of packets at each end of a flow from which the sender's clock offset is computed; drift is negligible
-within them."""
+"""Number of packets at the start and at the end of a flow from which the clock offset is computed. The drift during
+these packets is negligible."""
 
 REORDERING_NS: Final = 100_000_000
-"""Packets handled by two processors may be out of order by less than this. If it is more, the clock was set back."""
+"""If two processors capture packets, their times may be out of order by less than this. A larger difference shows
+that the clock was set back."""
 
 
 @dataclass(frozen=True)
 class FlowSchedule:
-    """Properties of a flow that are known without its capture.
+    """Properties of a flow that are known without its captures.
 
     Attributes:
-        interval_s: Sending interval of a flow with a fixed rate; 0 if the sender always has more to send.
-        lasts_s: Sending duration from the first payload on; None if the flow ends when everything is sent.
+        interval_s: Sending interval of a flow with a fixed rate; 0 if the sender always has data to send.
+        duration_s: Sending duration from the first payload on; None if the flow ends when all data is sent.
         size_bytes: Payload of a TCP flow; None if it is not known in advance.
-        until_ns: Time at which the receiving program ended, by the receiver's clock; None if unknown.
-        head_bytes: Bytes at the start of a TCP flow that belong to its setup.
+        receiver_end_ns: Time at which the receiving program exited, by the receiver's clock; None if unknown.
+        head_bytes: Number of bytes at the start of a TCP flow that belong to its setup.
     """
 
     interval_s: float = 0.0
-    lasts_s: float | None = None
+    duration_s: float | None = None
     size_bytes: int | None = None
-    until_ns: int | None = None
+    receiver_end_ns: int | None = None
     head_bytes: int = 0
 
 
@@ -64,12 +66,14 @@ class FlowSchedule:
 class Delivery:
     """Deliveries of one stream; times in nanoseconds since 1970 UTC by the receiver's clock.
 
+    If nothing arrived, `begin_ns` and `end_ns` are by the sender's clock.
+
     Attributes:
-        at_ns: Time of arrival of each new payload, ascending. Shape (n,).
-        begin_ns: Start of the stream: its first packet, for TCP its SYN. By the sender's clock if nothing arrived.
-        end_ns: Time until which payload was due; None if all of it arrived. By the sender's clock if nothing arrived.
+        at_ns: Times of arrival of new payload, ascending. Shape (n,).
+        begin_ns: Time of the first packet of the stream, which is the SYN for TCP.
+        end_ns: Time until which payload was due; None if all payload arrived.
         interval_s: As `FlowSchedule.interval_s`.
-        min_stall_s: If payload is overdue for longer than this, it is a stall.
+        min_stall_s: Minimum length of a stall: payload is overdue for longer than this.
     """
 
     at_ns: Ints
@@ -79,44 +83,44 @@ class Delivery:
     min_stall_s: float
 
 
-def of_udp(packets: UdpPackets, chosen: Mask, expected: FlowSchedule) -> Delivery:
+def udp_delivery(packets: UdpPackets, in_stream: Mask, expected: FlowSchedule) -> Delivery:
     """Return the deliveries of datagrams.
 
     Args:
         packets: UDP packets of both captures.
-        chosen: Mask of the sent datagrams that belong to the stream. Shape (k,).
+        in_stream: Mask of the sent datagrams that belong to the stream. Shape (k,).
         expected: Known properties of the stream.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the captures.
     """
     matched = packets.match
-    chosen_packets = np.append(chosen, False)[packets.datagram]  # the last entry is for NO_DATAGRAM
-    received_packets = np.append(chosen_packets, False)[matched.sent_index]  # the last is for match.NONE
+    stream_packets = np.append(in_stream, False)[packets.datagram]  # the last entry is for NO_DATAGRAM
+    received_packets = np.append(stream_packets, False)[matched.sent_index]  # the last entry is for match.NONE
     if (received_packets & matched.possible_copy).any():
-        raise EvidenceError("its packets cannot be distinguished, and some that arrived may be copies")
-    sent_ns = packets.sent.time_ns[chosen_packets]
+        raise EvidenceError("its packets cannot be distinguished, and some of the received packets may be copies")
+    sent_ns = packets.sent.time_ns[stream_packets]
     _require_times(sent_ns, packets.received.time_ns[received_packets])
-    complete_ns = arrivals_ns(packets)[chosen]
+    complete_ns = arrivals_ns(packets)[in_stream]
     at_ns = np.sort(complete_ns[complete_ns != NO_TIME])
-    index = np.flatnonzero(chosen_packets & matched.arrived)
+    index = np.flatnonzero(stream_packets & matched.arrived)
     pairs = StampPairs(packets.sent.time_ns[index], packets.received.time_ns[matched.received_index[index]])
     return stream_delivery(at_ns, (int(sent_ns.min()), int(sent_ns.min()), int(sent_ns.max())), pairs, expected)
 
 
 def arrivals_ns(packets: UdpPackets) -> Ints:
-    """Return the arrival of the last fragment of each sent datagram, or `NO_TIME` if it is incomplete. Shape (k,)."""
+    """Return the arrival time of each sent datagram's last fragment; `NO_TIME` if it is incomplete. Shape (k,)."""
     index = np.flatnonzero((packets.datagram != NO_DATAGRAM) & packets.match.arrived)
     last_ns = np.full(len(packets.first), NO_TIME)
     np.maximum.at(last_ns, packets.datagram[index], packets.received.time_ns[packets.match.received_index[index]])
     return np.where(udp.complete(packets)[:-1], last_ns, NO_TIME)
 
 
-def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
+def tcp_delivery(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Delivery:
     """Return the deliveries of one TCP connection in one direction.
 
     Args:
-        frames: Its frames in both captures.
+        frames: Frames of the connection in both captures.
         answers: Packets of the other direction in the sender's capture.
         expected: Known properties of the connection.
 
@@ -131,7 +135,8 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
     # Two processors may have captured two packets in the wrong order.
     at_ns = np.maximum.accumulate(received.time_ns[advancing])[has_payload]
     delivered_bytes, sent_bytes = (
-        int(bytes_[-1]) if len(bytes_) else 0 for bytes_ in (received_contiguous, sent_contiguous)
+        int(contiguous_bytes[-1]) if len(contiguous_bytes) else 0
+        for contiguous_bytes in (received_contiguous, sent_contiguous)
     )
     is_complete = delivered_bytes >= max(sent_bytes, expected.size_bytes or 0, expected.head_bytes + 1)
     data = sent.tcp_payload_bytes > expected.head_bytes
@@ -141,20 +146,22 @@ def of_tcp(frames: TcpFrames, answers: Packets, expected: FlowSchedule) -> Deliv
     sent_index, received_index = delay.tcp_copies(frames)
     pairs = StampPairs(sent.time_ns[sent_index], received.time_ns[received_index])
     delivery = stream_delivery(at_ns, (first_ns, data_ns, last_ns), pairs, expected, rtt_s=_rtt_s(sent, answers))
-    if expected.lasts_s is not None or not len(at_ns):
+    if expected.duration_s is not None or not len(at_ns):
         return delivery
     if is_complete:
         return replace(delivery, end_ns=None)
-    # A receiver of a known number of bytes waits for the rest until it is terminated.
+    # A receiver of a known number of bytes waits for the missing bytes until it is terminated.
     return (
         delivery
-        if expected.size_bytes is None or expected.until_ns is None
-        else replace(delivery, end_ns=expected.until_ns)
+        if expected.size_bytes is None or expected.receiver_end_ns is None
+        else replace(delivery, end_ns=expected.receiver_end_ns)
     )
 
 
 def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
-    """Return the frames that extend the contiguous bytes of a connection, and the number of these bytes after each.
+    """Return the indices of the frames that extend the contiguous bytes of a connection.
+
+    The second array has the number of contiguous bytes after each of these frames.
 
     Args:
         frames: Frames of one TCP connection in one direction, in the order of the capture.
@@ -164,57 +171,58 @@ def advancing_frames(frames: Packets) -> tuple[Ints, Ints]:
     """
     # SYN frames are included, because they define the position of the first byte. The number in an RST is arbitrary.
     relevant = np.flatnonzero((frames.tcp_payload_bytes > 0) | (frames.tcp_flags & SYN != 0))
-    chosen = frames.where(relevant)
-    _, pieces = tcp_streams.cut(chosen.where(slice(0, 0)), chosen)
-    no_frame = len(chosen)
+    relevant_frames = frames.where(relevant)
+    _, pieces = tcp_streams.cut(relevant_frames.where(slice(0, 0)), relevant_frames)
+    no_frame = len(relevant_frames)
     count = int(pieces.range_id.max(initial=-1)) + 1
     first, size_bytes = np.full(count, no_frame), np.zeros(count, dtype=np.int64)
-    # If an index occurs several times, numpy stores the last value, which is the value of the earliest frame here.
+    # If an index occurs several times, numpy stores the last value: the earliest frame, because the order is
+    # reversed.
     first[pieces.range_id[::-1]] = pieces.frame[::-1]
     size_bytes[pieces.range_id] = pieces.size_bytes
-    reached = np.maximum.accumulate(first)
-    reached = reached[reached < no_frame]
-    last_of_frame = np.flatnonzero(np.diff(reached, append=no_frame))
-    return relevant[reached[last_of_frame]], np.cumsum(size_bytes[: len(reached)])[last_of_frame]
+    completed_by = np.maximum.accumulate(first)
+    completed_by = completed_by[completed_by < no_frame]
+    last_of_frame = np.flatnonzero(np.diff(completed_by, append=no_frame))
+    return relevant[completed_by[last_of_frame]], np.cumsum(size_bytes[: len(completed_by)])[last_of_frame]
 
 
 def stream_delivery(
     at_ns: Ints, sent_ns: tuple[int, int, int], pairs: StampPairs, expected: FlowSchedule, *, rtt_s: float = 0.0
 ) -> Delivery:
-    """Return the deliveries of a stream that was due until its last payload was sent, or for its duration.
+    """Return the deliveries of a stream whose payload was due until the last payload was sent, or for its duration.
 
     Args:
         at_ns: Times of delivery.
-        sent_ns: Times at which its sender sent the first packet, the first payload and the last payload.
-        pairs: Its packets that are in both captures.
+        sent_ns: Times at which the sender sent the first packet, the first payload and the last payload.
+        pairs: Packets of the stream that are in both captures.
         expected: Known properties of the stream.
         rtt_s: Round-trip time if the stream retransmits lost data, otherwise 0.
     """
     min_stall_s = max(MIN_STALL_S, _MIN_RTTS * rtt_s, _MIN_INTERVALS * expected.interval_s)
     first_ns, data_ns, last_ns = sent_ns
-    if expected.lasts_s is not None:
-        last_ns = data_ns + round(1e9 * expected.lasts_s)
+    if expected.duration_s is not None:
+        last_ns = data_ns + round(1e9 * expected.duration_s)
     if not len(at_ns):
         return Delivery(at_ns, first_ns, last_ns, expected.interval_s, min_stall_s)
     start_offset_ns, end_offset_ns = _sender_to_receiver_ns(pairs)
     end_ns = last_ns + end_offset_ns
-    if expected.lasts_s is not None and expected.until_ns is not None:
-        end_ns = min(end_ns, expected.until_ns)
+    if expected.duration_s is not None and expected.receiver_end_ns is not None:
+        end_ns = min(end_ns, expected.receiver_end_ns)
     return Delivery(at_ns, first_ns + start_offset_ns, end_ns, expected.interval_s, min_stall_s)
 
 
 def _sender_to_receiver_ns(pairs: StampPairs) -> tuple[int, int]:
-    """Return the values to add to the sender's times at the start and at the end of a flow."""
+    """Return the offsets in ns that convert the sender's times at the start and at the end of a flow."""
     if not len(pairs):
         raise EvidenceError("no packet of the flow is known to be in both captures")
     order = np.argsort(pairs.receiver_ns, kind="stable")
-    first_and_last = pairs.where(order[:_EDGE_PACKETS]), pairs.where(order[-_EDGE_PACKETS:])
-    start_offset_ns, end_offset_ns = (int((part.receiver_ns - part.sender_ns).min()) for part in first_and_last)
+    edge_pairs = pairs.where(order[:_EDGE_PACKETS]), pairs.where(order[-_EDGE_PACKETS:])
+    start_offset_ns, end_offset_ns = (int((edge.receiver_ns - edge.sender_ns).min()) for edge in edge_pairs)
     return start_offset_ns, end_offset_ns
 
 
 def _require_times(sent_ns: Ints, received_ns: Ints) -> None:
-    """Raise an error if durations cannot be computed from the times of the captures."""
+    """Raise an error if the times in the captures cannot be used to compute durations."""
     if not len(sent_ns):
         raise EvidenceError("no packet of the flow is in the sender's capture")
     for times_ns in (sent_ns, received_ns):
@@ -230,7 +238,7 @@ def _last_syn_ns(sent: Packets, first_ns: int) -> int:
 
 
 def _rtt_s(sent: Packets, answers: Packets) -> float:
-    """Return the round-trip time of the handshake at the sender, or 0 if its capture does not have it."""
+    """Return the round-trip time of the handshake at the sender, or 0 if the handshake was not captured."""
     acknowledged_ns = answers.time_ns[answers.tcp_flags & ACK != 0]
     syn_ns = sent.time_ns[sent.tcp_flags & SYN != 0]
     if not len(acknowledged_ns) or not (before := syn_ns[syn_ns <= acknowledged_ns[0]]).size:

@@ -24,21 +24,21 @@ class Fates:
 
     Attributes:
         sent_ns: Time of sending by the sender's clock, in the order of the capture. Shape (n,).
-        sent_bytes: Offset of each sent packet in the payload, in bytes.
-        marked: Mask of the sent packets that were lost (UDP), or that repeat bytes sent before (TCP).
+        sent_bytes: Offset of each sent packet in the payload, in bytes. Shape (n,).
+        lost_or_repeated: Mask of the sent packets that were lost (UDP), or that repeat bytes sent before (TCP).
         received_ns: Time of arrival by the receiver's clock. Shape (m,).
-        received_bytes: Offset of each received packet in the payload.
+        received_bytes: Offset of each received packet in the payload, in bytes. Shape (m,).
     """
 
     sent_ns: Ints
     sent_bytes: NDArray[np.int64]
-    marked: Mask
+    lost_or_repeated: Mask
     received_ns: Ints
     received_bytes: NDArray[np.int64]
 
 
 def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets, Packets]:
-    """Return the packets of the sender's and the receiver's capture after checks that they can be compared.
+    """Return the packets of the sender's and the receiver's capture; raises if these cannot be compared.
 
     Args:
         evidence: The attempt's evidence.
@@ -47,14 +47,14 @@ def both_packets(evidence: AttemptEvidence, transfer: Transfer) -> tuple[Packets
     Raises:
         EvidenceError: A capture is missing, damaged or without times, or the captures contradict each other.
     """
-    captures = [evidence.whole_capture(name) for name in transfer.captures]
+    captures = [evidence.undamaged_capture(name) for name in transfer.captures]
     if any(capture is None for capture in captures):
         raise EvidenceError("there are no complete captures of both ends", where=str(evidence.folder))
     sender, receiver = (capture.packets for capture in captures if capture is not None)
     if (sender.time_ns == NO_TIME).any() or (receiver.time_ns == NO_TIME).any():
         raise EvidenceError("a capture lacks times", where=str(evidence.folder))
-    if why := altered_packets.incomparability_reason(sender, receiver, transfer):
-        raise EvidenceError(f"the captures of the transfer cannot be compared: {why}", where=str(evidence.folder))
+    if reason := altered_packets.incomparability_reason(sender, receiver, transfer):
+        raise EvidenceError(f"the captures of the transfer cannot be compared: {reason}", where=str(evidence.folder))
     return sender, receiver
 
 
@@ -78,22 +78,26 @@ def read(evidence: AttemptEvidence, transfer: Transfer) -> Fates | None:
 
 def _udp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates | None:
     packets = udp.match_transfer(sender, receiver, transfer)
-    chosen, sent_index = packets.chosen, packets.match.sent_index
-    if (chosen & packets.match.ambiguous).any():
+    is_transfer_packet, sent_index = packets.is_transfer_packet, packets.match.sent_index
+    if (is_transfer_packet & packets.match.ambiguous).any():
         return None
-    offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * chosen) - packets.sent.ip_payload_bytes
-    received = np.append(chosen, False)[sent_index]  # the last entry is for match.NONE
+    offset_bytes = np.cumsum(packets.sent.ip_payload_bytes * is_transfer_packet) - packets.sent.ip_payload_bytes
+    received = np.append(is_transfer_packet, False)[sent_index]  # the last entry is for match.NONE
     return Fates(
-        sent_ns=packets.sent.time_ns[chosen],
-        sent_bytes=offset_bytes[chosen],
-        marked=~packets.match.arrived[chosen],
+        sent_ns=packets.sent.time_ns[is_transfer_packet],
+        sent_bytes=offset_bytes[is_transfer_packet],
+        lost_or_repeated=~packets.match.arrived[is_transfer_packet],
         received_ns=packets.received.time_ns[received],
         received_bytes=offset_bytes[sent_index[received]],
     )
 
 
 def _tcp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
-    """Offload makes the frames at the two ends differ, so retransmissions are identified by sequence range."""
+    """Return the fates of TCP frames.
+
+    Offload changes frames, so that they differ at both ends. Retransmissions are therefore identified by their range
+    of sequence numbers.
+    """
     sent, received = (
         packets.where((packets.dport == transfer.port) & (packets.tcp_payload_bytes > 0))
         for packets in (transfer.forward(sender), transfer.forward(receiver))
@@ -104,7 +108,7 @@ def _tcp_fates(sender: Packets, receiver: Packets, transfer: Transfer) -> Fates:
     return Fates(
         sent_ns=sent.time_ns,
         sent_bytes=offset_bytes,
-        marked=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), offset_bytes[1:] < sent_up_to[:-1]),
+        lost_or_repeated=np.append(np.zeros(min(1, len(sent)), dtype=np.bool_), offset_bytes[1:] < sent_up_to[:-1]),
         received_ns=received.time_ns,
         received_bytes=received_offset_bytes,
     )
@@ -122,8 +126,8 @@ PACKET_COLUMNS: Final = columns(
         "received_ns",
         "ns",
         (
-            "Arrival time of the packet's first copy by the receiver's clock; for a TCP frame, of its last byte. "
-            "Empty if the packet was lost or is ambiguous, and if segmentation offload joined it to others."
+            "Arrival time of the packet's first copy by the receiver's clock; for a TCP frame, arrival time of its "
+            "last byte. Empty if the packet was lost or is ambiguous, or if segmentation offload joined it to others."
         ),
     ),
     (
@@ -137,7 +141,7 @@ PACKET_COLUMNS: Final = columns(
     (
         "delay_s",
         "s",
-        "One-way delay by the estimated clock offset; empty if received_ns or the clock offset is unknown.",
+        "One-way delay with the estimated clock offset; empty if received_ns or the clock offset is unknown.",
     ),
     (
         "delay_error_s",
@@ -166,20 +170,20 @@ class SentPackets:
 
 @dataclass(frozen=True, eq=False)
 class _MatchedPackets:
-    """Packets sent, shape (n,), and received, with their matches.
+    """Sent packets, shape (n,), and received packets, with their matches.
 
     Attributes:
         sent: Packets in the sender's capture.
         received: Packets in the receiver's capture.
-        chosen: Mask of the sent packets that belong to the transfer.
+        is_transfer_packet: Mask of the sent packets that belong to the transfer.
         lost: As `SentPackets.lost`.
         sent_again: As `SentPackets.sent_again`.
-        copies: Indices of matched sent packets, and of their copies among the received packets.
+        copies: Indices of the matched sent packets, and indices of their copies among the received packets.
     """
 
     sent: Packets
     received: Packets
-    chosen: Mask
+    is_transfer_packet: Mask
     lost: MaskedArray
     sent_again: MaskedArray
     copies: tuple[Ints, Ints]
@@ -205,14 +209,14 @@ def read_sent_packets(evidence: AttemptEvidence, transfer: Transfer) -> SentPack
     if (delays := delay.packet_delays(pairs, sender, receiver, transfer)) is not None:
         delay_s[sent_index], error_s[sent_index] = delays
     return SentPackets(
-        sent_ns=np.ma.array(packets.sent.time_ns[packets.chosen]),
-        received_ns=received_ns[packets.chosen],
-        lost=packets.lost[packets.chosen],
-        sent_again=packets.sent_again[packets.chosen],
-        wire_bytes=np.ma.array(packets.sent.wire_bytes[packets.chosen]),
-        payload_bytes=np.ma.array(packets.sent.ip_payload_bytes[packets.chosen]),
-        delay_s=delay_s[packets.chosen],
-        delay_error_s=error_s[packets.chosen],
+        sent_ns=np.ma.array(packets.sent.time_ns[packets.is_transfer_packet]),
+        received_ns=received_ns[packets.is_transfer_packet],
+        lost=packets.lost[packets.is_transfer_packet],
+        sent_again=packets.sent_again[packets.is_transfer_packet],
+        wire_bytes=np.ma.array(packets.sent.wire_bytes[packets.is_transfer_packet]),
+        payload_bytes=np.ma.array(packets.sent.ip_payload_bytes[packets.is_transfer_packet]),
+        delay_s=delay_s[packets.is_transfer_packet],
+        delay_error_s=error_s[packets.is_transfer_packet],
     )
 
 
@@ -223,12 +227,14 @@ def _all_masked(rows: int, kind: type[np.generic]) -> MaskedArray:
 def _match_udp(sender: Packets, receiver: Packets, transfer: Transfer) -> _MatchedPackets:
     matched = udp.match_transfer(sender, receiver, transfer)
     # Each received packet that may be a copy may hide the loss of another packet.
-    hidden = np.append(matched.chosen, False)[matched.match.sent_index] & matched.match.possible_copy
+    may_hide_loss = (
+        np.append(matched.is_transfer_packet, False)[matched.match.sent_index] & matched.match.possible_copy
+    )
     return _MatchedPackets(
         sent=matched.sent,
         received=matched.received,
-        chosen=matched.chosen,
-        lost=np.ma.array(~matched.match.arrived, mask=matched.match.ambiguous | hidden.any()),
+        is_transfer_packet=matched.is_transfer_packet,
+        lost=np.ma.array(~matched.match.arrived, mask=matched.match.ambiguous | may_hide_loss.any()),
         sent_again=_all_masked(len(matched.sent), np.bool_),
         copies=delay.udp_copies(matched),
     )
@@ -243,7 +249,7 @@ def _match_tcp(sender: Packets, receiver: Packets, transfer: Transfer) -> _Match
     return _MatchedPackets(
         sent=matched.sent,
         received=matched.received,
-        chosen=matched.sent.tcp_payload_bytes > 0,
+        is_transfer_packet=matched.sent.tcp_payload_bytes > 0,
         lost=np.ma.array(lost, mask=ambiguous | match.possible_copy.any()),
         sent_again=np.ma.array(tcp.sent_again(matched)),
         copies=delay.tcp_copies(matched),

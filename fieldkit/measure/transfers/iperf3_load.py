@@ -1,4 +1,4 @@
-"""An iperf3 load in the captures of both ends, independent of iperf3's report: loss, rate, deliveries and jitter."""
+"""Loss, rate, deliveries and jitter of an iperf3 load, computed from captures and independent of iperf3's report."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,8 +26,8 @@ COLUMNS: Final = columns(
         "iperf3_captured_bit_s",
         "bit/s",
         (
-            "Payload of the test per second in the receiver's capture, each byte once, during the same seconds as "
-            "iperf3_throughput_bit_s, counted from the first packet; compare the two."
+            "Payload rate of the test in the receiver's capture during the same seconds as iperf3_throughput_bit_s, "
+            "counted from the first packet; each byte counts once. Compare it with iperf3_throughput_bit_s."
         ),
         Figure("iperf3 throughput, captured", Kind.MEDIAN, rank=65),
     ),
@@ -35,8 +35,8 @@ COLUMNS: Final = columns(
         "iperf3_captured_loss",
         "share",
         (
-            "1 - received/sent of the test in both captures: for UDP datagrams, to be compared with iperf3_loss; for "
-            "TCP payload bytes, retransmissions included. Empty if datagrams were fragmented."
+            "1 - received/sent of the test in both captures. UDP: datagrams; compare it with iperf3_loss. TCP: "
+            "payload bytes, including retransmissions. Empty if datagrams were fragmented."
         ),
         Figure("iperf3 loss, captured", Kind.MEAN, rank=66),
         NEGATIVE_LOSS_BOUNDS,
@@ -44,13 +44,12 @@ COLUMNS: Final = columns(
 )
 
 COOKIE_BYTES: Final = 37
-"""Length of the cookie at the start of each TCP connection of a test, sent before its data (iperf_api.h,
-COOKIE_SIZE)."""
+"""Length of the cookie that is sent before the data of each TCP connection of a test (iperf_api.h, COOKIE_SIZE)."""
 
 
 @dataclass(frozen=True)
 class LoadFlow:
-    """The data of one test from one robot to another.
+    """Data flow of a test from one robot to another.
 
     Attributes:
         protocol: Transport protocol.
@@ -58,7 +57,7 @@ class LoadFlow:
         destination_address: Address of the receiver.
         ports: Sender's and receiver's port of each stream.
         payload_bytes: Payload of a UDP datagram; shorter datagrams belong to the setup.
-        window_s: Start and end of the time over which the rate is computed, in seconds from the first packet.
+        window_s: Start and end of the time span over which the rate is computed, in seconds from the first packet.
     """
 
     protocol: Protocol
@@ -69,7 +68,7 @@ class LoadFlow:
     window_s: tuple[float, float]
 
     def streams(self, packets: Packets) -> list[Packets]:
-        """Return the data packets of each stream in a capture, for UDP only the first fragment of each datagram."""
+        """Return the data packets of each stream in a capture; for UDP, only the first fragments of datagrams."""
         number = UDP if self.protocol is Protocol.UDP else TCP
         ends = packets.are_from(self.source_address) & packets.are_to(self.destination_address)
         packets_between = packets.where(ends & (packets.protocol == number))
@@ -83,7 +82,7 @@ class LoadFlow:
 
 
 def measure_totals(flow: LoadFlow, sender: Packets | None, receiver: Packets | None) -> Measured:
-    """Return the columns of a test; a capture that is missing or damaged is None."""
+    """Return the columns of a test. `sender` or `receiver` is None if this capture is missing or damaged."""
     if sender is None or receiver is None:
         return Measured.all_missing(COLUMNS, "there are no complete captures of both ends")
     sent, received = flow.streams(sender), flow.streams(receiver)
@@ -112,12 +111,14 @@ def _rate(flow: LoadFlow, received: list[Packets]) -> float | None:
     if not len(times_ns) or (times_ns == NO_TIME).any() or end_s <= start_s:
         return None
     start_ns, end_ns = (int(times_ns.min()) + round(1e9 * second) for second in flow.window_s)
-    inside = [packets.where((start_ns <= packets.time_ns) & (packets.time_ns < end_ns)) for packets in data]
+    packets_in_window = [
+        packets.where((start_ns <= packets.time_ns) & (packets.time_ns < end_ns)) for packets in data
+    ]
     if is_udp:
-        return 8 * flow.payload_bytes * sum(map(len, inside)) / (end_s - start_s)
+        return 8 * flow.payload_bytes * sum(map(len, packets_in_window)) / (end_s - start_s)
     total = 0
-    for stream, frames in zip(received, inside, strict=True):
-        # A capture starts before the connections of its test, so it has their SYN.
+    for stream, frames in zip(received, packets_in_window, strict=True):
+        # A capture starts before the connections of its test, so it contains their SYNs.
         connections = Connections.from_syn(stream)
         if len(frames) and not len(connections.ports):
             return None
@@ -131,20 +132,20 @@ JITTER: Final = columns(
         "iperf3_captured_jitter_mean_s",
         "s",
         (
-            "Mean over the whole test of the interarrival jitter after each datagram (RFC 3550, section 6.4.1), from "
-            "both captures; with several streams, of all of their datagrams. Empty for TCP."
+            "Mean of the interarrival jitter after each datagram of the test (RFC 3550, section 6.4.1), from both "
+            "captures; with several streams, the mean over the datagrams of all streams. Empty for TCP."
         ),
         Figure("iperf3 jitter, mean over the test (RFC 3550, captured)", Kind.MEDIAN, rank=63),
     ),
     (
         "iperf3_captured_variation_median_s",
         "s",
-        "Median delay of the datagrams relative to the fastest (RFC 5481), from both captures. Empty for TCP.",
+        "Median delay of the datagrams relative to the fastest one (RFC 5481), from both captures. Empty for TCP.",
     ),
     (
         "iperf3_captured_variation_p95_s",
         "s",
-        "95th percentile of the datagrams' delay relative to the fastest (RFC 5481). Empty for TCP.",
+        "95th percentile of the datagrams' delay relative to the fastest datagram (RFC 5481). Empty for TCP.",
         Figure("iperf3 delay variation, 95 % (RFC 5481, captured)", Kind.MEDIAN, rank=63),
     ),
 )
@@ -153,10 +154,10 @@ JITTER_CROSS_CHECKS: Final = (
         quantity="delay variation of iperf3's datagrams",
         columns=tuple(column.name for column in JITTER),
         source="both captures: times of sending and arrival of each datagram",
-        against=("both captures: packets of the other direction, and the clock offset that fits all",),
+        against=("both captures: packets of the other direction, and the clock offset that fits all packets",),
         tolerance=(
-            "two quartz clocks may drift by 0.1 ms a second relative to each other; no other source has the time of "
-            "a single datagram, which the order of packets bounds to 0.1 s"
+            "two quartz clocks may drift by 0.1 ms per second relative to each other; no other source has the time "
+            "of a single datagram, which the order of packets bounds to 0.1 s"
         ),
         outcome=CheckOutcome.WITHHELD,
     ),
@@ -165,7 +166,7 @@ JITTER_CROSS_CHECKS: Final = (
 
 @dataclass(frozen=True)
 class LoadStreams:
-    """The data of one load from one robot to another.
+    """Streams of a load from one robot to another.
 
     Attributes:
         protocol: Transport protocol.
@@ -175,8 +176,8 @@ class LoadStreams:
         source_listens: True if the server is the sender.
         count: Number of streams.
         payload_bytes: Payload of a UDP datagram.
-        ports: Sender's and receiver's port of each stream as iperf3 reports them; empty to determine them from
-            packets.
+        ports: Sender's and receiver's port of each stream as reported by iperf3. If empty, they are determined from
+            the packets.
         expected: Known properties of each stream.
     """
 
@@ -191,11 +192,11 @@ class LoadStreams:
     expected: FlowSchedule
 
     def forward(self, packets: Packets) -> Packets:
-        """Return the packets of its protocol from sender to receiver, of any port."""
+        """Return the packets of the load's protocol from sender to receiver, with any ports."""
         return self._between(packets, self.source_address, self.destination_address)
 
     def backward(self, packets: Packets) -> Packets:
-        """Return the packets of its protocol from receiver to sender, of any port."""
+        """Return the packets of the load's protocol from receiver to sender, with any ports."""
         return self._between(packets, self.destination_address, self.source_address)
 
     def _between(self, packets: Packets, source: str, destination: str) -> Packets:
@@ -203,42 +204,45 @@ class LoadStreams:
         return packets.where(packets.are_from(source) & packets.are_to(destination) & (packets.protocol == number))
 
     def stream_ports(self, sent: Packets) -> tuple[tuple[int, int], ...]:
-        """Return the ports of each stream, from the result of `forward` for the sender's capture if unknown.
+        """Return the ports of each stream.
+
+        Args:
+            sent: Packets of the sender's capture, from `forward`. Unknown ports are determined from them.
 
         Raises:
             EvidenceError: The streams cannot be distinguished from other connections.
         """
         if self.ports:
             return self.ports
-        packets = sent.where(self._data(sent) if self.protocol is Protocol.UDP else sent.tcp_flags != 0)
+        packets = sent.where(self._is_data(sent) if self.protocol is Protocol.UDP else sent.tcp_flags != 0)
         packets = packets.where((packets.sport if self.source_listens else packets.dport) == self.port)
         _, first = np.unique(packets.sport << 16 | packets.dport, return_index=True)
         first.sort()
         if self.protocol is Protocol.TCP:  # the first connection is iperf3's control connection
             first = first[1:]
         if len(first) > self.count:
-            raise EvidenceError(f"{len(first)} connections use its port, but it has {self.count} streams")
+            raise EvidenceError(f"{len(first)} connections use the port of the load, but it has {self.count} streams")
         return tuple((int(packets.sport[index]), int(packets.dport[index])) for index in first)
 
-    def _data(self, packets: Packets) -> Mask:
-        """Return a mask of the first fragments of its data; datagrams of the setup are shorter."""
+    def _is_data(self, packets: Packets) -> Mask:
+        """Return a mask of the first fragments of data; datagrams of the setup are shorter."""
         mask: Mask = packets.udp_bytes == self.payload_bytes + UDP_HEADER_BYTES
         return mask
 
     def datagram_masks(self, first: Packets) -> Iterator[Mask]:
-        """Yield for each stream a mask of its datagrams, given the first fragment of each datagram."""
+        """Yield a mask of the datagrams of each stream, given the first fragment of every datagram."""
         for sport, dport in self.stream_ports(first):
-            yield self._data(first) & (first.sport == sport) & (first.dport == dport)
+            yield self._is_data(first) & (first.sport == sport) & (first.dport == dport)
 
 
 def measure_stalls(flow: str, load: LoadStreams, sender: Packets | None, receiver: Packets | None) -> Measured:
-    """Return the columns of the stalls of a load; a capture that is missing or damaged is None.
+    """Return the columns of the stalls of a load.
 
     Args:
         flow: Prefix of the columns' names, as for `stalls.declare_columns`.
         load: The load.
-        sender: Packets of the sender's capture.
-        receiver: Packets of the receiver's capture.
+        sender: Packets of the sender's capture; None if it is missing or damaged.
+        receiver: Packets of the receiver's capture; None if it is missing or damaged.
     """
     return stalls.measure(flow, lambda: read_deliveries(load, sender, receiver))
 
@@ -247,7 +251,7 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     """Return the deliveries of each stream of a load; arguments as for `measure_stalls`.
 
     Raises:
-        EvidenceError: They cannot be determined from the captures.
+        EvidenceError: The deliveries cannot be determined from the captures.
     """
     if sender is None or receiver is None:
         raise EvidenceError("there are no complete captures of both ends")
@@ -255,10 +259,10 @@ def read_deliveries(load: LoadStreams, sender: Packets | None, receiver: Packets
     if load.protocol is Protocol.UDP:
         packets = _udp_packets(load, sender, receiver)
         masks = load.datagram_masks(packets.sent.where(packets.first))
-        return [deliveries.of_udp(packets, mask, load.expected) for mask in masks]
+        return [deliveries.udp_delivery(packets, mask, load.expected) for mask in masks]
     sent, received, reverse = load.forward(sender), load.forward(receiver), load.backward(sender)
     return [
-        deliveries.of_tcp(
+        deliveries.tcp_delivery(
             tcp.match_frames(
                 *(
                     frames.where((frames.sport == source_port) & (frames.dport == destination_port))
@@ -305,7 +309,7 @@ def _udp_packets(load: LoadStreams, sender: Packets, receiver: Packets) -> UdpPa
 
 
 def _require_steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets) -> Clocks | None:
-    """Return the offset between the clocks, or None if it cannot be estimated because one direction has no packets.
+    """Return the offset between the clocks, or None if a direction without packets makes an estimate impossible.
 
     Raises:
         EvidenceError: A clock was set during the load.
@@ -319,7 +323,7 @@ def _require_steady_clocks(load: LoadStreams, sender: Packets, receiver: Packets
 
 
 def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Iterator[Ints]:
-    """Yield the delays of the datagrams of each stream in the order of arrival."""
+    """Yield the delays in ns of the datagrams of each stream, in the order of arrival."""
     clocks = _require_steady_clocks(load, sender, receiver)
     if clocks is None:
         raise EvidenceError("no packet from receiver to sender is in both captures")
@@ -329,9 +333,9 @@ def _transits_ns(load: LoadStreams, sender: Packets, receiver: Packets) -> Itera
     first, arrived_ns = matched.sent.where(matched.first), deliveries.arrivals_ns(matched)
     for mask in load.datagram_masks(first):
         if (np.append(mask, False)[matched.datagram] & matched.match.ambiguous).any():
-            raise EvidenceError("its packets cannot be distinguished, so their times of arrival are unknown")
-        complete = mask & (arrived_ns != NO_TIME)
-        if complete.any():
-            order = np.argsort(arrived_ns[complete], kind="stable")
-            delay_s = clocks.delays_s(first.time_ns[complete][order], arrived_ns[complete][order])
+            raise EvidenceError("its packets cannot be distinguished, so their arrival times are unknown")
+        is_complete = mask & (arrived_ns != NO_TIME)
+        if is_complete.any():
+            order = np.argsort(arrived_ns[is_complete], kind="stable")
+            delay_s = clocks.delays_s(first.time_ns[is_complete][order], arrived_ns[is_complete][order])
             yield np.round(1e9 * delay_s).astype(np.int64)

@@ -1,9 +1,9 @@
 """Matching of received packets with sent packets by the fields that are equal at both ends.
 
-Headers can be equal in several packets: 16-bit IP ids repeat in a long transfer, or are always 0 in packets that are
+Several packets can have equal headers: 16-bit IP ids repeat in a long transfer, or are always 0 in packets that are
 never fragmented (RFC 6864, section 4), and a retransmission repeats its sequence numbers. Such packets are
-distinguished by their content or by TCP time stamps, otherwise by time if they were sent far enough apart. The
-remaining packets are ambiguous.
+distinguished by their content or by TCP time stamps. If these are equal too, they are distinguished by time, which
+requires a minimum time between them. Packets that cannot be distinguished are ambiguous.
 """
 
 from dataclasses import dataclass, replace
@@ -18,17 +18,17 @@ from fieldkit.measure.transfers import tcp_streams
 from fieldkit.measure.transfers.tcp_streams import Pieces
 
 NONE: Final = -1
-"""Index that means: no packet."""
+"""Index that means "no packet"."""
 
 MIN_SPACING_NS: Final = 200_000_000
-"""Packets with equal keys may be distinguished by time if they were sent at least this far apart.
+"""Packets with equal keys can be distinguished by time if at least this time is between their times of sending.
 
-Linux's TCP also considers a packet lost after this delay (minimum retransmission timeout, TCP_RTO_MIN).
+It is the minimum retransmission timeout of Linux (TCP_RTO_MIN), after which TCP considers a packet lost.
 """
 
 _CLEAR_FACTOR: Final = 4
-"""An arrival is clearly nearest to a sent packet if the time between the two, multiplied by this factor, is at most
-the time between this sent packet and the nearest other one.
+"""An arrival is clearly nearest to a sent packet if the time between them, multiplied by this factor, is at most the
+time between this sent packet and the sent packet that is nearest to it.
 """
 
 
@@ -37,16 +37,17 @@ class Match:
     """Match between the n packets sent and the m packets received in two captures.
 
     Attributes:
-        received_index: For each sent packet the index of its first copy among the received packets; `NONE` if lost.
+        received_index: Index of the first copy of each sent packet among the received packets; `NONE` if it was lost.
             Shape (n,).
-        sent_index: For each received packet the index of the sent packet of which it is a copy; `NONE` if there is no
-            such packet in the sender's capture. Shape (m,).
+        sent_index: Index of the sent packet that each received packet is a copy of; `NONE` if the sender's capture
+        has
+            no such packet. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
         ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
-            same time, so the order of their arrival is unknown. They are matched in the order of
-            sending: if n were sent and m received, min(n, m) arrived. Shape (n,).
-        possible_copy: Mask of received packets that count as arrived but may be copies of another packet, because
-            packets with their key arrived closer together than they were sent. Shape (m,).
+            same time, so the order of their arrival is unknown. They are matched in the order of sending: if a
+            packets were sent and b received, min(a, b) arrived. Shape (n,).
+        possible_copy: Mask of received packets that are counted as arrived, but may be copies of another packet,
+            because packets with the same key arrived at shorter intervals than they were sent. Shape (m,).
     """
 
     received_index: Ints
@@ -64,11 +65,11 @@ class Match:
 
 @dataclass(frozen=True, eq=False)
 class Payload:
-    """TCP payload of two captures in comparable pieces.
+    """TCP payload of two captures, divided into comparable pieces.
 
     Attributes:
-        sent: Pieces sent.
-        received: Pieces received.
+        sent: Sent pieces.
+        received: Received pieces.
         match: Match between the pieces.
     """
 
@@ -78,13 +79,13 @@ class Payload:
 
 
 def match(sent: Packets, received: Packets) -> Match:
-    """Match received packets with the sent packets of which they are copies.
+    """Match received packets with the sent packets that they are copies of.
 
-    Packets are copies of each other if addresses, protocol, IP id, fragment offset, length, ports, and TCP's numbers,
-    flags and time stamp are equal; if several packets have equal values, their content must be equal as well.
+    Packets are copies of each other if they have equal addresses, protocol, IP id, fragment offset, length, ports,
+    and TCP numbers, flags and time stamp. If several packets have equal values, their content must also be equal.
 
-    With segmentation offload the two ends capture different TCP frames. A frame without an equal one at the other end
-    is matched with the frame that has its first byte. It is a duplicate if all of its bytes are duplicates.
+    With segmentation offload, the two ends capture different TCP frames. A frame without an equal frame at the other
+    end is matched with the frame that contains its first byte. It is a duplicate if all of its bytes are duplicates.
 
     Args:
         sent: Packets captured at the sender.
@@ -110,11 +111,11 @@ def match(sent: Packets, received: Packets) -> Match:
 
 
 def match_payload(sent: Packets, received: Packets) -> Payload:
-    """Match received TCP payload with the sent payload of which it is a copy.
+    """Match received TCP payload with the sent payload that it is a copy of.
 
-    A piece matches a piece with the same bytes in a frame with the same time stamp. If frames have IP ids, a piece
-    matches the piece in the equal frame at the other end, if there is one; the other frames were cut or joined by
-    segmentation offload.
+    A piece matches a piece with the same bytes in a frame with the same time stamp. If frames have IP ids and there
+    is an equal frame at the other end, a piece matches the piece in this frame. Frames without an equal frame were
+    cut or joined by segmentation offload.
 
     Args:
         sent: Packets captured at the sender.
@@ -134,13 +135,13 @@ def match_keys(
     *,
     contents: tuple[Ints, Ints] | None = None,
 ) -> Match:
-    """Match sent and received items, which are copies of each other only if their keys are equal.
+    """Match sent and received items. Items with different keys are never copies of each other.
 
     Args:
         key: Key of each sent item. Shape (n,).
-        time_ns: Time of sending.
+        time_ns: Time of sending of each item. Shape (n,).
         received_key: Key of each received item. Shape (m,).
-        received_time_ns: Time of reception, by any clock.
+        received_time_ns: Time of reception of each item, by any clock. Shape (m,).
         contents: Values that distinguish sent and received items with equal keys; `NOT_CAPTURED` if unknown.
     """
     sent_order, received_order = np.lexsort((time_ns, key)), np.lexsort((received_time_ns, received_key))
@@ -156,11 +157,13 @@ def match_keys(
     received_order, received_group = received_order[has_match], received_group[has_match]
     received_count = np.bincount(received_group, minlength=len(keys))
 
-    position, is_clear, no_copy = assign(group, time_ns[sent_order], received_group, received_time_ns[received_order])
+    position, is_clear, has_no_copies = assign(
+        group, time_ns[sent_order], received_group, received_time_ns[received_order]
+    )
     sent_index = np.full(len(received_key), NONE)
     sent_index[received_order] = sent_order[(np.cumsum(sent_count) - sent_count)[received_group] + position]
     received_index = np.full(len(key), NONE)
-    # If an index occurs several times, numpy stores the last value, which is the earliest copy here.
+    # If an index occurs several times, numpy stores the last value: the earliest copy, because the order is reversed.
     received_index[sent_index[received_order[::-1]]] = received_order[::-1]
     duplicates: Mask = sent_index != NONE
     duplicates[received_index[received_index != NONE]] = False
@@ -168,44 +171,46 @@ def match_keys(
     ambiguous[sent_order] = (~is_clear & (received_count > 0))[group]
     possible_copy = np.zeros(len(received_key), dtype=np.bool_)
     # If only one packet of a group arrived, it cannot be a copy of another one.
-    possible_copy[received_order] = (~is_clear & ~no_copy & (received_count > 1))[received_group]
+    possible_copy[received_order] = (~is_clear & ~has_no_copies & (received_count > 1))[received_group]
     possible_copy &= ~duplicates
     return Match(received_index, sent_index, duplicates, ambiguous, possible_copy)
 
 
 def reordered(sent_index: Ints) -> Mask:
-    """Return a mask of the items that arrived after one that was sent later (RFC 4737, section 3).
+    """Return a mask of the items that arrived after an item that was sent later (RFC 4737, section 3).
 
     Args:
-        sent_index: Position in the order of sending of each received item, in the order of arrival.
+        sent_index: For each received item in the order of arrival, its position in the order of sending.
     """
     mask: Mask = sent_index < np.maximum.accumulate(sent_index)
     return mask
 
 
 def usable_stamps(sent: Packets, received: Packets) -> tuple[Ints, Ints]:
-    """Return the TCP time stamps of packets sent and received; `NO_STAMP` for connections where some are missing.
+    """Return the TCP time stamps of sent and received packets; `NO_STAMP` for connections without usable time stamps.
 
-    If time stamps were negotiated, every frame except a reset has one (RFC 7323, section 3.2). Time stamps cannot be
-    used if a middlebox removed some of them, or if a capture truncated them.
+    If time stamps were negotiated, every frame except a reset has one (RFC 7323, section 3.2). The time stamps of a
+    connection are not usable if a middlebox removed some of them, or if a capture truncated them.
     """
-    lacking = [
+    lacks_stamp = [
         (packets.protocol == TCP) & (packets.tcp_stamp == NO_STAMP) & (packets.tcp_flags & RST == 0)
         for packets in (sent, received)
     ]
-    if not any(mask.any() for mask in lacking):
+    if not any(mask.any() for mask in lacks_stamp):
         return sent.tcp_stamp, received.tcp_stamp
     connections = [connection_keys(packets) for packets in (sent, received)]
-    without = np.concatenate([numbers[mask] for numbers, mask in zip(connections, lacking, strict=True)])
+    connections_without_stamps = np.concatenate(
+        [numbers[mask] for numbers, mask in zip(connections, lacks_stamp, strict=True)]
+    )
     sent_stamps, received_stamps = (
-        np.where(np.isin(numbers, without), NO_STAMP, packets.tcp_stamp)
+        np.where(np.isin(numbers, connections_without_stamps), NO_STAMP, packets.tcp_stamp)
         for packets, numbers in zip((sent, received), connections, strict=True)
     )
     return sent_stamps, received_stamps
 
 
 def connection_keys(packets: Packets) -> Keys:
-    """Return a key per packet that is equal for equal addresses and ports."""
+    """Return a key of each packet, which is equal for packets with equal addresses and ports."""
     return row_hashes(*packets.src.T, *packets.dst.T, packets.sport + 1 << 20 | packets.dport + 1)
 
 
@@ -241,12 +246,15 @@ def _match_pieces(sent: Packets, received: Packets, frames: Match) -> Payload:
 
 
 def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints, Ints]:
-    """Return the number of each frame that has an equal one at the other end, identified by IP id; 0 for others."""
+    """Return a number for each sent and received frame that has an equal frame at the other end; 0 for other frames.
+
+    Frames are equal only if they have the same IP id.
+    """
     keys = [connection_keys(packets) for packets in (sent, received)]
     has_payload = sent.tcp_payload_bytes > 0
     _, first_of_id = np.unique(row_hashes(keys[0][has_payload], sent.ip_id[has_payload]), return_index=True)
     connections, id_count = np.unique(keys[0][has_payload][first_of_id], return_counts=True)
-    # If all frames of a connection have the same id, each may be a part of another.
+    # If all frames of a connection have the same id, any frame may be a part of another frame.
     has_ids, received_has_ids = (~np.isin(numbers, connections[id_count < 2]) for numbers in keys)
     sent_frame = np.where(frames.arrived & has_ids, np.arange(len(sent)), NONE) + 1
     received_frame = np.where(received_has_ids, frames.sent_index, NONE) + 1
@@ -254,17 +262,26 @@ def _equal_frames(sent: Packets, received: Packets, frames: Match) -> tuple[Ints
 
 
 def _key(packets: Packets, stamp: Ints) -> Keys:
-    """Return a key that is equal for packets with equal fields; the chance of a collision is 1 in 2**48."""
+    """Return a key of each packet, which is equal for packets with equal fields.
+
+    Two other packets have equal keys with a probability of 2**-48.
+    """
     ip = (packets.ip_id << 16 | packets.fragment_offset, packets.ip_payload_bytes << 8 | packets.protocol)
     tcp = (packets.tcp_seq << 32 | packets.tcp_ack, packets.tcp_flags << 33 | stamp + 1)
     key = connection_keys(packets)
     key = row_hashes(key, *ip, *tcp)
-    # IP ids mostly increase, and keys that increase with them sort faster.
+    # Most IP ids increase from packet to packet, and keys that increase with them are sorted faster.
     return packets.ip_id.astype(np.uint64) << np.uint64(48) | key >> np.uint64(16)
 
 
 def _keys_with_content(ambiguous: Keys, keys: tuple[Keys, Keys], contents: tuple[Ints, Ints]) -> tuple[Keys, Keys]:
-    """Return keys that include the content where packets have `ambiguous` keys and all their contents are known."""
+    """Return keys that also depend on the content if a key is ambiguous.
+
+    Args:
+        ambiguous: Keys that several packets have. The content of all packets with such a key must be known.
+        keys: Keys of the sent and the received packets.
+        contents: Contents of the sent and the received packets.
+    """
     without_content = np.concatenate(
         [key[content == NOT_CAPTURED] for key, content in zip(keys, contents, strict=True)]
     )
@@ -279,11 +296,14 @@ def _keys_with_content(ambiguous: Keys, keys: tuple[Keys, Keys], contents: tuple
 def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[Ints, Mask, Mask]:
     """Assign received items to sent items within groups of items with equal keys.
 
-    If the items of a group were sent at least `MIN_SPACING_NS` apart, and each received item is clearly nearest in
-    time to one of them, it is assigned to that one, and the group is clear. In all other groups, each received item
-    is assigned to the nearest in time, subject to two conditions: the order is kept, and each item of the smaller
-    side, sent or received, is assigned. A group has no copies if each received item is clearly nearest to a different
-    sent item, even if the sent items are close together in time.
+    A group is clear if at least `MIN_SPACING_NS` is between its times of sending, and each received item is clearly
+    nearest in time to one sent item. Each received item is then assigned to this sent item.
+
+    In any other group, each received item is assigned to the nearest sent item that fulfils two conditions: the order
+    of the items does not change, and as many items as possible are assigned to different sent items.
+
+    A group has no copies if each received item is clearly nearest to a different sent item, even if the time between
+    the sent items is short.
 
     Args:
         group: Group of each sent item, ascending.
@@ -292,28 +312,28 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
         received_time_ns: Time of reception, ascending within a group.
 
     Returns:
-        For each received item the position of its sent item in the group, from 0 in the order of sending; for each
-        group, whether it is clear; for each group, whether it has no copies.
+        Position of the sent item in its group for each received item, from 0 in the order of sending; mask of the
+        groups that are clear; mask of the groups without copies.
     """
-    groups = int(group.max(initial=-1)) + 1
-    sent_count, received_count = (np.bincount(groups_of, minlength=groups) for groups_of in (group, received_group))
+    group_count = int(group.max(initial=-1)) + 1
+    sent_count, received_count = (np.bincount(numbers, minlength=group_count) for numbers in (group, received_group))
     position = np.zeros(len(received_group), dtype=np.int64)
     has_several = sent_count > 1
-    is_clear_group = np.ones(groups, dtype=np.bool_)
-    chosen, in_several = has_several[received_group], has_several[group]
-    if not chosen.any():
+    is_clear_group = np.ones(group_count, dtype=np.bool_)
+    is_undecided, in_several = has_several[received_group], has_several[group]
+    if not is_undecided.any():
         return position, is_clear_group, is_clear_group
-    offset_ns, offset_known = _clock_offset_ns(group, time_ns, received_group, received_time_ns)
+    offset_ns, is_offset_known = _clock_offset_ns(group, time_ns, received_group, received_time_ns)
     group, time_ns = group[in_several], time_ns[in_several]
-    received_group, received_time_ns = received_group[chosen], received_time_ns[chosen] - offset_ns
+    received_group, received_time_ns = received_group[is_undecided], received_time_ns[is_undecided] - offset_ns
     sent_count, received_count = sent_count * has_several, received_count * has_several
     nearest = _nearest(group, time_ns, received_group, received_time_ns)
     index = (np.cumsum(sent_count) - sent_count)[received_group] + nearest
     spacing_ns = _spacing_ns(group, time_ns)[index]
     is_nearest = _CLEAR_FACTOR * np.abs(received_time_ns - time_ns[index]) <= spacing_ns
-    is_clear_group[received_group[~(offset_known & is_nearest & (spacing_ns >= MIN_SPACING_NS))]] = False
-    no_copy = np.ones(groups, dtype=np.bool_)
-    no_copy[received_group[~is_nearest | (np.diff(index, prepend=-1) == 0)]] = False
+    is_clear_group[received_group[~(is_offset_known & is_nearest & (spacing_ns >= MIN_SPACING_NS))]] = False
+    has_no_copies = np.ones(group_count, dtype=np.bool_)
+    has_no_copies[received_group[~is_nearest | (np.diff(index, prepend=-1) == 0)]] = False
 
     order = np.arange(len(received_group)) - (np.cumsum(received_count) - received_count)[received_group]
     surplus = (sent_count - received_count)[received_group]
@@ -323,12 +343,15 @@ def assign(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: I
     skipped = np.clip(sign * (nearest - order), 0, np.abs(surplus))
     group_base = received_group * (len(group) + len(received_group))
     in_order = order + sign * (np.maximum.accumulate(skipped + group_base) - group_base)
-    position[chosen] = np.where(is_clear_group[received_group], nearest, in_order)
-    return position, is_clear_group, no_copy
+    position[is_undecided] = np.where(is_clear_group[received_group], nearest, in_order)
+    return position, is_clear_group, has_no_copies
 
 
 def _spacing_ns(group: Ints, time_ns: Ints) -> Ints:
-    """Return the time from each sent item to the nearest other one of its group; input ordered by group and time."""
+    """Return the time between each sent item and the nearest other item of its group.
+
+    The items must be in the order of groups and times.
+    """
     steps_ns = np.where(np.diff(group) == 0, np.diff(time_ns), np.iinfo(np.int64).max)
     edge = np.iinfo(np.int64).max
     spacing_ns: Ints = np.minimum(np.append(edge, steps_ns), np.append(steps_ns, edge))
@@ -336,7 +359,7 @@ def _spacing_ns(group: Ints, time_ns: Ints) -> Ints:
 
 
 def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> Ints:
-    """Return, for each received item, the position in its group of the sent item that is nearest in time."""
+    """Return the position in the group of the sent item that is nearest in time to each received item."""
     sent = np.bincount(group)
     order = np.lexsort((np.concatenate((time_ns, received_time_ns)), np.concatenate((group, received_group))))
     is_sent = order < len(group)
@@ -350,12 +373,13 @@ def _nearest(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns:
 
 
 def _clock_offset_ns(group: Ints, time_ns: Ints, received_group: Ints, received_time_ns: Ints) -> tuple[int, bool]:
-    """Return the receiver's clock minus the sender's, including the delay, and False if it is only a rough estimate.
+    """Return the receiver's clock minus the sender's, including the delay, and True if the value is reliable.
 
-    It is computed from items with a unique key or, if there are none, from groups whose items all arrived.
+    It is computed from items with a unique key or, if there are none, from groups whose items all arrived. Otherwise,
+    it is a rough estimate.
     """
-    groups = int(group.max()) + 1
-    sent, received = (np.bincount(groups_of, minlength=groups) for groups_of in (group, received_group))
+    group_count = int(group.max()) + 1
+    sent, received = (np.bincount(numbers, minlength=group_count) for numbers in (group, received_group))
     first = np.diff(received_group, prepend=-1) != 0
     single = (sent == 1) & (received > 0)
     if single.any():

@@ -1,10 +1,10 @@
-"""Rates of a transfer from the receiver's capture: throughput of its packets, goodput of the program.
+"""Rates of a transfer from the receiver's capture: throughput of the packets, goodput of the program.
 
-Throughput counts IP-layer bits, header and payload of every received packet (RFC 5136, section 2.3.1). Goodput counts
-the bits that the application received: without headers and duplicates (RFC 2647, section 3.17; RFC 5166, section
-2.1). Data that had arrived at the start of the measured time is not counted, as in the dispersion of a packet train
-(Dovrolis, Ramanathan and Moore 2001, INFOCOM, eq. 8): any number of packets that arrive at the rate of a link then
-gives that rate.
+Throughput counts IP-layer bits: header and payload of every received packet (RFC 5136, section 2.3.1). Goodput counts
+the bits that the application received, without headers and duplicates (RFC 2647, section 3.17; RFC 5166, section
+2.1). The measured time starts with the arrival of the first packet, whose bits are not counted, as in the dispersion
+of a packet train (Dovrolis, Ramanathan and Moore 2001, INFOCOM, eq. 8). If packets arrive at the rate of a link, the
+result is then this rate for any number of packets.
 """
 
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ COLUMNS: Final = columns(
         "throughput_bit_s",
         "bit/s",
         (
-            "IP-layer bits (RFC 5136) per second at the receiver's interface, retransmissions and copies included, "
-            "from the transfer's first packet with payload, which is not counted, to the last. Empty for a "
-            "single packet, and without complete captures of both ends."
+            "IP-layer bits (RFC 5136) per second at the receiver's interface, including retransmissions and copies. "
+            "The time starts with the transfer's first packet with payload, which is not counted, and ends with the "
+            "last. Empty for a single packet, and without complete captures of both ends."
         ),
         Figure("throughput", Kind.MEDIAN, rank=51),
     ),
@@ -35,16 +35,16 @@ COLUMNS: Final = columns(
         "completion_s",
         "s",
         (
-            "Time from the first frame of the transfer in the receiver's capture until the program there had the "
-            "file. TCP: until it closed the connection after it received everything; empty if it did not. UDP: until "
-            "the last complete datagram."
+            "Time from the first frame of the transfer in the receiver's capture until the program had received the "
+            "file. TCP: until it closed the connection after it had received everything; empty if it did not. UDP: "
+            "until the last complete datagram."
         ),
     ),
     (
         "goodput_bit_s",
         "bit/s",
         (
-            "Bits of received_bytes per second of completion_s, without those that arrived before. Empty if "
+            "Bits of received_bytes per second of completion_s, without the bits in the first packet. Empty if "
             "completion_s or received_bytes is empty, and if completion_s is 0."
         ),
         Figure("goodput", Kind.MEDIAN, rank=50),
@@ -60,8 +60,8 @@ class Rates:
 
     Attributes:
         throughput_bit_s: IP-layer bits per second; None with fewer than two packets with payload, or without times.
-        completion_s: Time until the program had received the file; None if it did not receive all of it, or if this
-            is unknown.
+        completion_s: Time until the program had received the file; None if it did not receive the whole file, or if
+            the time is unknown.
         head_bytes: Payload in the first packet, with which the measured time starts.
     """
 
@@ -81,31 +81,34 @@ class Rates:
         }
 
 
-def of_udp(packets: udp.UdpPackets) -> Rates:
+def udp_rates(packets: udp.UdpPackets) -> Rates:
     """Return the rates of a UDP transfer."""
     sent_index = packets.match.sent_index
-    is_chosen = np.append(packets.chosen, False)[sent_index]  # the last entry is for match.NONE
-    received, datagram = packets.received.where(is_chosen), np.append(packets.datagram, NONE)[sent_index[is_chosen]]
+    is_of_transfer = np.append(packets.is_transfer_packet, False)[sent_index]  # the last entry is for match.NONE
+    received, datagram = (
+        packets.received.where(is_of_transfer),
+        np.append(packets.datagram, NONE)[sent_index[is_of_transfer]],
+    )
     time_ns = received.time_ns
     if not len(received) or (time_ns == NO_TIME).any():
         return Rates(None, None)
     throughput = _throughput(received, np.ones(len(received), dtype=np.bool_), _ip_bytes(received))
     # A datagram is complete when its last fragment arrives; duplicates of fragments are ignored.
-    completes = udp.complete(packets)[datagram] & ~packets.match.duplicates[is_chosen]
-    if not completes.any():
+    is_useful = udp.complete(packets)[datagram] & ~packets.match.duplicates[is_of_transfer]
+    if not is_useful.any():
         return Rates(throughput, None)
     first = int(time_ns.argmin())
-    head_bytes = int(udp.payload_bytes(received)[first]) if completes[first] else 0
-    return Rates(throughput, float(time_ns[completes].max() - time_ns[first]) / 1e9, head_bytes)
+    head_bytes = int(udp.payload_bytes(received)[first]) if is_useful[first] else 0
+    return Rates(throughput, float(time_ns[is_useful].max() - time_ns[first]) / 1e9, head_bytes)
 
 
-def of_tcp(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
-    """Return the rates of a TCP transfer; only the throughput if it has several connections.
+def tcp_rates(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> Rates:
+    """Return the rates of a TCP transfer; if it has several connections, only the throughput.
 
     If offload joined segments into a frame, the headers of these segments are added.
 
     Args:
-        frames: Its frames in both captures.
+        frames: Frames of the transfer in both captures.
         receiver: Packets of the receiver's capture, including the answers.
         transfer: Identifies the packets of the transfer.
         counts: Counts of the frames.
@@ -123,9 +126,10 @@ def of_tcp(frames: tcp.TcpFrames, receiver: Packets, transfer: Transfer, counts:
 
 
 def _closed_ns(sent: Packets, receiver: Packets, transfer: Transfer, counts: tcp.TcpCounts) -> int | None:
-    """Return the time at which the receiver closed the connection after it acknowledged every byte, or None.
+    """Return the time at which the receiver closed the connection after it had acknowledged every byte, or None.
 
-    Netcat exits after it has read to the end of the connection. Its kernel's FIN shows that it received every byte.
+    netcat exits after it has read to the end of the connection. The FIN that its kernel then sends shows that it
+    received every byte.
     """
     is_syn = sent.tcp_flags & SYN != 0
     if len(np.unique(sent.sport)) != 1 or len(isn := np.unique(sent.tcp_seq[is_syn])) != 1:

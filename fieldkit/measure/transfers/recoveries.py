@@ -1,7 +1,7 @@
-"""Recovery of a flow after a fault: time from the end of its cause until the flow's first new payload.
+"""Recovery of a flow after a fault: time from the end of the fault's cause to the first new payload of the flow.
 
-The laptop records start and end of the cause by its clock. Exchanges of time stamps give the offset of the receiver's
-clock and its maximum error.
+The laptop records start and end of the cause by its clock. The offset of the receiver's clock and its maximum error
+are computed from exchanges of time stamps.
 """
 
 import re
@@ -39,8 +39,8 @@ class FaultTimes:
     """Times of a fault.
 
     Attributes:
-        began_ns: Start of its cause, nanoseconds since 1970 UTC by the laptop's clock.
-        ended_ns: End of its cause; None if unknown.
+        began_ns: Start of the cause, nanoseconds since 1970 UTC by the laptop's clock.
+        ended_ns: End of the cause; None if unknown.
         clock_offsets: Offset of each robot's clock from the laptop's, by role.
     """
 
@@ -50,12 +50,12 @@ class FaultTimes:
 
 
 def fault_times_text(times: FaultTimes) -> str:
-    """Return the content of a file that `read_fault_times` reads."""
-    ended = "unknown" if times.ended_ns is None else str(times.ended_ns)
+    """Return the content of a file with the times of a fault, as `read_fault_times` reads it."""
+    end_text = "unknown" if times.ended_ns is None else str(times.ended_ns)
     lines = (
         f"ahead_s {role} {offset.offset_s:.9f} {offset.error_s:.9f}\n" for role, offset in times.clock_offsets.items()
     )
-    return f"began_utc_ns {times.began_ns}\nended_utc_ns {ended}\n{''.join(lines)}"
+    return f"began_utc_ns {times.began_ns}\nended_utc_ns {end_text}\n{''.join(lines)}"
 
 
 def read_fault_times(path: Path) -> FaultTimes:
@@ -80,8 +80,8 @@ def parse_fault_times(content: str) -> FaultTimes:
     if match is None:
         raise EvidenceError("does not contain the start and end of the fault")
     words = (line.split() for line in match["ahead"].splitlines())
-    ahead = {Role(role): Offset(float(offset_s), float(error_s)) for _, role, offset_s, error_s in words}
-    return FaultTimes(int(match["began"]), None if match["ended"] == "unknown" else int(match["ended"]), ahead)
+    offsets = {Role(role): Offset(float(offset_s), float(error_s)) for _, role, offset_s, error_s in words}
+    return FaultTimes(int(match["began"]), None if match["ended"] == "unknown" else int(match["ended"]), offsets)
 
 
 FLOWS: Final = ("transfer", "iperf3", "soak", "topic")
@@ -89,9 +89,9 @@ FLOWS: Final = ("transfer", "iperf3", "soak", "topic")
 
 CROSS_CHECKS: Final = (
     CrossCheck(
-        quantity="time from the end of a fault to new payload of a flow, and the longest time without any around it",
+        quantity="time from the end of a fault to new payload of a flow, and longest time without payload around it",
         columns=tuple(f"{flow}_*_{part}_*" for flow in FLOWS for part in ("recovery", "outage")),
-        source="receiver's capture, for a topic the subscriber's log: deliveries; `fault-KIND-times.txt`: the fault",
+        source="deliveries in the receiver's capture (topics: in the subscriber's log); `fault-KIND-times.txt`",
         against=(
             "`fault-KIND-times.txt`: exchanges of time stamps with the receiver",
             "both captures: the clock offset",
@@ -102,7 +102,7 @@ CROSS_CHECKS: Final = (
 )
 
 MAX_ERROR_S: Final = 0.1
-"""Largest permitted error of the receiver's clock offset: the interval of the fault's ping."""
+"""Maximum error of the receiver's clock offset: the interval of the fault's ping."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,10 @@ def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
         (
             f"{outage}_s",
             "s",
-            f"Longest time without new payload of the {flow} that overlaps the fault {kind}; empty if it has no end.",
+            (
+                f"Longest time without new payload of the {flow} that overlaps the fault {kind}; empty if it had not "
+                f"ended when the {flow} did."
+            ),
             Figure(f"{flow} outage around {kind}", Kind.MEDIAN, rank=80 + index, at_least=f"{outage}_at_least_s"),
         ),
         (
@@ -139,17 +142,17 @@ def declare_columns(flow: str, kind: FaultKind) -> tuple[Column, ...]:
             "s",
             (
                 f"Time from the end of the cause of {kind} to the first new payload of the {flow} at its receiver; "
-                "with several streams the longest. Empty if no new payload arrived, if the end of the cause is "
-                f"unknown, and if the error of the receiver's clock can be above {MAX_ERROR_S:g} s."
+                "with several streams, the longest of their times. Empty if no new payload arrived, if the end of "
+                f"the cause is unknown, and if the error of the receiver's clock can be above {MAX_ERROR_S:g} s."
             ),
             Figure(f"{flow} recovery after {kind}", Kind.MEDIAN, rank=80 + index, at_least=f"{recovery}_at_least_s"),
         ),
-        (f"{outage}_at_least_s", "s", f"Lower bound of {outage}_s if the outage had not ended, else empty."),
-        (f"{recovery}_at_least_s", "s", f"Lower bound of {recovery}_s if no new payload arrived, else empty."),
+        (f"{outage}_at_least_s", "s", f"Lower bound of {outage}_s if the outage had not ended; otherwise empty."),
+        (f"{recovery}_at_least_s", "s", f"Lower bound of {recovery}_s if no new payload arrived; otherwise empty."),
     )
 
 
-def find(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecovery:
+def find_recovery(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecovery:
     """Return the effect of a fault on a stream; times are by the receiver's clock.
 
     Raises:
@@ -164,19 +167,19 @@ def find(delivery: Delivery, began_ns: int, ended_ns: int | None) -> FaultRecove
     if last_ns <= began_ns:
         raise EvidenceError("the flow ended before the fault")
     before, after = (int(np.searchsorted(at_ns, time_ns, side="right")) for time_ns in (began_ns, cause_end_ns))
-    recovered = after < len(at_ns)
-    if not recovered and delivery.end_ns is None:
+    has_recovered = after < len(at_ns)
+    if not has_recovered and delivery.end_ns is None:
         raise EvidenceError("all payload of the flow arrived before the end of the cause")
     longest_gap_s = float(np.diff(at_ns[max(before - 1, 0) : after + 1]).max(initial=0)) / 1e9
     before_first_s = 0.0 if before else (int(at_ns[0]) - delivery.begin_ns) / 1e9
-    after_last_s = 0.0 if recovered else (last_ns - int(at_ns[-1])) / 1e9
-    recovery_ns = int(at_ns[after]) - cause_end_ns if recovered else last_ns - cause_end_ns
-    observed = ended_ns is not None and (recovered or recovery_ns > 0)
+    after_last_s = 0.0 if has_recovered else (last_ns - int(at_ns[-1])) / 1e9
+    recovery_ns = int(at_ns[after]) - cause_end_ns if has_recovered else last_ns - cause_end_ns
+    is_observed = ended_ns is not None and (has_recovered or recovery_ns > 0)
     return FaultRecovery(
         outage_s=max(longest_gap_s, before_first_s, after_last_s),
-        outage_open=not recovered,
-        recovery_s=recovery_ns / 1e9 if observed else None,
-        recovery_open=not recovered,
+        outage_open=not has_recovered,
+        recovery_s=recovery_ns / 1e9 if is_observed else None,
+        recovery_open=not has_recovered,
     )
 
 
@@ -188,14 +191,14 @@ def measure(
     Args:
         flow: Kind of flow.
         kind: Kind of fault.
-        deliveries: Returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
+        deliveries: Function that returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
         times: Times of the fault; None if they were not recorded.
         role: Role of the receiving robot.
     """
     declared_columns = declare_columns(flow, kind)
     try:
         began_ns, ended_ns = _fault_times_at(times, role)
-        streams = [find(delivery, began_ns, ended_ns) for delivery in deliveries()]
+        streams = [find_recovery(delivery, began_ns, ended_ns) for delivery in deliveries()]
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:
@@ -209,7 +212,7 @@ def measure(
     recoveries_s = [stream.recovery_s for stream in streams if stream.recovery_s is not None]
     if recoveries_s and len(recoveries_s) == len(streams):
         values[_column_name(recovery, any(stream.recovery_open for stream in streams))] = max(recoveries_s)
-    reason = "the end of the cause is unknown, or the other column of the pair has the value"
+    reason = "the end of the cause is unknown, or the value is in the other column of the pair"
     return Measured(values, {column.name: reason for column in declared_columns if column.name not in values})
 
 
@@ -221,10 +224,10 @@ def _fault_times_at(times: FaultTimes | None, role: Role) -> tuple[int, int | No
     """Return start and end of a fault by the clock of a robot."""
     if times is None:
         raise EvidenceError("the start of the fault is unknown")
-    ahead = times.clock_offsets.get(role)
-    if ahead is None:
+    clock_offset = times.clock_offsets.get(role)
+    if clock_offset is None:
         raise EvidenceError(f"the clock offset of the {role} is unknown")
-    if ahead.error_s > MAX_ERROR_S:
-        raise EvidenceError(f"the clock offset of the {role} has an error of up to {ahead.error_s:.3f} s")
-    ahead_ns = round(1e9 * ahead.offset_s)
-    return times.began_ns + ahead_ns, None if times.ended_ns is None else times.ended_ns + ahead_ns
+    if clock_offset.error_s > MAX_ERROR_S:
+        raise EvidenceError(f"the clock offset of the {role} has an error of up to {clock_offset.error_s:.3f} s")
+    offset_ns = round(1e9 * clock_offset.offset_s)
+    return times.began_ns + offset_ns, None if times.ended_ns is None else times.ended_ns + offset_ns

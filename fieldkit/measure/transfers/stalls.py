@@ -1,10 +1,10 @@
 """Stalls of a flow: times during which new payload was overdue at its receiver.
 
-Payload is overdue from the previous delivery on; in a flow with a fixed rate, from one sending interval after it on.
-Time in which the sender had nothing to send is therefore not part of a stall. Overdue time longer than
-`Delivery.min_stall_s` is a stall. Time before the first payload, during which a connection is established, and time
-after the last payload, while more was due, are included only if they are also longer than this. A stall after the
-last payload is right-censored: it had not ended when the flow ended.
+Payload is overdue from the previous delivery on; in a flow with a fixed rate, from one sending interval after the
+previous delivery on. Time in which the sender has nothing to send is therefore not part of a stall. A stall is a time
+longer than `Delivery.min_stall_s` during which payload is overdue. The time before the first payload, in which a
+connection is established, and the time after the last payload are included only if they are longer than this. A stall
+after the last payload is right-censored: it had not ended when the flow ended.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,12 +28,12 @@ from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.measure.transfers.udp import UdpPackets
 
 RANK: Final = 120
-"""Position of the columns in trial.csv: after the columns of earlier versions."""
+"""Rank of the columns in trial.csv: after the columns of earlier versions."""
 
 
 @dataclass(frozen=True)
 class Stalls:
-    """Stalls of one stream or of several.
+    """Stalls of one or several streams.
 
     Attributes:
         longest_s: Longest time during which payload was overdue, even if it is too short for a stall.
@@ -50,9 +50,9 @@ def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
     """Return the columns for a kind of flow.
 
     Args:
-        flow: Prefix of the columns' names: `transfer`.
-        label: Name of the flow in their labels: `the transfer`.
-        rank: Rank of their figures.
+        flow: Prefix of the columns' names, such as `transfer`.
+        label: Name of the flow in the columns' labels, such as `the transfer`.
+        rank: Rank of the columns' figures.
     """
     bound = f"{flow}_stall_at_least_s"
     return columns(
@@ -61,7 +61,7 @@ def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
             f"{flow}_stall_s",
             "s",
             (
-                "Longest time of any stream during which new payload was overdue at the receiver. "
+                "Longest time during which new payload of a stream was overdue at the receiver. "
                 "Empty if a stall had not ended, and without complete captures of both ends."
             ),
             Figure(f"longest stall of {label}", Kind.MEDIAN, rank=rank, at_least=bound),
@@ -70,17 +70,17 @@ def declare_columns(flow: str, label: str, rank: int) -> tuple[Column, ...]:
             f"{flow}_stalls",
             "count",
             (
-                "Number of times that new payload was overdue for more than 0.2 s, 2 round trips of TCP's handshake "
-                "and 3 sending intervals, in all streams together."
+                "Number of times that new payload of any stream was overdue for longer than 0.2 s, 2 round trips of "
+                "TCP's handshake and 3 sending intervals."
             ),
             Figure(f"stalls of {label}", Kind.MEAN, rank=rank),
         ),
-        (bound, "s", f"Lower bound of {flow}_stall_s if a stall had not ended, else empty."),
+        (bound, "s", f"Lower bound of {flow}_stall_s if a stall had not ended; otherwise empty."),
     )
 
 
 def cross_checks(flow: str) -> tuple[CrossCheck, ...]:
-    """Return the sources of the columns for a kind of flow, and the checks between them."""
+    """Return the sources of the columns for a kind of flow, and the cross-checks between these sources."""
     return (
         CrossCheck(
             quantity="time without new payload at the receiver",
@@ -88,7 +88,7 @@ def cross_checks(flow: str) -> tuple[CrossCheck, ...]:
             source="receiver's capture: times of the frames that deliver new payload",
             against=(
                 "sender's capture: the same packets, and the clock offset that fits both captures",
-                "`ROLE-before.txt` and `ROLE-after.txt`: whether a clock was set",
+                "`ROLE-before.txt` and `ROLE-after.txt`: clocks that were set",
             ),
             tolerance="packets may be out of order by 0.1 s, because two processors capture them",
             outcome=CheckOutcome.WITHHELD,
@@ -96,7 +96,7 @@ def cross_checks(flow: str) -> tuple[CrossCheck, ...]:
     )
 
 
-def find(delivery: Delivery) -> Stalls:
+def find_stalls(delivery: Delivery) -> Stalls:
     """Return the stalls of a stream.
 
     Raises:
@@ -110,18 +110,18 @@ def find(delivery: Delivery) -> Stalls:
     after_s = 0.0
     if delivery.end_ns is not None:
         after_s = (delivery.end_ns - int(at_ns[-1])) / 1e9 - delivery.interval_s
-    ends_s = [seconds for seconds in (before_s, after_s) if seconds > min_stall_s]
-    if not len(overdue_s) and not ends_s:
+    edge_stalls_s = [seconds for seconds in (before_s, after_s) if seconds > min_stall_s]
+    if not len(overdue_s) and not edge_stalls_s:
         raise EvidenceError("only one packet of the flow arrived, so no time can be computed")
     return Stalls(
-        longest_s=max(float(overdue_s.max(initial=0.0)), *ends_s, 0.0),
-        count=int((overdue_s > min_stall_s).sum()) + len(ends_s),
+        longest_s=max(float(overdue_s.max(initial=0.0)), *edge_stalls_s, 0.0),
+        count=int((overdue_s > min_stall_s).sum()) + len(edge_stalls_s),
         is_open=after_s > min_stall_s,
     )
 
 
 def _stall_without_arrivals(delivery: Delivery) -> Stalls:
-    """Return the stall of a stream without any arrival: all of its duration."""
+    """Return the stall of a stream of which nothing arrived: its whole duration."""
     duration_s = ((delivery.end_ns or delivery.begin_ns) - delivery.begin_ns) / 1e9
     if duration_s <= 0:
         raise EvidenceError("no packet of the flow arrived, and only one was sent")
@@ -133,11 +133,11 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
 
     Args:
         flow: As for `declare_columns`.
-        deliveries: Returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
+        deliveries: Function that returns the deliveries of each stream; raises `EvidenceError` if they are unknown.
     """
     declared_columns = declare_columns(flow, flow, 0)
     try:
-        streams = [find(delivery) for delivery in deliveries()]
+        streams = [find_stalls(delivery) for delivery in deliveries()]
     except EvidenceError as error:
         return Measured.all_missing(declared_columns, error.what)
     if not streams:
@@ -151,16 +151,16 @@ def measure(flow: str, deliveries: Callable[[], Sequence[Delivery]]) -> Measured
 
 
 def flow_schedule(evidence: AttemptEvidence, transfer: Transfer, listener: str) -> FlowSchedule:
-    """Return the known properties of a transfer; its sender always has more to send until the end of the file.
+    """Return the known properties of a transfer. Its sender always has data to send until the end of the file.
 
     Args:
         evidence: The attempt's evidence.
         transfer: The transfer.
-        listener: Job that received the file; empty if unknown.
+        listener: Name of the job that received the file; empty if unknown.
     """
     return FlowSchedule(
         size_bytes=evidence.read_or_none(reading.size, transfer.sent_file),
-        until_ns=robot_clock.job_end_ns(evidence, transfer.destination, listener),
+        receiver_end_ns=robot_clock.job_end_ns(evidence, transfer.destination, listener),
     )
 
 
@@ -168,9 +168,9 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
     """Return the deliveries of each connection; arguments as for `flow_schedule`.
 
     Raises:
-        EvidenceError: They cannot be determined from the captures.
+        EvidenceError: The deliveries cannot be determined from the captures.
     """
-    sender, receiver = (evidence.whole_capture(file) for file in transfer.captures)
+    sender, receiver = (evidence.undamaged_capture(file) for file in transfer.captures)
     if sender is None or receiver is None:
         raise EvidenceError("there are no complete captures of both ends")
     schedule = flow_schedule(evidence, transfer, listener)
@@ -181,12 +181,12 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
 
 
 def udp_deliveries(packets: UdpPackets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of a UDP transfer; errors as `deliveries.of_udp`."""
-    return [deliveries.of_udp(packets, packets.is_transfer[:-1], schedule)]
+    """Return the deliveries of a UDP transfer; errors as `deliveries.udp_delivery`."""
+    return [deliveries.udp_delivery(packets, packets.is_transfer_datagram[:-1], schedule)]
 
 
 def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of each connection of a TCP transfer; errors as `deliveries.of_tcp`.
+    """Return the deliveries of each connection of a TCP transfer; errors as `deliveries.tcp_delivery`.
 
     Args:
         frames: Frames of the connections in both captures.
@@ -195,9 +195,9 @@ def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) 
     """
     ports = np.unique(frames.sent.sport)
     if len(ports) == 1:
-        return [deliveries.of_tcp(frames, answers.where(answers.dport == ports[0]), schedule)]
+        return [deliveries.tcp_delivery(frames, answers.where(answers.dport == ports[0]), schedule)]
     return [
-        deliveries.of_tcp(
+        deliveries.tcp_delivery(
             tcp.match_frames(
                 frames.sent.where(frames.sent.sport == port), frames.received.where(frames.received.sport == port)
             ),

@@ -1,7 +1,8 @@
 """Loss of a TCP transfer, counted by sequence ranges.
 
-A byte is identified by its sequence number (RFC 9293, section 3.4), so the counts are not changed by reordering,
-duplicates, retransmissions, partial overlaps, or segmentation offload, which joins segments into larger frames.
+A byte is identified by its sequence number (RFC 9293, section 3.4). The counts are therefore independent of
+reordering, duplicates, retransmissions, partial overlaps, and segmentation offload, which joins segments into larger
+frames.
 """
 
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ class TcpFrames:
     Attributes:
         sent: Frames in the sender's capture.
         received: Frames in the receiver's capture.
-        payload: Match between their pieces of payload.
-        mss_bytes: Largest MSS in a SYN of either end; 0 if no SYN has one.
+        payload: Match between the pieces of payload of both captures.
+        mss_bytes: Largest MSS in a SYN of either end; 0 if no SYN has an MSS.
     """
 
     sent: Packets
@@ -37,23 +38,23 @@ class TcpCounts:
     """Counts of frames and bytes that left the sender and that reached the receiver's interface.
 
     Attributes:
-        frames_sent: Frames captured at the sender, including frames without payload.
-        frames_received: Frames captured at the receiver; offload may change the number.
-        sent_bytes: Payload bytes sent, including retransmissions.
-        unique_bytes: Payload bytes sent, each sequence number once.
-        received_bytes: Payload bytes sent that arrived; a copy that was not sent is not counted.
+        frames_sent: Frames in the sender's capture, including frames without payload.
+        frames_received: Frames in the receiver's capture. Offload may change the number of frames.
+        sent_bytes: Sent payload bytes, including retransmissions.
+        unique_bytes: Sent payload bytes; each sequence number is counted once.
+        received_bytes: Sent payload bytes that arrived; copies that were not sent are not counted.
         lost_bytes: Unique bytes that never reached the receiver.
-        duplicated_bytes: Payload bytes received in addition to the first copy of each sequence number.
-        retransmitted_frames: Frames whose range had been sent before, completely or partly.
-        spurious_frames: Frames that were sent without need, because each of their bytes had been sent before in a
-            frame that reached the receiver at any time. None if frames are ambiguous.
-        reordered_frames: Frames received whose first byte was sent before a byte that had arrived; only the first of
-            several copies counts. None if frames are ambiguous.
-        superframes: Frames of either capture with more payload than the largest MSS in a SYN: offload joined several
-            segments. None if no SYN has an MSS.
+        duplicated_bytes: Received payload bytes without the first copy of each sequence number.
+        retransmitted_frames: Frames with bytes that had been sent before.
+        spurious_frames: Frames that were not necessary, because each of their bytes had been sent before in a frame
+            that reached the receiver at any time. None if frames are ambiguous.
+        reordered_frames: Received frames whose first byte was sent before a byte that had already arrived; only the
+            first of several copies is counted. None if frames are ambiguous.
+        superframes: Frames of either capture with more payload than the largest MSS in a SYN, because offload joined
+            several segments. None if no SYN has an MSS.
         ambiguous_frames: Frames with bytes that were sent several times and arrived, if neither time stamps nor IP
-            ids nor the time between them show which copy arrived.
-        possible_copies: Frames received that may be copies and hide a loss: see `Match.possible_copy`.
+            ids nor the time between the frames show which copy arrived.
+        possible_copies: Received frames that may be copies and hide a loss (see `Match.possible_copy`).
         transfer_s: Time from the first frame to the last frame with payload at the receiver, in seconds; None without
             payload.
     """
@@ -77,8 +78,8 @@ class TcpCounts:
 def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> TcpFrames:
     """Match the frames of a TCP transfer in both captures.
 
-    A connection is included if its SYN is in the sender's capture. This excludes retransmissions of
-    an aborted earlier transfer, which may continue for minutes.
+    A connection is included if its SYN is in the sender's capture. This excludes retransmissions of an aborted
+    earlier transfer, which may continue for minutes.
 
     Raises:
         EvidenceError: As for `tcp_streams.cut`.
@@ -106,7 +107,7 @@ def count(frames: TcpFrames) -> TcpCounts:
     times_sent, times_received = (
         np.bincount(pieces.range_id, minlength=range_count) for pieces in (sent_pieces, received_pieces)
     )
-    ambiguous = len(np.unique(sent_pieces.frame[payload.match.ambiguous]))
+    ambiguous_count = len(np.unique(sent_pieces.frame[payload.match.ambiguous]))
     size_bytes = np.zeros(range_count, dtype=np.int64)
     size_bytes[sent_pieces.range_id], size_bytes[received_pieces.range_id] = (
         sent_pieces.size_bytes,
@@ -121,21 +122,22 @@ def count(frames: TcpFrames) -> TcpCounts:
         lost_bytes=int(size_bytes[(times_sent > 0) & (times_received == 0)].sum()),
         duplicated_bytes=int((np.maximum(times_received - 1, 0) * size_bytes).sum()),
         retransmitted_frames=int(sent_again(frames).sum()),
-        spurious_frames=None if ambiguous else _spurious(payload),
-        reordered_frames=None if ambiguous else _reordered(payload),
-        superframes=_superframes(frames),
-        ambiguous_frames=ambiguous,
+        spurious_frames=None if ambiguous_count else _count_spurious(payload),
+        reordered_frames=None if ambiguous_count else _count_reordered(payload),
+        superframes=_count_superframes(frames),
+        ambiguous_frames=ambiguous_count,
         possible_copies=len(np.unique(received_pieces.frame[payload.match.possible_copy])),
         transfer_s=span_s(received.time_ns, received.tcp_payload_bytes > 0),
     )
 
 
 def _is_repeated(pieces: Pieces, others: Pieces) -> Mask:
-    """Return a mask of the pieces whose frame is later than the first frame in `others` with the same bytes."""
+    """Return a mask of the pieces that are in a later frame than the first piece of `others` with the same bytes."""
     earliest = np.full(
         max(pieces.range_id.max(initial=-1), others.range_id.max(initial=-1)) + 1, np.iinfo(np.int64).max
     )
-    # If an index occurs several times, numpy stores the last value, which is the earliest frame here.
+    # If an index occurs several times, numpy stores the last value: the earliest frame, because the order is
+    # reversed.
     earliest[others.range_id[::-1]] = others.frame[::-1]
     mask: Mask = pieces.frame > earliest[pieces.range_id]
     return mask
@@ -143,18 +145,18 @@ def _is_repeated(pieces: Pieces, others: Pieces) -> Mask:
 
 def sent_again(frames: TcpFrames) -> Mask:
     """Return a mask of the frames in `frames.sent` with bytes that had been sent before."""
-    again = np.zeros(len(frames.sent), dtype=np.bool_)
-    again[frames.payload.sent.frame[_is_repeated(frames.payload.sent, frames.payload.sent)]] = True
-    return again
+    is_sent_again = np.zeros(len(frames.sent), dtype=np.bool_)
+    is_sent_again[frames.payload.sent.frame[_is_repeated(frames.payload.sent, frames.payload.sent)]] = True
+    return is_sent_again
 
 
-def _spurious(payload: Payload) -> int:
-    """Return the number of frames that repeat only bytes which reach the receiver from earlier frames."""
+def _count_spurious(payload: Payload) -> int:
+    """Return the number of frames all of whose bytes reached the receiver in earlier sent frames."""
     is_needless = _is_repeated(payload.sent, payload.sent.where(payload.match.arrived))
     return len(np.unique(payload.sent.frame)) - len(np.unique(payload.sent.frame[~is_needless]))
 
 
-def _reordered(payload: Payload) -> int:
+def _count_reordered(payload: Payload) -> int:
     """Return the number of received frames that arrived after bytes that were sent later."""
     first_copies = np.flatnonzero((payload.match.sent_index != NONE) & ~payload.match.duplicates)
     is_late = first_copies[reordered(payload.match.sent_index[first_copies])]
@@ -168,7 +170,7 @@ def _mss_bytes(sender: Packets, receiver: Packets, port: int) -> int:
     )
 
 
-def _superframes(frames: TcpFrames) -> int | None:
+def _count_superframes(frames: TcpFrames) -> int | None:
     mss = frames.mss_bytes
-    both = frames.sent, frames.received
-    return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in both) if mss else None
+    ends = frames.sent, frames.received
+    return sum(int((packets.tcp_payload_bytes > mss).sum()) for packets in ends) if mss else None

@@ -1,6 +1,6 @@
-"""TCP streams in captures: payload as ranges, bytes of each connection, and bytes that its receiver acknowledged.
+"""TCP streams in captures: payload as byte ranges, bytes of each connection, bytes that the receiver acknowledged.
 
-Ranges are cut at the same positions in two captures.
+The ranges of two captures start and end at the same positions, so that they can be compared.
 """
 
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ from fieldkit.measure.captures.arrays import Ints, Mask, Table, row_hashes
 from fieldkit.measure.captures.headers import TCP
 from fieldkit.measure.captures.packets import ACK, FIN, SYN, Packets
 
-# Upper limit of the length of a stream: byte positions of different connections are this far apart.
+# Upper limit of the length of a stream, and distance between the byte positions of two connections.
 _MAX_STREAM_BYTES: Final = 1 << 44
 
-# The number of pieces is quadratic if all frames overlap. It is not quadratic in a transfer, because each end of a
-# frame cuts only one other frame and its copies.
+# The number of pieces is quadratic if all frames overlap. In a transfer it is not, because each end of a frame
+# divides only one other frame and its copies.
 _PIECES_PER_FRAME: Final = 16
 _MIN_PIECE_LIMIT: Final = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
 class Pieces(Table):
-    """Pieces of payload in the order of the frames and, within a frame, of the bytes.
+    """Pieces of payload, in the order of the frames and of the bytes in a frame.
 
     Attributes:
         frame: Index of the frame that contains the piece.
@@ -38,23 +38,25 @@ class Pieces(Table):
 
 
 def cut(sent: Packets, received: Packets) -> tuple[Pieces, Pieces]:
-    """Cut the payload of the TCP frames in two captures into comparable pieces.
+    """Divide the payload of the TCP frames in two captures into comparable pieces.
 
     Raises:
-        EvidenceError: There are implausibly many overlaps, so that the pieces would fill the memory.
+        EvidenceError: There are implausibly many overlaps, so the pieces would need too much memory.
     """
     frames = [np.flatnonzero(packets.protocol == TCP) for packets in (sent, received)]
-    both = Packets.concatenated((sent.where(frames[0]), received.where(frames[1])))
-    connection_key = row_hashes(*both.src.T, *both.dst.T, both.sport << 16 | both.dport)
+    all_frames = Packets.concatenated((sent.where(frames[0]), received.where(frames[1])))
+    connection_key = row_hashes(*all_frames.src.T, *all_frames.dst.T, all_frames.sport << 16 | all_frames.dport)
     _, first, connection = np.unique(connection_key, return_index=True, return_inverse=True)
     sides = slice(0, len(frames[0])), slice(len(frames[0]), None)
-    start = np.concatenate([_starts(both.where(side), connection[side], both.tcp_seq[first]) for side in sides])
-    stop = start + both.tcp_payload_bytes
+    start = np.concatenate(
+        [_starts(all_frames.where(side), connection[side], all_frames.tcp_seq[first]) for side in sides]
+    )
+    stop = start + all_frames.tcp_payload_bytes
     edges = np.unique(np.concatenate((start, stop)))
     first = np.searchsorted(edges, start)
     count = np.searchsorted(edges, stop) - first
-    if count.sum() > _MIN_PIECE_LIMIT + _PIECES_PER_FRAME * len(both):
-        raise EvidenceError(f"{len(both)} TCP frames overlap in {count.sum()} pieces, too many for a transfer")
+    if count.sum() > _MIN_PIECE_LIMIT + _PIECES_PER_FRAME * len(all_frames):
+        raise EvidenceError(f"{len(all_frames)} TCP frames overlap in {count.sum()} pieces, too many for a transfer")
     size_bytes = np.diff(edges)
     sent_pieces, received_pieces = (
         _pieces(frame, first[side], count[side], size_bytes) for frame, side in zip(frames, sides, strict=True)
@@ -63,10 +65,10 @@ def cut(sent: Packets, received: Packets) -> tuple[Pieces, Pieces]:
 
 
 def _starts(packets: Packets, connection: Ints, base: Ints) -> Ints:
-    """Return the position in the stream at which each TCP frame's payload starts, with unwrapped sequence numbers.
+    """Return the position of each TCP frame's payload in its stream, with unwrapped sequence numbers.
 
-    Sequence numbers have 32 bits. The step between consecutive frames of a connection is taken as the difference with
-    the smaller magnitude; the first step starts from `base`.
+    Sequence numbers have 32 bits, so the difference between consecutive frames of a connection is ambiguous. The
+    value with the smaller magnitude is used. The first difference is relative to `base`.
     """
     order = np.argsort(connection, kind="stable")
     seq, number = packets.tcp_seq[order], connection[order]
@@ -82,21 +84,21 @@ def _starts(packets: Packets, connection: Ints, base: Ints) -> Ints:
 
 
 def _pieces(frame: Ints, first: Ints, count: Ints, size_bytes: Ints) -> Pieces:
-    """Return the pieces of frames, each consisting of `count` byte ranges from `first` on."""
+    """Return the pieces of frames. Each frame consists of `count` byte ranges from number `first` on."""
     range_id = np.arange(count.sum()) + np.repeat(first - (np.cumsum(count) - count), count)
     return Pieces(np.repeat(frame, count), range_id, size_bytes[range_id])
 
 
 LONGEST_BYTES: Final = 1 << 31
-"""For streams of this length or more, 32-bit sequence numbers are ambiguous."""
+"""32-bit sequence numbers are ambiguous in streams of this length or more."""
 
 _CONNECTION_BITS: Final = 33
-"""Number of bits for a position within a connection's interval, including positions before its start."""
+"""Number of bits of a position within a connection, including positions before its start."""
 
 
 @dataclass(frozen=True, eq=False)
 class ByteIntervals:
-    """Intervals of byte positions from `starts` up to and excluding `stops`; they may overlap."""
+    """Half-open intervals of byte positions, from `starts` to before `stops`. Intervals may overlap."""
 
     starts: Ints
     stops: Ints
@@ -107,23 +109,25 @@ class ByteIntervals:
         if not len(self.starts):
             return 0
         order = np.argsort(self.starts)
-        starts, reached = self.starts[order], np.maximum.accumulate(self.stops[order])
-        uncovered_from = np.maximum(starts[1:], reached[:-1])
-        return int(reached[0] - starts[0] + np.maximum(reached[1:] - uncovered_from, 0).sum())
+        starts, max_stops = self.starts[order], np.maximum.accumulate(self.stops[order])
+        new_from = np.maximum(starts[1:], max_stops[:-1])
+        return int(max_stops[0] - starts[0] + np.maximum(max_stops[1:] - new_from, 0).sum())
 
     def bytes_not_in(self, other: "ByteIntervals") -> int:
-        """Return the number of bytes that these intervals cover and `other` does not."""
-        both = ByteIntervals(np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops)))
-        return both.size_bytes - other.size_bytes
+        """Return the number of bytes that these intervals cover, but `other` does not cover."""
+        all_frames = ByteIntervals(
+            np.concatenate((self.starts, other.starts)), np.concatenate((self.stops, other.stops))
+        )
+        return all_frames.size_bytes - other.size_bytes
 
 
 @dataclass(frozen=True, eq=False)
 class Connections:
-    """Connections to a transfer's port whose SYN is in a capture.
+    """Connections to the port of a transfer, if their SYN is in a capture.
 
     Attributes:
         ports: Sender's port of each connection, ascending.
-        first_seq: Sequence number of its first byte.
+        first_seq: Sequence number of the first byte of each connection.
     """
 
     ports: Ints
@@ -143,16 +147,16 @@ class Connections:
     def payload(self, frames: Packets) -> ByteIntervals:
         """Return the payload bytes in frames from sender to receiver."""
         selected = frames.where(self.includes(frames.sport) & (frames.tcp_payload_bytes > 0))
-        # SYN consumes a sequence number before the data that TCP Fast Open lets it carry (RFC 7413).
+        # A SYN consumes a sequence number before its data, which it may contain with TCP Fast Open (RFC 7413).
         starts = self._positions(selected.sport, selected.tcp_seq + (selected.tcp_flags & SYN != 0))
         return ByteIntervals(starts, starts + selected.tcp_payload_bytes)
 
     def numbers(self, frames: Packets) -> ByteIntervals:
-        """Return the sequence numbers of bytes and of FINs; a FIN is acknowledged like one byte."""
-        ends = frames.where(self.includes(frames.sport) & (frames.tcp_flags & FIN != 0))
-        stops = self._positions(ends.sport, ends.tcp_seq) + ends.tcp_payload_bytes
-        carried = self.payload(frames)
-        return ByteIntervals(np.concatenate((carried.starts, stops)), np.concatenate((carried.stops, stops + 1)))
+        """Return the sequence numbers of payload bytes and of FINs, which consume one sequence number each."""
+        fin_frames = frames.where(self.includes(frames.sport) & (frames.tcp_flags & FIN != 0))
+        stops = self._positions(fin_frames.sport, fin_frames.tcp_seq) + fin_frames.tcp_payload_bytes
+        payload = self.payload(frames)
+        return ByteIntervals(np.concatenate((payload.starts, stops)), np.concatenate((payload.stops, stops + 1)))
 
     def acknowledged(self, answers: Packets) -> ByteIntervals:
         """Return the sequence numbers that frames from receiver to sender acknowledge."""

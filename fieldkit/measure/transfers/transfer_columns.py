@@ -13,7 +13,7 @@ FILES: Final = columns(
     (
         "file_loss",
         "share",
-        "1 - received_bytes/sent_bytes, the bytes that the application missed.",
+        "1 - received_bytes/sent_bytes: the share of the bytes that the application did not receive.",
         Figure("file loss", Kind.MEAN, rank=14),
         NEGATIVE_LOSS_BOUNDS,
     ),
@@ -26,12 +26,15 @@ LAYERS: Final = columns(
     (
         "ip_packets_sent",
         "count",
-        "IP packets of the transfer that left the sender (its capture), each fragment separately.",
+        "IP packets of the transfer in the sender's capture; each fragment is a packet.",
     ),
     (
         "ip_packets_received",
         "count",
-        "ip_packets_sent that are in the receiver's capture, matched by IP id and offset; TCP: all frames captured.",
+        (
+            "Packets of ip_packets_sent that are in the receiver's capture, matched by IP id and offset. TCP: all "
+            "frames in the receiver's capture."
+        ),
     ),
     (
         "ip_loss",
@@ -42,13 +45,13 @@ LAYERS: Final = columns(
     (
         "ip_packets_duplicated",
         "count",
-        "Further copies of ip_packets_sent in the receiver's capture. Empty for TCP: see tcp_duplicated_bytes.",
+        "Further copies of sent packets in the receiver's capture. Empty for TCP: see tcp_duplicated_bytes.",
     ),
     (
         "ip_packets_reordered",
         "count",
         (
-            "ip_packets_received that arrived after a packet that was sent later (RFC 4737, section 3)."
+            "Packets of ip_packets_received that arrived after a packet that was sent later (RFC 4737, section 3)."
             " Empty if packets are ambiguous, and for TCP: see tcp_reordered_segments."
         ),
     ),
@@ -56,24 +59,24 @@ LAYERS: Final = columns(
         "ip_packets_doubtful",
         "count",
         (
-            "ip_packets_sent that are ambiguous: equal in headers and content to others that were sent at nearly the"
-            " same time, and only some of which arrived. Empty for TCP."
+            "Packets of ip_packets_sent that are ambiguous: their headers and contents equal those of other packets"
+            " that were sent at nearly the same time, and only some of these packets arrived. Empty for TCP."
         ),
     ),
     (
         "ip_loss_bursts",
         "count",
         (
-            "Runs of lost packets among ip_packets_sent, in the order of sending. Empty for TCP, and if packets"
-            " are ambiguous and some were lost."
+            "Runs of consecutively sent packets that were lost. Empty for TCP, and if packets are ambiguous and"
+            " some were lost."
         ),
     ),
-    ("ip_loss_longest_burst", "count", "Packets in the longest run of lost packets; empty if ip_loss_bursts is."),
+    ("ip_loss_longest_burst", "count", "Packets in the longest such run; empty if ip_loss_bursts is empty."),
     ("datagrams_sent", "count", "UDP datagrams that left the sender. Empty for TCP."),
     (
         "datagrams_received",
         "count",
-        "UDP datagrams all of whose fragments reached the receiver's interface. Empty for TCP.",
+        "UDP datagrams of which all fragments reached the receiver's interface. Empty for TCP.",
     ),
     (
         "datagram_loss",
@@ -87,68 +90,69 @@ LAYERS: Final = columns(
         "Share of the transfer's payload bytes that never reached the receiver's interface.",
         Figure("payload byte loss", Kind.MEAN, rank=13),
     ),
-    ("tcp_sent_bytes", "B", "TCP payload bytes sent, retransmissions included. Empty for UDP."),
-    ("tcp_unique_bytes", "B", "TCP payload bytes sent, each sequence number once. Empty for UDP."),
+    ("tcp_sent_bytes", "B", "Sent TCP payload bytes, including retransmissions. Empty for UDP."),
+    ("tcp_unique_bytes", "B", "Sent TCP payload bytes; each sequence number counts once. Empty for UDP."),
     (
         "tcp_received_bytes",
         "B",
         (
-            "tcp_sent_bytes that are in the receiver's capture; further copies of bytes that were sent fewer times "
-            "do not count. Empty if a copy may hide a loss, and for UDP."
+            "Bytes of tcp_sent_bytes that are in the receiver's capture; if a byte arrived more often than it was "
+            "sent, the further copies do not count. Empty if a copy may hide a loss, and for UDP."
         ),
     ),
     (
         "tcp_byte_loss",
         "share",
-        "1 - tcp_received_bytes/tcp_sent_bytes: the loss on the radio, repaired by TCP. Empty for UDP.",
+        "1 - tcp_received_bytes/tcp_sent_bytes: the loss on the link, which TCP repairs. Empty for UDP.",
         Figure("TCP byte loss before retransmission", Kind.MEAN, rank=12),
     ),
     (
         "tcp_retransmitted_segments",
         "count",
-        "Data frames sent whose sequence range had been sent before, completely or partly. Empty for UDP.",
+        "Sent data frames with bytes that had been sent before. Empty for UDP.",
     ),
     (
         "tcp_spurious_segments",
         "count",
         (
-            "tcp_retransmitted_segments that were not needed: an earlier copy of every byte reached the receiver's "
-            "interface, before or after. Empty if segments are ambiguous, and for UDP."
+            "Segments of tcp_retransmitted_segments that were not necessary: an earlier copy of each byte reached "
+            "the receiver's interface at any time. Empty if segments are ambiguous, and for UDP."
         ),
     ),
     (
         "tcp_duplicated_bytes",
         "B",
-        "TCP payload bytes in the receiver's capture beyond the first copy of each. Empty for UDP.",
+        "TCP payload bytes in the receiver's capture, without the first copy of each byte. Empty for UDP.",
     ),
     (
         "tcp_reordered_segments",
         "count",
         (
-            "Data frames received whose first byte was sent before one that had arrived; a retransmission counts as "
-            "sent when it was retransmitted. Empty if segments are ambiguous, and for UDP."
+            "Received data frames whose first byte was sent before a byte that had already arrived. The time of "
+            "sending of a retransmission is the time at which it was retransmitted. Empty if segments are ambiguous, "
+            "and for UDP."
         ),
     ),
     (
         "tcp_doubtful_segments",
         "count",
         (
-            "Data frames sent with bytes that were sent several times and arrived, if neither time stamps nor IP "
-            "ids nor the time between them show which copy arrived. Empty for UDP."
+            "Sent data frames with bytes that were sent several times and arrived, if neither time stamps nor IP "
+            "ids nor the time between the frames show which copy arrived. Empty for UDP."
         ),
     ),
     (
         "tcp_superframes",
         "count",
         (
-            "Data frames in either capture with more payload than the largest MSS in a SYN: offload joined several "
-            "segments. Empty for UDP, and if no SYN has an MSS."
+            "Data frames in either capture with more payload than the largest MSS in a SYN, because offload joined "
+            "several segments. Empty for UDP, and if no SYN has an MSS."
         ),
     ),
     (
         "transfer_s",
         "s",
-        "Time from the first frame of the transfer to its last with payload, both in the capture of transfer_from.",
+        "Time from the first frame of the transfer to the last frame with payload, in the capture of transfer_from.",
         Figure("transfer time", Kind.MEDIAN, rank=35),
     ),
     ("transfer_from", "text", "Robot whose capture gives transfer_s: receiver."),
@@ -178,12 +182,12 @@ PAPER: Final = columns(
     (
         "paper_packets",
         "count",
-        "Frames counted at the sender by the paper's filter, src and port of the transfer.",
+        "Frames in the sender's capture that match the paper's filter: src and port of the transfer.",
     ),
     (
         "paper_received",
         "count",
-        "Frames counted at the receiver by the paper's filter, dst and port of the transfer.",
+        "Frames in the receiver's capture that match the paper's filter: dst and port of the transfer.",
     ),
     ("paper_window_bytes", "B", "Ping payload that the paper uses for the protocol: TCP 502, UDP 8192."),
     (
@@ -195,7 +199,7 @@ PAPER: Final = columns(
     (
         "paper_loss",
         "share",
-        "1 - paper_received/paper_packets; of a fragmented packet only the first fragment counts.",
+        "1 - paper_received/paper_packets; only the first fragment of a fragmented packet counts.",
         Figure("paper's loss (eq. 1)", Kind.COUNTED, "paper_received", "paper_packets", rank=15),
         NEGATIVE_LOSS_BOUNDS,
     ),
@@ -218,7 +222,7 @@ COLUMNS: Final[tuple[Column, ...]] = (
 )
 
 TIMES: Final = [column for column in LAYERS if column.name in {"transfer_s", "transfer_from"}]
-"""Columns that depend on one clock only, the receiver's."""
+"""Columns that depend only on the receiver's clock."""
 
 OF_TCP: Final = frozenset(column.name for column in LAYERS if column.name.startswith("tcp_"))
 OF_UDP: Final = frozenset(

@@ -1,8 +1,8 @@
-"""All columns of one transfer, computed from files, captures, ping and host counters.
+"""All columns of one transfer, computed from files, captures, the output of ping, and counters of the hosts.
 
-The columns of the paper are computed as in its procedure, for comparison with the columns of fieldkit. Its filters
-are tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches
-either port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
+The columns of the paper are computed as in the paper, for comparison with the columns of fieldkit. The paper's
+filters are tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port`
+matches the source or destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from fieldkit.measure.transfers.transfer_columns import DISTANCE, LAYERS, OF_TCP
 from fieldkit.measure.transfers.transfer_spec import Transfer
 
 PAPER_WINDOW_BYTES: Final[Mapping[Protocol, int]] = MappingProxyType({Protocol.TCP: 502, Protocol.UDP: 8192})
-"""Ping payload that the paper uses as the window of each protocol."""
+"""Payload of a ping that the paper uses as the window of each protocol."""
 
 PAPER_COUNTS: Final = ("paper_packets", "paper_received", "paper_loss", "paper_transfer_s")
 """Columns that depend on the counts of the paper's filters, which may include packets of other transfers."""
@@ -43,7 +43,7 @@ def paper_frames_to(packets: Packets, address: str, port: int) -> int:
 
 
 def paper_transfer_s(packets: int, delay_s: float) -> float:
-    """Return the paper's transfer time: number of packets times the mean RTT of a ping with the window's payload."""
+    """Return the paper's transfer time: number of packets times the mean RTT of pings with the window as payload."""
     return packets * delay_s
 
 
@@ -55,18 +55,18 @@ def _has_port(packets: Packets, port: int) -> Mask:
 def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -> Measured:
     """Return all columns of a transfer.
 
-    Columns that depend on missing, unreadable or damaged evidence are missing. The gates determine whether the
-    repeat is valid without them.
+    Columns that depend on missing, unreadable or damaged evidence are missing. The gates decide if the repeat is
+    valid without them.
 
     Args:
         evidence: The attempt's evidence.
         transfer: The transfer.
-        listener: Job that received the file; empty if unknown.
+        listener: Name of the job that received the file; empty if unknown.
     """
-    captures = [evidence.whole_capture(file) for file in transfer.captures]
+    captures = [evidence.undamaged_capture(file) for file in transfer.captures]
     sender, receiver = captures if transfer.captured else (None, None)
     contradiction = incomparability_reason(evidence, transfer)
-    pings = evidence.read_or_none(ping.read, step_prefixed(transfer.name, ping.FILE))
+    ping_output = evidence.read_or_none(ping.read, step_prefixed(transfer.name, ping.FILE))
     states = (host.before_file(transfer.destination), host.after_file(transfer.destination))
     files = _files(evidence, transfer)
     air_delay = evidence.read_or_none(
@@ -86,48 +86,48 @@ def measure(evidence: AttemptEvidence, transfer: Transfer, listener: str = "") -
         | position_columns.measure(
             evidence, DISTANCE, (transfer.source, transfer.destination), _sent_ns(sender, transfer)
         )
-        | _paper(sender, None if contradiction else receiver, pings, transfer)
+        | _paper(sender, None if contradiction else receiver, ping_output, transfer)
         | host.measure(*(evidence.read_or_none(host.read, name) for name in states))
         | _system(evidence, transfer)
     )
 
 
 def _system(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
-    """Return the columns of the operating systems of both ends."""
+    """Return the columns of the hosts' operating systems."""
     if transfer.protocol is Protocol.UDP:
         return Measured.all_missing(host.SYSTEM, "UDP has no congestion control")
     return host.measure_system(evidence.read_or_none(host.congestion_control, host.before_file(transfer.source)))
 
 
 def incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
-    """Return the reason why no loss can be computed from two undamaged captures, or None if it can.
+    """Return the reason why no loss can be computed from two undamaged captures, or None if it can be computed.
 
-    The reason is a contradiction between the captures, or with the file. Without two captures there is no such
-    reason.
+    The reason is a contradiction between the two captures, or between a capture and the received file. The result is
+    None if an end has no capture.
     """
     return evidence.cached(_incomparability_reason, transfer) if transfer.captured else None
 
 
 def _incomparability_reason(evidence: AttemptEvidence, transfer: Transfer) -> str | None:
-    sender, receiver = map(evidence.whole_capture, transfer.captures)
+    sender, receiver = map(evidence.undamaged_capture, transfer.captures)
     if (
         sender
         and receiver
-        and (why := altered_packets.incomparability_reason(sender.packets, receiver.packets, transfer))
+        and (reason := altered_packets.incomparability_reason(sender.packets, receiver.packets, transfer))
     ):
-        return f"the captures of the transfer cannot be compared: {why}"
+        return f"the captures of the transfer cannot be compared: {reason}"
     if evidence.read_or_none(reading.size, transfer.received_file):
         for role, capture in ((transfer.source, sender), (transfer.destination, receiver)):
             if capture is not None and not len(transfer.forward(capture.packets)):
                 return (
                     f"{transfer.received_file} is not empty, but the capture of {role} has no packet of the transfer:"
-                    " check whether an address is translated (NAT) on the path"
+                    " check if a router on the path translates addresses (NAT)"
                 )
     return None
 
 
 def loss(arrived: int | None, sent: int | None) -> float | None:
-    """Return 1 - arrived/sent, the loss of the paper's eq. 1; None if nothing was sent."""
+    """Return the loss 1 - arrived/sent (eq. 1 of the paper), or None if nothing was sent."""
     return None if arrived is None or not sent else 1 - arrived / sent
 
 
@@ -158,30 +158,30 @@ def _layers(
     schedule: FlowSchedule,
 ) -> Measured:
     """Return the columns that depend on both captures: losses, delay, stalls, and rates."""
-    declared = (*LAYERS, *delay.COLUMNS, *delay.SENT_COLUMNS, *rates.COLUMNS, *STALLS)
+    all_columns = (*LAYERS, *delay.COLUMNS, *delay.SENT_COLUMNS, *rates.COLUMNS, *STALLS)
     sender, receiver = ends
     if contradiction:
-        return Measured({"one_way_withheld": contradiction}) | Measured.all_missing(declared, contradiction)
+        return Measured({"one_way_withheld": contradiction}) | Measured.all_missing(all_columns, contradiction)
     if sender is None or receiver is None:
-        return Measured.all_missing(declared, "there are no complete captures of both ends")
+        return Measured.all_missing(all_columns, "there are no complete captures of both ends")
     try:
         if transfer.protocol is Protocol.UDP:
             udp_packets = udp.match_transfer(sender.packets, receiver.packets, transfer)
             udp_counts = udp.count(udp_packets)
-            pairs, counts, sent = delay.udp_packets(udp_packets), _udp(udp_counts), udp_counts.packets_sent
-            transfer_rates = rates.of_udp(udp_packets)
+            pairs, counts, sent = delay.udp_packets(udp_packets), _udp_values(udp_counts), udp_counts.packets_sent
+            transfer_rates = rates.udp_rates(udp_packets)
             stall_columns = stalls.measure("transfer", lambda: stalls.udp_deliveries(udp_packets, schedule))
         else:
             frames = tcp.match_transfer(sender.packets, receiver.packets, transfer)
             tcp_counts = tcp.count(frames)
-            pairs, counts, sent = delay.tcp_frames(frames), _tcp(tcp_counts), delay.tcp_sent(frames)
-            transfer_rates = rates.of_tcp(frames, receiver.packets, transfer, tcp_counts)
+            pairs, counts, sent = delay.tcp_frames(frames), _tcp_values(tcp_counts), delay.tcp_sent(frames)
+            transfer_rates = rates.tcp_rates(frames, receiver.packets, transfer, tcp_counts)
             reverse = transfer.backward(sender.packets)
             stall_columns = stalls.measure("transfer", lambda: stalls.tcp_deliveries(frames, reverse, schedule))
         ambiguous = bool(counts.get("ip_packets_doubtful") or counts.get("tcp_doubtful_segments"))
         delays = delay.measure(pairs, sender.packets, receiver.packets, transfer, sent=sent or 0, ambiguous=ambiguous)
-    except EvidenceError as error:  # handled like a damaged capture
-        return Measured.all_missing(declared, error.what)
+    except EvidenceError as error:  # the captures cannot be evaluated, as if they were damaged
+        return Measured.all_missing(all_columns, error.what)
     rate_values = transfer_rates.values(files.values.get("received_bytes"))
     if delays.values.get("one_way_withheld") == delay.UNSTEADY:
         delays |= Measured.all_missing((*TIMES, *rates.COLUMNS), delay.UNSTEADY)
@@ -192,16 +192,16 @@ def _layers(
         )
     other_names = OF_TCP if transfer.protocol is Protocol.UDP else OF_UDP
     other_columns = [column for column in LAYERS if column.name in other_names]
-    reason = "no such packet was sent, none arrived, or it is ambiguous which arrived"
+    reason = "no such packet was sent or arrived, or it is ambiguous which packets arrived"
     count_columns = Measured.from_optional(counts, reason)
     rate_columns = Measured.from_optional(
-        rate_values, "the captures have fewer than two packets of the transfer, or not its end"
+        rate_values, "the captures have fewer than two packets of the transfer, or lack its end"
     )
-    no_such_count = Measured.all_missing(other_columns, f"not applicable to {transfer.protocol}")
-    return delays | count_columns | rate_columns | stall_columns | no_such_count
+    other_protocol_columns = Measured.all_missing(other_columns, f"not applicable to {transfer.protocol}")
+    return delays | count_columns | rate_columns | stall_columns | other_protocol_columns
 
 
-def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
+def _udp_values(counts: udp.UdpCounts) -> dict[str, Value | None]:
     sent: dict[str, Value | None] = {
         "ip_packets_sent": counts.packets_sent,
         "ip_packets_doubtful": counts.packets_ambiguous,
@@ -224,7 +224,7 @@ def _udp(counts: udp.UdpCounts) -> dict[str, Value | None]:
     return sent | (dict.fromkeys(received) if counts.possible_copies else received)
 
 
-def _tcp(counts: tcp.TcpCounts) -> dict[str, Value | None]:
+def _tcp_values(counts: tcp.TcpCounts) -> dict[str, Value | None]:
     received_bytes = None if counts.possible_copies else counts.received_bytes
     return {
         "ip_packets_sent": counts.frames_sent,
@@ -254,11 +254,13 @@ def _sent_ns(sender: Capture | None, transfer: Transfer) -> list[int]:
     return [] if NO_TIME in times_ns else times_ns
 
 
-def _paper(sender: Capture | None, receiver: Capture | None, pings: ping.Ping | None, transfer: Transfer) -> Measured:
+def _paper(
+    sender: Capture | None, receiver: Capture | None, ping_output: ping.Ping | None, transfer: Transfer
+) -> Measured:
     window_bytes = PAPER_WINDOW_BYTES[transfer.protocol]
     sent = paper_frames_from(sender.packets, transfer.sender_address, transfer.port) if sender else None
     received = paper_frames_to(receiver.packets, transfer.receiver_address, transfer.port) if receiver else None
-    rtt_s = pings.rtt_s if pings and pings.payload_bytes == window_bytes else ()
+    rtt_s = ping_output.rtt_s if ping_output and ping_output.payload_bytes == window_bytes else ()
     delay_s = float(np.mean(rtt_s)) if rtt_s else None
     frames: dict[str, Value | None] = {
         "paper_packets": sent,

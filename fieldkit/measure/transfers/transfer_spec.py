@@ -25,7 +25,7 @@ class Transfer:
         sent_file: Name of the sent file in the attempt's folder.
         received_file: Name of the file that the listener wrote, in the same folder.
         captures: Names of the sender's and the receiver's capture in the same folder; None without a capture.
-        name: Name of its step, which is the prefix of its other files; empty if the step has no name.
+        name: Name of the step, which is the prefix of the transfer's other files; empty if the step has no name.
     """
 
     protocol: Protocol
@@ -41,11 +41,11 @@ class Transfer:
 
     @property
     def captured(self) -> bool:
-        """True if both ends captured."""
+        """True if there are captures of both ends."""
         return None not in self.captures
 
     def forward(self, packets: Packets) -> Packets:
-        """Return the packets of its protocol from sender to receiver, of any port."""
+        """Return the packets of the transfer's protocol from sender to receiver, with any ports."""
         return packets.where(
             packets.are_from(self.sender_address)
             & packets.are_to(self.receiver_address)
@@ -53,7 +53,7 @@ class Transfer:
         )
 
     def backward(self, packets: Packets) -> Packets:
-        """Return the packets of its protocol from receiver to sender, of any port."""
+        """Return the packets of the transfer's protocol from receiver to sender, with any ports."""
         return packets.where(
             packets.are_from(self.receiver_address)
             & packets.are_to(self.sender_address)
@@ -62,7 +62,10 @@ class Transfer:
 
 
 def span_s(time_ns: Ints, carries_payload: Mask) -> float | None:
-    """Return the seconds from the first frame to the last one with payload; None without payload or without times."""
+    """Return the time in seconds from the first frame to the last frame with payload.
+
+    Return None if no frame has payload, or if a frame has no time.
+    """
     if not carries_payload.any() or (time_ns == NO_TIME).any():
         return None
     return float(time_ns[carries_payload].max() - time_ns.min()) / 1e9

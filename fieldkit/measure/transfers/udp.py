@@ -1,4 +1,4 @@
-"""Loss of a UDP transfer on each layer: IP packets (fragments), datagrams, payload bytes."""
+"""Loss of a UDP transfer on each layer: IP packets (including fragments), datagrams and payload bytes."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -11,13 +11,14 @@ from fieldkit.measure.transfers.match import Match, match, reordered
 from fieldkit.measure.transfers.transfer_spec import Transfer, span_s
 
 NO_DATAGRAM: Final = -1
+"""Datagram index of a fragment without a first fragment."""
 
 
 def datagrams(packets: Packets) -> tuple[Ints, Ints]:
-    """Return the index of each datagram's first packet, and the datagram of each packet.
+    """Return the index of the first packet of each datagram, and the datagram index of each packet.
 
-    A later fragment belongs to the latest first fragment with the same addresses and id, or to the next first
-    fragment if there is none before it. Its datagram is `NO_DATAGRAM` if there is neither.
+    A later fragment belongs to the last first fragment before it that has the same addresses and id or, if there is
+    none, to the next such fragment. If there is neither, its datagram is `NO_DATAGRAM`.
     """
     is_fragment = packets.more_fragments | (packets.fragment_offset > 0)
     # An unfragmented packet has no other fragments, even if another packet has the same id.
@@ -36,7 +37,7 @@ def datagrams(packets: Packets) -> tuple[Ints, Ints]:
 
 
 def with_ports(packets: Packets) -> Packets:
-    """Return the packets; later fragments get the ports of their first fragment, or `NO_PORT` without one."""
+    """Return the packets. Later fragments have the ports of their first fragment, or `NO_PORT` without one."""
     first, datagram = datagrams(packets)
     sport, dport = (np.append(ports[first], NO_PORT)[datagram] for ports in (packets.sport, packets.dport))
     return replace(packets, sport=sport, dport=dport)
@@ -44,14 +45,14 @@ def with_ports(packets: Packets) -> Packets:
 
 @dataclass(frozen=True, eq=False)
 class UdpPackets:
-    """The n UDP packets sent and m received from sender to receiver in both captures, with their match.
+    """UDP packets from sender to receiver in both captures, n sent and m received, with their match.
 
     Attributes:
         sent: Packets in the sender's capture.
         received: Packets in the receiver's capture.
-        match: Match between them.
+        match: Match between the sent and the received packets.
         first: Index of the first fragment of each sent datagram. Shape (k,).
-        datagram: Datagram of each sent packet, `NO_DATAGRAM` if its first fragment is missing. Shape (n,).
+        datagram: Datagram index of each sent packet; `NO_DATAGRAM` if its first fragment is missing. Shape (n,).
         port: Destination port of the transfer.
     """
 
@@ -63,14 +64,14 @@ class UdpPackets:
     port: int
 
     @property
-    def is_transfer(self) -> Mask:
+    def is_transfer_datagram(self) -> Mask:
         """Mask of the transfer's datagrams; the last entry is for `NO_DATAGRAM`. Shape (k + 1,)."""
         return np.append(self.sent.dport[self.first] == self.port, False)
 
     @property
-    def chosen(self) -> Mask:
+    def is_transfer_packet(self) -> Mask:
         """Mask of the transfer's sent packets, including later fragments. Shape (n,)."""
-        return self.is_transfer[self.datagram]
+        return self.is_transfer_datagram[self.datagram]
 
 
 @dataclass(frozen=True)
@@ -78,21 +79,21 @@ class UdpCounts:
     """Counts of packets, datagrams and bytes that left the sender and that reached the receiver's interface.
 
     Attributes:
-        packets_sent: IP packets, each fragment separately.
-        packets_received: Sent packets that arrived; a duplicate counts once.
+        packets_sent: Sent IP packets; each fragment is a packet.
+        packets_received: Sent packets that arrived, without further copies.
         packets_duplicated: Further copies of sent packets that arrived.
-        packets_reordered: Sent packets that arrived after one that was sent later (RFC 4737, section 3). None if
+        packets_reordered: Sent packets that arrived after a packet that was sent later (RFC 4737, section 3). None if
             packets are ambiguous.
-        packets_ambiguous: Sent packets that equal others sent at nearly the same time, so that the time of arrival of
-            each is unknown.
-        possible_copies: Received packets that may be copies and hide a loss: see `Match.possible_copy`.
-        loss_bursts: Runs of lost packets that were sent consecutively. None if packets are ambiguous and some were
+        packets_ambiguous: Sent packets that equal other packets sent at nearly the same time, so that their arrival
+            times are unknown.
+        possible_copies: Received packets that may be copies and hide a loss (see `Match.possible_copy`).
+        loss_bursts: Runs of consecutively sent packets that were lost. None if packets are ambiguous and some were
             lost.
-        longest_burst: Packets in the longest run. None if `loss_bursts` is None.
-        datagrams_sent: Datagrams.
-        datagrams_received: Datagrams all of whose fragments arrived.
-        bytes_sent: Payload bytes without UDP headers.
-        bytes_received: Payload bytes that arrived, whether in complete datagrams or not.
+        longest_burst: Number of packets in the longest run. None if `loss_bursts` is None.
+        datagrams_sent: Sent datagrams.
+        datagrams_received: Datagrams of which all fragments arrived.
+        bytes_sent: Sent payload bytes, without UDP headers.
+        bytes_received: Payload bytes that arrived, including those of incomplete datagrams.
         transfer_s: Time from the first to the last packet at the receiver, in seconds; None if nothing arrived.
     """
 
@@ -120,29 +121,29 @@ def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> Ud
 def count(packets: UdpPackets) -> UdpCounts:
     """Return the counts of a UDP transfer."""
     sent, received, matched = packets.sent, packets.received, packets.match
-    arrived, chosen = matched.arrived, packets.chosen
+    arrived, is_sent = matched.arrived, packets.is_transfer_packet
     complete_datagrams = complete(packets)
     payload = payload_bytes(sent)
-    received_chosen = np.append(chosen, False)[matched.sent_index]  # the last entry is for match.NONE
-    bursts = _bursts(~arrived[chosen])
-    time_ns = received.time_ns[received_chosen]
-    ambiguous = int((chosen & matched.ambiguous).sum())
-    bursts_known = not ambiguous or bool(arrived[chosen].all())
+    is_received = np.append(is_sent, False)[matched.sent_index]  # the last entry is for match.NONE
+    bursts = _bursts(~arrived[is_sent])
+    time_ns = received.time_ns[is_received]
+    ambiguous_count = int((is_sent & matched.ambiguous).sum())
+    are_bursts_known = not ambiguous_count or bool(arrived[is_sent].all())
     return UdpCounts(
-        packets_sent=int(chosen.sum()),
-        packets_received=int((chosen & arrived).sum()),
-        packets_duplicated=int((received_chosen & matched.duplicates).sum()),
+        packets_sent=int(is_sent.sum()),
+        packets_received=int((is_sent & arrived).sum()),
+        packets_duplicated=int((is_received & matched.duplicates).sum()),
         packets_reordered=(
-            None if ambiguous else int(reordered(matched.sent_index[received_chosen & ~matched.duplicates]).sum())
+            None if ambiguous_count else int(reordered(matched.sent_index[is_received & ~matched.duplicates]).sum())
         ),
-        packets_ambiguous=ambiguous,
-        possible_copies=int((received_chosen & matched.possible_copy).sum()),
-        loss_bursts=len(bursts) if bursts_known else None,
-        longest_burst=int(bursts.max(initial=0)) if bursts_known else None,
-        datagrams_sent=int(packets.is_transfer.sum()),
-        datagrams_received=int((packets.is_transfer & complete_datagrams).sum()),
-        bytes_sent=int(payload[chosen].sum()),
-        bytes_received=int(payload[chosen & arrived].sum()),
+        packets_ambiguous=ambiguous_count,
+        possible_copies=int((is_received & matched.possible_copy).sum()),
+        loss_bursts=len(bursts) if are_bursts_known else None,
+        longest_burst=int(bursts.max(initial=0)) if are_bursts_known else None,
+        datagrams_sent=int(packets.is_transfer_datagram.sum()),
+        datagrams_received=int((packets.is_transfer_datagram & complete_datagrams).sum()),
+        bytes_sent=int(payload[is_sent].sum()),
+        bytes_received=int(payload[is_sent & arrived].sum()),
         transfer_s=span_s(time_ns, np.ones(len(time_ns), dtype=np.bool_)),
     )
 
@@ -163,6 +164,6 @@ def complete(packets: UdpPackets) -> Mask:
 
 
 def _bursts(lost: Mask) -> Ints:
-    """Return the length of each run of losses."""
+    """Return the length of each run of consecutive losses."""
     edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
     return edges[1::2] - edges[::2]

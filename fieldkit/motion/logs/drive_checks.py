@@ -12,16 +12,17 @@ from fieldkit.motion.logs.motion_log import time_contradictions
 
 MAX_DEVIATION_M: Final = 1.0
 """Largest acceptable deviation from the path. The control loop uses the same odometry, so on even ground the
-deviation is some centimetres."""
+deviation is a few centimetres."""
 
 _START_M: Final = 0.3
-"""Largest distance of the start from the origin: `START_M` of `fieldkit.agent.driving.drive_plan`, which a test
-compares."""
+"""Largest distance of the start from the origin. It equals `START_M` of `fieldkit.agent.driving.drive_plan`; a test
+checks this."""
 _ROUNDING_M: Final = 2e-3
 """Positions are rounded to 0.1 mm, the driven distance to 1 mm."""
 _JITTER_M: Final = 0.05
 _JITTER_SHARE: Final = 0.25
-"""Between two lines, jitter of the odometry makes the driven distance longer than the straight line."""
+"""Tolerance for jitter of the odometry, which makes the driven distance between two lines longer than the straight
+line."""
 _SPEED_SHARE: Final = 1.5
 _SPEED_M_S: Final = 0.1
 """Tolerance of a speed over half a second, for one additional odometry message and for overshoot of the control."""
@@ -88,13 +89,13 @@ def _deviation_m(moment: DriveMoment, legs: Sequence[Leg]) -> float:
     corners = list(
         accumulate(legs, lambda corner, leg: (corner[0] + leg.away_m, corner[1] + leg.left_m), initial=(0.0, 0.0))
     )
-    return min(_distance_m((moment.x_m, moment.y_m), begin, end) for begin, end in pairwise(corners))
+    return min(_distance_m((moment.x_m, moment.y_m), start, end) for start, end in pairwise(corners))
 
 
-def _distance_m(point: tuple[float, float], begin: tuple[float, float], end: tuple[float, float]) -> float:
+def _distance_m(point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]) -> float:
     """Return the distance of a point from a line segment."""
-    segment = end[0] - begin[0], end[1] - begin[1]
-    offset = point[0] - begin[0], point[1] - begin[1]
+    segment = end[0] - start[0], end[1] - start[1]
+    offset = point[0] - start[0], point[1] - start[1]
     squared_length = segment[0] ** 2 + segment[1] ** 2
     dot = offset[0] * segment[0] + offset[1] * segment[1]
     share = min(max(dot / squared_length, 0.0), 1.0) if squared_length else 0.0

@@ -1,8 +1,8 @@
 """Log of an autonomous drive of a ground robot, and its columns.
 
 The robot's agent writes a JSON object per line, ten times a second (`fieldkit.agent.driving.drive`): time, pose by
-its odometry in the frame of the start, and driven distance. The last line has the reason for the end. All values are
-measured by the robot itself.
+its odometry in the frame of the start, and driven distance. The last line contains the reason for the end. All
+values are measurements of the robot.
 """
 
 import math
@@ -103,14 +103,14 @@ class DriveMoment:
 
 
 def read(path: Path) -> tuple[DriveMoment, ...]:
-    """Return the lines of a log in the order of time; an incomplete last line is omitted.
+    """Return the lines of a log in chronological order; an incomplete last line is omitted.
 
     Raises:
         EvidenceError: The log is missing, empty, or has an invalid line.
     """
     log = motion_log.read(path, _parse_moment, "drive")
     if any(after.driven_m < before.driven_m for before, after in pairwise(log)):
-        raise EvidenceError("its lines are not in the order of time", where=str(path))
+        raise EvidenceError("its lines are not in chronological order", where=str(path))
     return log
 
 
@@ -139,14 +139,14 @@ def measure(log: Sequence[DriveMoment] | None) -> Measured:
     """Return the columns; all are missing if there is no log."""
     if not log:
         return Measured.all_missing(COLUMNS, "the robot wrote no log of its drive")
-    out = [record for record in log if record.phase in _OUT]
+    outward = [record for record in log if record.phase in _OUT]
     home = log[-1] if log[-1].ended == HOME else None
-    out_m_s = speeds_m_s([record for record in out if record.phase == "out"])
-    all_speeds_m_s = (*out_m_s, *speeds_m_s([record for record in log if record.phase == "back"]))
+    outward_speeds_m_s = speeds_m_s([record for record in outward if record.phase == "out"])
+    all_speeds_m_s = (*outward_speeds_m_s, *speeds_m_s([record for record in log if record.phase == "back"]))
     values: dict[str, Value | None] = {
-        "drive_out_m": out[-1].driven_m if out else None,
+        "drive_out_m": outward[-1].driven_m if outward else None,
         "drive_farthest_m": max(record.off_m for record in log),
-        "drive_speed_median_m_s": float(np.median(out_m_s)) if out_m_s else None,
+        "drive_speed_median_m_s": float(np.median(outward_speeds_m_s)) if outward_speeds_m_s else None,
         "drive_speed_max_m_s": max(all_speeds_m_s, default=None),
         "drive_back_off_m": None if home is None else home.off_m,
         "drive_back_turned_rad": None if home is None else home.yaw_rad,

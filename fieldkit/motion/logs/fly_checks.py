@@ -47,18 +47,19 @@ def contradictions(log: Sequence[FlightMoment], plan: FlyPlan) -> Iterator[str]:
     yield from time_contradictions(log, plan.window)
     if any(_jumps(*pair) for pair in pairwise(log)):
         yield "two consecutive positions are farther apart than the speeds allow"
-    for direction, value, limit_m in (
+    for direction, distance_m, limit_m in (
         ("high", max(moment.up_m for moment in log), plan.highest_m + POSITION_ERROR_M),
         ("away", max(moment.off_m for moment in log), plan.farthest_m + POSITION_ERROR_M),
     ):
-        if value > limit_m:
-            yield f"the drone was {value:.1f} m {direction}, but the plan allows {limit_m - POSITION_ERROR_M:.1f} m"
+        if distance_m > limit_m:
+            allowed_m = limit_m - POSITION_ERROR_M
+            yield f"the drone was {distance_m:.1f} m {direction}, but the plan allows {allowed_m:.1f} m"
     if (speed_m_s := max(moment.speed_m_s for moment in log)) > _SPEED_SHARE * plan.fastest_m_s + _SPEED_M_S:
         yield f"the drone flew at {speed_m_s:.1f} m/s, but its limit is {plan.fastest_m_s:g} m/s"
 
 
 def telemetry_contradiction(log: Sequence[FlightMoment], places_m: Floats) -> str | None:
-    """Return the reason why telemetry cannot be of the same flight as the log; None if it can.
+    """Return the reason why telemetry and the log cannot be from the same flight; None if they can.
 
     Args:
         log: The log.

@@ -2,7 +2,7 @@
 
 The agent writes a JSON object per line, ten times a second (`fieldkit.agent.flying.flight_log`): time, phase of the
 flight, and the autopilot's position estimate relative to the origin of the trial's flights, which is the position and
-heading of the first start. All values are measured by the drone itself. The first line has the origin.
+heading of the first start. All values are measurements of the drone. The first line contains the origin.
 """
 
 import math
@@ -58,7 +58,7 @@ _STEP_PHASES: Final = frozenset({_ON_PATH, "there"})
 """Phases in which the inner steps run."""
 _LAST_PHASE: Final = "coming down"
 PHASES: Final = ("standing", "climbing", "up", _ON_PATH, "there", "coming back", _LAST_PHASE)
-"""Phases of a flight in the order of time."""
+"""Phases of a flight in chronological order."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class FlightMoment:
 
 
 def read(path: Path) -> tuple[FlightMoment, ...]:
-    """Return the lines of a log in the order of time; an incomplete last line is omitted.
+    """Return the lines of a log in chronological order; an incomplete last line is omitted.
 
     Raises:
         EvidenceError: The log is missing, empty, or has an invalid line.
@@ -99,7 +99,7 @@ def read(path: Path) -> tuple[FlightMoment, ...]:
 
 
 def _parse_moment(fields: Mapping[str, Any]) -> FlightMoment | None:
-    """Convert the JSON object of a line, None for the origin and the end; raises `JSON_ERRORS` if it is invalid."""
+    """Convert the JSON object of a line, or return None for the origin and the end; raises one of `JSON_ERRORS`."""
     if "ended" in fields or "origin" in fields:
         return None
     at_s, speed_m_s, utc_ns = float(fields["at_s"]), float(fields["speed_m_s"]), int(fields.get("utc_ns", 0))

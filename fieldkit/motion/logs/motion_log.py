@@ -1,4 +1,4 @@
-"""Reading and checks that logs of drives and of flights have in common: order of lines, agreement of two clocks."""
+"""Common reader and checks of the logs of drives and flights: order of lines, agreement of two clocks."""
 
 import json
 import re
@@ -17,7 +17,7 @@ LONGEST_S: Final = 1e6
 LAST_NS: Final = 2**62
 """Limits of valid values."""
 _STALL_S: Final = 2.0
-"""Longest suspension of the program by a busy robot between reading the two clocks of a line."""
+"""Maximum time for which a busy robot may suspend the program between its readings of the two clocks."""
 
 
 _END: Final = re.compile(r'(.*), "crc32": ([0-9]{1,10})\}', re.ASCII)
@@ -45,11 +45,11 @@ _Value = TypeVar("_Value")
 
 
 def read(path: Path, parse: Callable[[Mapping[str, Any]], _Moment | None], motion: str) -> tuple[_Moment, ...]:
-    """Return the lines of a log in the order of time; an incomplete last line is omitted.
+    """Return the lines of a log in chronological order; an incomplete last line is omitted.
 
     Args:
         path: The log.
-        parse: Converts the JSON object of a line, None for a line to omit; raises `JSON_ERRORS` if it is invalid.
+        parse: Converts the JSON object of a line, or returns None to omit it; raises `JSON_ERRORS` if it is invalid.
         motion: Kind of motion, for messages: `drive`.
 
     Raises:
@@ -58,30 +58,30 @@ def read(path: Path, parse: Callable[[Mapping[str, Any]], _Moment | None], motio
     lines = _json_lines(path, parse, f"is not a line of a {motion} log")
     moments = tuple(moment for moment in lines if moment is not None)
     if any(after.at_s < before.at_s for before, after in pairwise(moments)):
-        raise EvidenceError("its lines are not in the order of time", where=str(path))
+        raise EvidenceError("its lines are not in chronological order", where=str(path))
     if not moments:
         raise EvidenceError(f"contains no position of a {motion}", where=str(path))
     return moments
 
 
-def _json_lines(path: Path, parse: Callable[[Any], _Value], wrong: str) -> list[_Value]:
+def _json_lines(path: Path, parse: Callable[[Any], _Value], error_text: str) -> list[_Value]:
     """Return the parsed JSON lines of a log; an incomplete last line is omitted.
 
     Args:
         path: The log.
         parse: Converts the value of a line; raises one of `JSON_ERRORS` if it is invalid.
-        wrong: Predicate of the message about an invalid line: `is not a sample of a drive`.
+        error_text: Predicate of the message about an invalid line: `is not a sample of a drive`.
 
     Raises:
-        EvidenceError: As `reading.text`, or a line is invalid.
+        EvidenceError: The log cannot be read (see `reading.text`), or a line is invalid.
     """
-    parsed = []
+    values = []
     for number, line in enumerate(reading.text(path).split("\n")[:-1], 1):
         try:
-            parsed.append(parse(json.loads(line)))
+            values.append(parse(json.loads(line)))
         except JSON_ERRORS:
-            raise EvidenceError(f"line {number} {wrong}", where=str(path)) from None
-    return parsed
+            raise EvidenceError(f"line {number} {error_text}", where=str(path)) from None
+    return values
 
 
 def numbered_lines_problem(path: Path) -> str | None:
@@ -96,7 +96,7 @@ def numbered_lines_problem(path: Path) -> str | None:
     if all(number is None for number in numbers):
         return None
     if numbers != list(range(len(lines))):
-        return "its lines are not numbered without a gap: some are missing or were changed"
+        return "its line numbers have a gap: lines are missing or were changed"
     end = _END.fullmatch(lines[-1].rstrip("\n"))
     if end is None or not lines[-1].endswith("\n"):
         return "its last line is missing: its writer was killed"
@@ -122,14 +122,14 @@ def time_contradictions(log: Sequence[MotionMoment], window: tuple[int, int] | N
         log: Its lines; lines without a time by the robot's clock are not checked.
         window: The robot's clock before and after the attempt, nanoseconds since 1970 UTC; None if unknown.
     """
-    timed = [moment for moment in log if moment.utc_ns]
-    if not timed:
+    timed_moments = [moment for moment in log if moment.utc_ns]
+    if not timed_moments:
         return
-    times_ns = [moment.utc_ns for moment in timed]
+    times_ns = [moment.utc_ns for moment in timed_moments]
     if window is not None and (min(times_ns) < window[0] or max(times_ns) > window[1]):
         yield "has lines from before the attempt or after it, by the robot's clock"
-    offsets_s = [moment.utc_ns / 1e9 - moment.at_s for moment in timed]
+    offsets_s = [moment.utc_ns / 1e9 - moment.at_s for moment in timed_moments]
     if max(offsets_s) - min(offsets_s) > _STALL_S:
         yield "its two clocks do not advance at the same rate"
     if times_ns != sorted(times_ns):
-        yield "its lines are not in the order of the robot's clock"
+        yield "its lines are not in chronological order by the robot's clock"

@@ -1,8 +1,8 @@
 """Loss of messages that an autopilot sends to every station at a fixed period.
 
 Sequence numbers alone overestimate this loss: a router withholds messages that are addressed to other stations, and
-their numbers are missing too. So a message counts as lost only if the autopilot's time (`time_boot_ms`) shows that
-one was due, and a number is missing there.
+their numbers are missing too. Therefore, a message counts as lost only if the autopilot's time (`time_boot_ms`) shows
+that a message was due, and a sequence number is missing at that time.
 
 An autopilot sends late when it is busy, and catches up. The received messages of a stream are therefore assigned to
 its periods together, not one gap at a time. The assignment with the least sum of squared deviations from the schedule
@@ -23,8 +23,8 @@ _MIN_INTERVALS: Final = 3
 """Minimum number of intervals without a missing sequence number that are needed to estimate a period."""
 _REQUEST_TOLERANCE: Final = 0.25
 """Maximum relative difference between the observed and the requested period of a granted request. A station that
-changes the rate changes it by more. The observed mean is too short, because long intervals contain a missing number
-more often, and are omitted."""
+changes the rate changes it by more than this. The observed mean is too short, because long intervals, which contain a
+missing number more often, are omitted."""
 _RATE_TOLERANCE: Final = 0.08
 """Maximum relative difference between the observed rate and an integer rate, for a stream without a request."""
 _MAX_RATE_HZ: Final = 10
@@ -36,7 +36,7 @@ _SKIP_COST: Final = 1.0
 """Cost of a period that the autopilot skipped, in squared periods: more than the squared deviation of one late
 message, less than the sum for two."""
 _HYPOTHESES: Final = 4
-"""Number of hypotheses that are kept; after late messages two or three are still possible."""
+"""Maximum number of hypotheses; after late messages two or three are still possible."""
 
 
 @dataclass(frozen=True)
@@ -55,26 +55,26 @@ class StreamMessage:
 
 
 class _Hypothesis(NamedTuple):
-    """An assignment of the messages so far to periods; hypotheses are ordered by cost.
+    """An assignment of messages to periods, up to one message; hypotheses are ordered by cost.
 
     Attributes:
         cost: Sum of squared deviations and of costs of skipped periods, in squared periods.
         phase_ms: Scheduled time of the last message, milliseconds.
-        lost: Number of lost messages.
+        lost_count: Number of lost messages.
     """
 
     cost: float
     phase_ms: float
-    lost: int
+    lost_count: int
 
 
-def lost(
+def count_messages(
     numbers: Sequence[tuple[int, int]],
     streams: Mapping[str, Sequence[StreamMessage]],
     ended_us: int,
     intervals_us: Mapping[str, int] | None = None,
 ) -> tuple[int, int]:
-    """Return the number of received and of lost messages of all periodic streams.
+    """Return the number of received and the number of lost messages of all periodic streams.
 
     In a silence of more than 1 s, and between the last message and the end, sequence numbers are ambiguous (they
     repeat after 256 messages), so only the period is used. A period that an overloaded autopilot skips counts as a
@@ -88,18 +88,18 @@ def lost(
             number of hertz up to 10.
     """
     indices = _unwrapped([number for _, number in numbers])
-    received = missing = 0
+    received_count = lost_count = 0
     tail_us = max(ended_us - numbers[-1][0], 0) if numbers else 0
     for name, messages in streams.items():
         if len(messages) < _MIN_MESSAGES:
             continue
         if (period_ms := _period_ms(messages, indices, (intervals_us or {}).get(name))) is None:
             continue
-        received += len(messages)
-        missing += _best_assignment(messages, indices, period_ms).lost
+        received_count += len(messages)
+        lost_count += _best_assignment(messages, indices, period_ms).lost_count
         if tail_us > SILENCE_US:
-            missing += max(round(tail_us / 1e3 / period_ms) - 1, 0)
-    return received, missing
+            lost_count += max(round(tail_us / 1e3 / period_ms) - 1, 0)
+    return received_count, lost_count
 
 
 def _best_assignment(messages: Sequence[StreamMessage], indices: Sequence[int], period_ms: float) -> _Hypothesis:
@@ -109,31 +109,33 @@ def _best_assignment(messages: Sequence[StreamMessage], indices: Sequence[int], 
         if after.at_us - before.at_us > SILENCE_US:
             lost_in_silence = max(round((after.boot_ms - before.boot_ms) / period_ms) - 1, 0)
             best = hypotheses[0]
-            hypotheses = [_Hypothesis(best.cost, float(after.boot_ms), best.lost + lost_in_silence)]
+            hypotheses = [_Hypothesis(best.cost, float(after.boot_ms), best.lost_count + lost_in_silence)]
             continue
-        missing = max(indices[after.position] - indices[before.position] - (after.position - before.position), 0)
+        missing_count = max(
+            indices[after.position] - indices[before.position] - (after.position - before.position), 0
+        )
         cheapest = dict[int, _Hypothesis]()
         for hypothesis in hypotheses:
-            for following in _next_hypotheses(hypothesis, after.boot_ms, missing, period_ms):
-                cheapest[following.lost] = min(cheapest.get(following.lost, following), following)
+            for candidate in _next_hypotheses(hypothesis, after.boot_ms, missing_count, period_ms):
+                cheapest[candidate.lost_count] = min(cheapest.get(candidate.lost_count, candidate), candidate)
         hypotheses = sorted(cheapest.values())[:_HYPOTHESES]
     return hypotheses[0]
 
 
-def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing: int, period_ms: float) -> list[_Hypothesis]:
-    """Return the hypotheses after the next message; at most `missing` messages before it were lost."""
+def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing_count: int, period_ms: float) -> list[_Hypothesis]:
+    """Return the hypotheses after the next message; at most `missing_count` messages before it were lost."""
     elapsed = (boot_ms - before.phase_ms) / period_ms
     nearest = max(round(elapsed), 1)
     hypotheses = list[_Hypothesis]()
     for periods in range(max(nearest - 1, 1), nearest + 2):
-        lost_here = min(periods - 1, missing)
-        if skipped := periods - 1 - lost_here:  # the schedule begins again at this message
-            cost, phase_ms = before.cost + _SKIP_COST * skipped, float(boot_ms)
+        lost_before = min(periods - 1, missing_count)
+        if skipped_periods := periods - 1 - lost_before:  # the schedule starts again at this message
+            cost, phase_ms = before.cost + _SKIP_COST * skipped_periods, float(boot_ms)
         else:
             deviation = elapsed - periods
             cost = before.cost + deviation**2
             phase_ms = before.phase_ms + (periods + _PHASE_GAIN * deviation) * period_ms
-        hypotheses.append(_Hypothesis(cost, phase_ms, before.lost + lost_here))
+        hypotheses.append(_Hypothesis(cost, phase_ms, before.lost_count + lost_before))
     return hypotheses
 
 

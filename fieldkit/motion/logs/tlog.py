@@ -141,18 +141,18 @@ class RecorderSummary:
 
     Attributes:
         frames: Number of frames in the log.
-        left_out: Number of frames that did not fit into it.
+        dropped_frames: Number of frames that did not fit into the log.
         ended_us: End of the recording, microseconds since 1970 UTC by its robot's clock.
-        refused: MAV_RESULT by message ID, for messages whose rate the autopilot did not set.
+        refusals: MAV_RESULT by message ID, for messages whose rate the autopilot did not set.
         crc32: CRC-32 of the log; None for a recorder of an older version.
         slow_s: Longest time for which a requested message was too slow; None if no message was requested, or for a
             recorder of an older version.
     """
 
     frames: int
-    left_out: int
+    dropped_frames: int
     ended_us: int
-    refused: Mapping[int, int]
+    refusals: Mapping[int, int]
     crc32: int | None = None
     slow_s: float | None = None
 
@@ -165,13 +165,15 @@ def read_summary(path: Path) -> RecorderSummary:
     """
     try:
         data = json.loads(reading.text(path))
-        refused = {
+        refusals = {
             _non_negative_int(int(kind)): _non_negative_int(result) for kind, result in data["refused"].items()
         }
-        frames, left_out, ended_us = (_non_negative_int(data[name]) for name in ("frames", "left_out", "ended_us"))
+        frames, dropped_frames, ended_us = (
+            _non_negative_int(data[name]) for name in ("frames", "left_out", "ended_us")
+        )
         crc32 = _non_negative_int(data["crc32"]) if "crc32" in data else None
-        slow_s = max((_duration_s(lasted) for lasted in data.get("slow_s", {}).values()), default=None)
-        return RecorderSummary(frames, left_out, ended_us, refused, crc32, slow_s)
+        slow_s = max((_duration_s(duration) for duration in data.get("slow_s", {}).values()), default=None)
+        return RecorderSummary(frames, dropped_frames, ended_us, refusals, crc32, slow_s)
     except JSON_ERRORS as error:
         raise EvidenceError(
             "is not a summary of a recording", where=str(path), remedy="read the recorder's log: was it killed?"
@@ -262,7 +264,7 @@ def contradictions(
     if summary.crc32 is not None and summary.crc32 != file_crc32:
         yield "was changed: its checksum differs from the one that its recorder wrote"
     if log.last_us > summary.ended_us + _TIME_TOLERANCE_US:
-        yield f"has a frame {(log.last_us - summary.ended_us) / 1e6:.3f} s after its recorder ended"
+        yield f"has a frame {(log.last_us - summary.ended_us) / 1e6:.3f} s after its recorder stopped"
     if log.back_us > _TIME_TOLERANCE_US:
         yield f"has a frame that is {log.back_us / 1e6:.3f} s earlier than the previous one"
     if window is not None and not window[0] // 1000 <= log.first_us <= log.last_us <= -(-window[1] // 1000):
@@ -270,7 +272,7 @@ def contradictions(
 
 
 def crc32_of(path: Path) -> int:
-    """Return the CRC-32 of a log; raises `EvidenceError` as `reading.mapped`."""
+    """Return the CRC-32 of a log; raises the errors of `reading.mapped`."""
     return zlib.crc32(reading.mapped(path))
 
 

@@ -12,7 +12,7 @@ from fieldkit.motion.logs import tlog
 
 
 def read_tlog(path: Path, position_source: PositionSource) -> Samples:
-    """Return the samples of a message type in a telemetry log. Times are the recorder's.
+    """Return the samples of a message type in a telemetry log. Times are by the recorder's clock.
 
     With `stamps` set to `header`, the differences between times are those of the autopilot's time since boot. The
     message with the lowest delay aligns them with the recorder's clock, because a radio may delay other messages.

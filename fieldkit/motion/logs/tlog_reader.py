@@ -1,7 +1,7 @@
 """Decoder of MAVLink telemetry logs with pymavlink, which `tlog` runs in a sandboxed process.
 
-A log is a sequence of frames, each after its time in microseconds since 1970 UTC (8 bytes, big-endian), as MAVProxy
-and QGroundControl write it. Messages and fields are named as in https://mavlink.io/en/messages/common.html.
+A log is a sequence of frames. Each frame is preceded by its time in microseconds since 1970 UTC (8 bytes,
+big-endian), as in logs of MAVProxy and QGroundControl. Messages and fields are named as in https://mavlink.io/en/messages/common.html.
 """
 
 import math
@@ -94,11 +94,11 @@ class TlogDecoder:
     """Decoder of frames of the common dialect.
 
     Attributes:
-        damaged: Number of frames with a wrong checksum.
+        damaged_frames: Number of frames with a wrong checksum.
     """
 
     def __init__(self) -> None:
-        self.damaged = 0
+        self.damaged_frames = 0
         self._link = dialect.MAVLink(None)
 
     def message(self, frame: LoggedFrame) -> Any | None:  # noqa: ANN401 (of a class that the dialect generates)
@@ -106,25 +106,25 @@ class TlogDecoder:
         try:
             decoded = self._link.decode(bytearray(frame.data))
         except dialect.MAVError:
-            self.damaged += 1
+            self.damaged_frames += 1
             return None
         return None if decoded.get_type().startswith("UNKNOWN") else decoded
 
 
-def answer(question: Json) -> Json:
-    """Return the answer to a query about the log at `path`.
+def answer(request: Json) -> Json:
+    """Return the answer to a request about the log at `path`.
 
-    A query with `positions` returns the positions in messages of this name, and any other query a summary of the log.
-    Both are of the autopilot with the system ID `system`; 0 selects the only autopilot in the log.
+    It contains the positions in the messages that the key `positions` names, or else a summary of the log.
+    Both concern the autopilot with the system ID `system`; 0 selects the only autopilot in the log.
 
     Raises:
         ValueError: The file is not a log, or does not contain exactly one such autopilot.
     """
-    data = Path(question["path"]).read_bytes()
-    autopilot = _autopilot(data, question["system"])
-    if "positions" in question:
-        return {"rows": list(_positions(data, autopilot, question["positions"]))}
-    return _summary(data, autopilot, question["ended_us"], question["intervals_us"])
+    data = Path(request["path"]).read_bytes()
+    autopilot = _autopilot(data, request["system"])
+    if "positions" in request:
+        return {"rows": list(_positions(data, autopilot, request["positions"]))}
+    return _summary(data, autopilot, request["ended_us"], request["intervals_us"])
 
 
 def _autopilot(data: bytes, system_id: int) -> Source:
@@ -150,16 +150,18 @@ def _autopilot(data: bytes, system_id: int) -> Source:
 
 def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mapping[str, int]) -> Json:
     decoder, series = TlogDecoder(), defaultdict[str, list[float]](list)
-    kinds, numbers, count, back_us = Counter[str](), list[tuple[int, int]](), 0, 0
-    first_us, last_us, before_us = _MAX_TIME_US, 0, 0
+    kinds, numbers, frame_count, back_us = Counter[str](), list[tuple[int, int]](), 0, 0
+    first_us, last_us, previous_us = _MAX_TIME_US, 0, 0
     streams = defaultdict[str, list[StreamMessage]](list)
     for frame in frames(data):
-        count += 1
+        frame_count += 1
         first_us, last_us = min(first_us, frame.at_us), max(last_us, frame.at_us)
-        back_us, before_us = max(back_us, before_us - frame.at_us), frame.at_us
-        is_autopilot, damaged = frame.source == autopilot, decoder.damaged
+        back_us, previous_us = max(back_us, previous_us - frame.at_us), frame.at_us
+        is_autopilot, damaged_frames = frame.source == autopilot, decoder.damaged_frames
         message = decoder.message(frame)
-        if is_autopilot and decoder.damaged == damaged:  # messages of other dialects have a sequence number too
+        if (
+            is_autopilot and decoder.damaged_frames == damaged_frames
+        ):  # messages of other dialects have a sequence number too
             numbers.append((frame.at_us, frame.number))
         if message is not None and (is_autopilot or message.get_type() == _RADIO):
             kinds[message.get_type()] += 1
@@ -170,13 +172,13 @@ def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mappin
                 if math.isfinite(value):
                     series[name].append(value)
     return {
-        "frames": count,
+        "frames": frame_count,
         "times": [first_us, last_us, back_us],
-        "damaged": decoder.damaged,
+        "damaged": decoder.damaged_frames,
         "system": autopilot[0],
         "kinds": dict(kinds),
         "numbers": vars(sequence.count_messages(numbers, ended_us)),
-        "periodic": periodic.lost(numbers, streams, ended_us, intervals_us),
+        "periodic": periodic.count_messages(numbers, streams, ended_us, intervals_us),
         "values": dict(_column_values(series)),
     }
 

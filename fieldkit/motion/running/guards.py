@@ -16,8 +16,8 @@ from fieldkit.trial.procedure_section import TrialOutline
 
 
 @contextmanager
-def guarded(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, shells: Shells) -> Iterator[None]:
-    """Guard drones that no step flies while the body runs.
+def guard_drones(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, shells: Shells) -> Iterator[None]:
+    """While the body runs, guard drones that no step flies.
 
     Args:
         actions: Action of each drone if the attempt is aborted, a value of `OnAbort`.
@@ -31,7 +31,7 @@ def guarded(actions: Mapping[Role, str], plan: TrialOutline, scene: Scene, shell
     """
     with ExitStack() as stack:
         for role in sort_roles(actions):
-            job = piloting.guard(scene, role, f"{role}-guard", abort=actions[role])
+            job = piloting.guard_job(scene, role, f"{role}-guard", abort=actions[role])
             body_s = plan.procedure.expected_s(scene.protocol)
             stack.enter_context(piloting.guarding(scene, shells[role], job, body_s=body_s))
         yield

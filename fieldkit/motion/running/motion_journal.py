@@ -31,7 +31,7 @@ class MotionEvent(StrEnum):
     """Event of a robot that moves without a person."""
 
     ORIGIN = "origin"
-    BEGUN = "begun"
+    STARTED = "begun"
     ENDED = "ended"
     HELD = "held"
     CONFIRMED = "confirmed"
@@ -46,9 +46,9 @@ class MotionEntry:
         utc_ns: Time of the entry, in nanoseconds since 1970 UTC.
         event: `origin`: `origin` is valid from now on. `begun`: the robot may move from now on. `ended`: its motion
             ended as planned. `held`: a fault stopped it, or it did not start. `confirmed`: a person confirmed that it
-            is at its place. `allowed`: an option allowed it to move from its present position.
+            is at its place. `allowed`: an option allowed it to move from its current position.
         robot: Name of the robot.
-        place: The place of the origin, as named by `place_of`.
+        place: Name of the place of the origin, from `place_of`.
         origin: The origin; for `ended`, the robot's position at the end, if it reported one.
         reason: Reason why it is held, or how it was confirmed.
     """
@@ -86,7 +86,7 @@ def journal_of(trial: Path) -> Path:
 
 
 def place_of(role: Role, placement: Placement) -> str:
-    """Return the name of a robot's place; it is the same in all trials in which the robot is left there."""
+    """Return the name of a robot's place; it is the same in all trials in which the robot stays there."""
     if role == _FIXED[placement.topology]:
         return str(placement.topology)
     posts = "".join(f" {post}" for post in placement.posts if post.role == role)
@@ -110,26 +110,26 @@ def last_places(entries: Sequence[MotionEntry]) -> Mapping[str, MotionOrigin]:
     for entry in entries:
         if entry.event in {MotionEvent.ENDED, MotionEvent.HELD} and entry.origin is not None:
             by_robot[entry.robot] = entry.origin
-        elif entry.event in {MotionEvent.ORIGIN, MotionEvent.BEGUN, MotionEvent.CONFIRMED}:
+        elif entry.event in {MotionEvent.ORIGIN, MotionEvent.STARTED, MotionEvent.CONFIRMED}:
             by_robot.pop(entry.robot, None)
     return by_robot
 
 
 def holds(entries: Sequence[MotionEntry]) -> Sequence[MotionHold]:
     """Return the robots that may not move; a motion without an end means that fieldkit was killed."""
-    held: dict[str, MotionHold] = {}
+    by_robot: dict[str, MotionHold] = {}
     for entry in entries:
-        if entry.event is MotionEvent.BEGUN:
-            held[entry.robot] = MotionHold(entry.robot, "fieldkit stopped while it moved", entry.utc_ns)
+        if entry.event is MotionEvent.STARTED:
+            by_robot[entry.robot] = MotionHold(entry.robot, "fieldkit stopped while it moved", entry.utc_ns)
         elif entry.event is MotionEvent.HELD:
-            held[entry.robot] = MotionHold(entry.robot, entry.reason, entry.utc_ns)
+            by_robot[entry.robot] = MotionHold(entry.robot, entry.reason, entry.utc_ns)
         elif entry.event is not MotionEvent.ORIGIN:
-            held.pop(entry.robot, None)
-    return tuple(held.values())
+            by_robot.pop(entry.robot, None)
+    return tuple(by_robot.values())
 
 
 class MotionJournal:
-    """The journal of motions in a file; empty if there is none yet.
+    """The journal of motions in a file; empty if the file does not exist.
 
     Args:
         path: The file.
@@ -156,7 +156,7 @@ class MotionJournal:
     def add(
         self, event: MotionEvent, robot: str, *, place: str = "", origin: MotionOrigin | None = None, reason: str = ""
     ) -> None:
-        """Add an entry; raises as `jsonl.append`."""
+        """Add an entry; raises the errors of `jsonl.append`."""
         entry = MotionEntry(time.time_ns(), event, robot, place, origin, shorten(reason))
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
@@ -165,7 +165,7 @@ class MotionJournal:
         """Allow the held robots to move again.
 
         Args:
-            how: Description of how it was confirmed.
+            how: The way in which it was confirmed.
             at_place: Whether a person confirmed that they are at their places; their origins are then recorded again.
         """
         event = MotionEvent.CONFIRMED if at_place else MotionEvent.ALLOWED
@@ -174,7 +174,7 @@ class MotionJournal:
 
 
 def read(path: Path) -> list[MotionEntry]:
-    """Return the entries of a journal of motions; empty if there is no such file. Raises as `jsonl.read`."""
+    """Return the entries of a journal of motions; empty if there is no file. Raises the errors of `jsonl.read`."""
     return jsonl.read(path, _CODEC.parse, remedy="restore it from a copy") if path.is_file() else []
 
 
@@ -208,12 +208,12 @@ class JournaledOrigins:
         self._places = {role: place_of(role, placement) for role in robots}
 
     def get(self, role: Role) -> MotionOrigin | None:
-        """Return the recorded origin of a robot at its present place, or None."""
+        """Return the recorded origin of a robot at its current place, or None."""
         entry = origins(self._journal.entries).get(self._robots[role])
         return entry.origin if entry is not None and entry.place == self._places[role] else None
 
     def is_new_place(self, role: Role) -> bool:
-        """Return True if the last recorded origin is of a place other than the robot's place in this trial."""
+        """Return True if the last recorded origin is at another place than the robot's place in this trial."""
         places = [
             entry.place
             for entry in self._journal.entries
@@ -229,9 +229,9 @@ class JournaledOrigins:
         """Record the origin of a robot."""
         self._journal.add(MotionEvent.ORIGIN, self._robots[role], place=self._places[role], origin=origin)
 
-    def refuse(self, role: Role, why: str) -> None:
+    def refuse(self, role: Role, reason: str) -> None:
         """Record that a motion did not start, so that the robot is held."""
-        self._journal.add(MotionEvent.HELD, self._robots[role], reason=f"it did not start: {why}")
+        self._journal.add(MotionEvent.HELD, self._robots[role], reason=f"it did not start: {reason}")
 
     def require(self) -> None:
         """Check that robots may move; robots in motion are exempt.
@@ -239,36 +239,36 @@ class JournaledOrigins:
         Raises:
             MotionHeldError: A robot is held.
         """
-        if held := [hold for hold in self._journal.holds if hold.robot not in self._in_motion]:
-            raise held_error(held, self._folder)
+        if holds_of_others := [hold for hold in self._journal.holds if hold.robot not in self._in_motion]:
+            raise hold_error(holds_of_others, self._folder)
 
     @contextmanager
     def moving(self, role: Role) -> Iterator[RobotMotion]:
         """Record start and end of a motion. If the motion is not over when the body ends, the robot is held."""
         self.require()
-        name, motion, why = self._robots[role], RobotMotion(), "it stopped on its path"
-        self._journal.add(MotionEvent.BEGUN, name)
+        name, motion, reason = self._robots[role], RobotMotion(), "it stopped on its path"
+        self._journal.add(MotionEvent.STARTED, name)
         self._in_motion.add(name)
         try:
             yield motion
         except BaseException as error:
-            why = error.what if isinstance(error, FieldkitError) else type(error).__name__
+            reason = error.what if isinstance(error, FieldkitError) else type(error).__name__
             if isinstance(error, KeyboardInterrupt):
-                why = STOPPED
+                reason = STOPPED
             raise
         finally:
             self._in_motion.discard(name)
             event = MotionEvent.ENDED if motion.is_over else MotionEvent.HELD
-            self._journal.add(event, name, origin=motion.at, reason="" if motion.is_over else why)
+            self._journal.add(event, name, origin=motion.at, reason="" if motion.is_over else reason)
 
 
-def held_error(held: Sequence[MotionHold], folder: Path) -> MotionHeldError:
-    """Return the error for robots that may not move before a person has confirmed."""
-    robots = "; ".join(f"{hold.robot}: {hold.reason}" for hold in held)
+def hold_error(robot_holds: Sequence[MotionHold], folder: Path) -> MotionHeldError:
+    """Return the error for robots that must not move until a person confirms."""
+    robots = "; ".join(f"{hold.robot}: {hold.reason}" for hold in robot_holds)
     campaign = folder.parent / laptop_files.CAMPAIGN
     command = "fieldkit campaign, as before" if campaign.is_file() else shell_command("fieldkit", "resume", folder)
     return MotionHeldError(
-        f"a fault stopped a robot, and no robot moves before a person confirms: {robots}",
-        remedy=f"put the robot at its place, check that its path is free, then without --yes: {command}; or, if "
-        "robots may move from where they are, --allow-motion-after-fault",
+        f"a fault stopped a robot, and no robot moves until a person confirms: {robots}",
+        remedy=f"put the robot at its place, check that its path is free, then run without --yes: {command}; or add "
+        "--allow-motion-after-fault, if robots may move from their current positions",
     )

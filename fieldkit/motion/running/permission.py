@@ -14,7 +14,7 @@ from fieldkit.core.permissions import option
 from fieldkit.core.prompts import Operator, Question, Unattended
 from fieldkit.motion import permissions
 from fieldkit.motion.origins import MemoryOrigins, Origins
-from fieldkit.motion.profile_sections import drives, flies
+from fieldkit.motion.profile_sections import can_drive, can_fly
 from fieldkit.motion.running import motion_journal
 from fieldkit.motion.running.motion_journal import JournaledOrigins, MotionJournal
 from fieldkit.trial.plan import Plan
@@ -42,8 +42,8 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
 
 
 def _self_moving(plan: Plan) -> tuple[Role, ...]:
-    moved = plan.procedure.moved()
-    return tuple(role for role, robot in plan.cast.items() if role in moved and (drives(robot) or flies(robot)))
+    moved = plan.procedure.moved_roles()
+    return tuple(role for role, robot in plan.cast.items() if role in moved and (can_drive(robot) or can_fly(robot)))
 
 
 class MotionPermission:
@@ -70,10 +70,10 @@ class MotionPermission:
             self.origins = MemoryOrigins()
             return
         self._journal = MotionJournal(motion_journal.journal_of(folder))
-        allowed = isinstance(testbed, Attended) and permissions.MOVE_AFTER_FAULT in testbed.permissions
+        may_return = isinstance(testbed, Attended) and permissions.MOVE_AFTER_FAULT in testbed.permissions
         robots = {role: robot.name for role, robot in plan.cast.items()}
         self.origins = self._journaled = JournaledOrigins(
-            self._journal, folder, robots, plan.placement, may_return=allowed
+            self._journal, folder, robots, plan.placement, may_return=may_return
         )
 
     def require(self) -> None:
@@ -119,11 +119,11 @@ class MotionPermission:
             if permissions.MOVE_AFTER_FAULT in testbed.permissions:
                 self._journal.confirm(option(permissions.MOVE_AFTER_FAULT), at_place=False)
                 return
-            stopped = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
+            reasons = "; ".join(f"{hold.robot}: {hold.reason}" for hold in self._journal.holds)
             names = " and ".join(hold.robot for hold in self._journal.holds)
             text = (
-                f"a fault stopped a robot ({stopped}); put {names} at its place, with the initial heading, its path "
-                f"free; type {CONFIRM} to let robots move again"
+                f"a fault stopped a robot ({reasons}); put {names} at its place with the initial heading, and clear "
+                f"its path; type {CONFIRM} to let robots move again"
             )
             if testbed.operator.enter(Question(text, choices=(CONFIRM, _STOP), usual=_STOP)) == CONFIRM:
                 self._journal.confirm("a person confirmed", at_place=True)

@@ -24,7 +24,7 @@ _RENEWALS: Final = 5
 """Number of renewals within the duration of a lease."""
 _SILENT_S: Final = 10.0
 STATUS: Final = "drive.status"
-"""File with the status of the driver; its name is prefixed as `driving.planned` describes."""
+"""File with the status of the driver; its name is prefixed as `driving.drive_job` describes."""
 
 
 class DriveLease(LeaseKeeper):
@@ -33,8 +33,8 @@ class DriveLease(LeaseKeeper):
     Args:
         shell: Connection to the robot.
         job: The running program.
-        name: See `driving.planned`.
-        lease_s: The robot stops if the lease is not renewed for this time.
+        name: See `driving.drive_job`.
+        lease_s: Duration of the lease; the robot stops if it is not renewed in this time.
     """
 
     def __init__(self, shell: Shell, job: Job, name: str, lease_s: float) -> None:
@@ -97,7 +97,7 @@ class DriveLease(LeaseKeeper):
         return "" if self.end_state in {"", drive_log.HOME} else f"it stopped on its path: {self.end_state}"
 
     def wait(self, condition: Callable[[], object], deadline: Deadline) -> None:
-        """Wait until a condition holds or the deadline has passed."""
+        """Wait until a condition is true or the deadline has passed."""
         while not condition() and not deadline.expired:
             self.pause()
             # Without the link the robot stops automatically and its driver reports why; the link may be restored.

@@ -1,4 +1,4 @@
-"""Drive a robot by its velocity topic while other steps run: its agent steers, this laptop renews the lease."""
+"""Drive a robot by its velocity topic while other steps run. The agent steers it; the laptop renews the lease."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -47,7 +47,7 @@ _TOPIC_KEYS: Final = MappingProxyType(
 )
 """Keys of a topic description that each middleware needs; others are omitted to keep command lines readable."""
 
-_TEXT: Final = "drive.log"
+_LOG: Final = "drive.log"
 
 
 def middleware_of(robot: Robot) -> MiddlewareName:
@@ -59,23 +59,23 @@ def middleware_of(robot: Robot) -> MiddlewareName:
 
 
 def limit_s(move: Move) -> float:
-    """Return the maximum duration of the path of a move in one direction, in seconds; then the robot stops."""
+    """Return the maximum duration of a move in one direction, in seconds; the robot stops after this time."""
     return 2 * geometry.length_m(move) / move.speed_m_s + _TURN_S * (len(move.legs) + 1) + _SLACK_S
 
 
 def path_duration_s(robot: Robot, move: Move) -> float:
-    """Return the duration of the path of a move in one direction with its turns, in seconds, to the millisecond."""
+    """Return the duration of the path of a move in one direction with its turns, in s, rounded to milliseconds."""
     return round(drive_plan.path_duration_s(DriveTask.from_json(_task(robot, move))), 3)
 
 
-def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
+def drive_job(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
     """Return the job that drives a robot.
 
     Args:
         scene: The attempt.
         move: Path and speed.
         inside_s: Maximum duration of the steps inside.
-        name: Pattern of the names of the step's jobs and files, from `Step.own_name`; `{}` is replaced.
+        name: Pattern of the names of the step's jobs and files, from `Step.prefixed_name`; `{}` is replaced.
     """
     robot = scene.robot(move.role)
     argv = (
@@ -91,7 +91,7 @@ def planned(scene: Scene, move: Move, inside_s: float, name: str) -> Planned:
         name=name.format("drive"),
         argv=with_environment(argv, setup=setup, environment=robot.ros_environment),
         limit_s=START_S + 2 * limit_s(move) + inside_s,
-        log=name.format(_TEXT),
+        log=name.format(_LOG),
         ready="log:up,",
     )
     program = robot.profile.tools.python
@@ -106,18 +106,18 @@ def refusals(scene: Scene, move: Move) -> Iterator[Refusal]:
     if limits.fence_m is not None and farthest_m > limits.fence_m:
         yield Refusal(
             move.role,
-            f"its fence is {limits.fence_m:g} m from its place, but its path leads {farthest_m:g} m away",
+            f"its fence is {limits.fence_m:g} m from its origin, but its path leads {farthest_m:g} m away",
             "shorten the path in the procedure, or increase limits.fence_m in its profile if the area allows it",
         )
     drive = drive_of(robot.profile)
-    if drive is not None and (why := drive.topic_conflict(robot, scene.cast.values())):
-        remedy = "give each robot its own topics, ROS domain or master; or move it by hand: without --allow-motion"
-        yield Refusal(move.role, why, remedy)
+    if drive is not None and (reason := drive.topic_conflict(robot, scene.cast.values())):
+        remedy = "use separate topics, ROS domains or masters; or move it by hand, without --allow-motion"
+        yield Refusal(move.role, reason, remedy)
 
 
 def files(name: str) -> tuple[str, ...]:
-    """Return the files that a drive writes; see `planned` for `name`."""
-    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _TEXT))
+    """Return the files that a drive writes; see `drive_job` for `name`."""
+    return tuple(name.format(file) for file in (drive_log.FILE, orders_file("drive"), STATUS, _LOG))
 
 
 def _drive(robot: Robot) -> Drive:
@@ -168,11 +168,13 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
     robot = scene.robot(move.role)
     drive = _drive(robot)
     middleware, ros = middleware_of(robot), robot.profile.ros
-    message_types = types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.shipped()
+    message_types = (
+        types.MessageTypes(types.Distribution.of(ros.command.distribution)) if ros else types.standard_types()
+    )
     network = _network(robot, middleware) | {"gid_bytes": message_types.distribution.gid_bytes}
 
     def topic(topic_name: str, kind: str, profile: str, number: int) -> dict[str, Any]:
-        described = topics.describe(
+        description = topics.describe(
             message_types,
             topic_name,
             kind,
@@ -181,7 +183,7 @@ def _driver_arguments(scene: Scene, move: Move, name: str) -> str:
             node=network["node"],
             number=number,
         )
-        return {key: described[key] for key in ("name", "type", "quality", *_TOPIC_KEYS[middleware])}
+        return {key: description[key] for key in ("name", "type", "quality", *_TOPIC_KEYS[middleware])}
 
     arguments = {
         "over": middleware.value,
@@ -216,7 +218,7 @@ def _network(robot: Robot, middleware: MiddlewareName) -> dict[str, Any]:
 
 
 @contextmanager
-def driven(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[DriveLease]:
+def drive_robot(scene: Scene, testbed: Testbed, plan: Planned, move: Move, name: str) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, and back to its place afterwards; yield its lease.
 
     After an error in the body the robot drives back, too; if it cannot, the operator brings it back. After an
@@ -265,15 +267,15 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
 def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
     scene: Scene, testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, motion: RobotMotion
 ) -> Iterator[DriveLease]:
-    """Drive a robot out while the body runs, and back; see `driven`."""
+    """Drive a robot along its path while the body runs, then back; see `drive_robot`."""
 
     def bring_back() -> str:
-        why_ended = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
-        if why_ended == drive_log.HOME:
+        end_state = _bring_back(testbed, shell, job, drive_lease, move, by_hand=not origins_of(scene).robots_stay)
+        if end_state == drive_log.HOME:
             motion.mark_ended(drive_lease.pose)
         elif drive_lease.status.get("ended"):
             motion.at = drive_lease.pose
-        return why_ended
+        return end_state
 
     try:
         with suppress(LinkError, RobotError):  # each renewal repeats the order
@@ -283,15 +285,15 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
         try:
             bring_back()
         except FieldkitError as second_error:
-            second_error.what += f"; before, the steps failed: {describe_exception(error)}"
+            second_error.what += f"; before that, the steps failed: {describe_exception(error)}"
             raise
         raise
     except BaseException:
         _end(shell, job)
         raise
     early_end = drive_lease.end_reason
-    why_ended = bring_back()
-    if early_end or why_ended != drive_log.HOME:
+    end_state = bring_back()
+    if early_end or end_state != drive_log.HOME:
         reason = early_end or drive_lease.end_reason or "it stopped on its path: it was not back in time"
         raise drive_lease.failure(reason)
 
@@ -299,9 +301,9 @@ def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
 def _bring_back(
     testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, *, by_hand: bool
 ) -> str:
-    """Let a robot drive back; if this fails and `by_hand` is set, ask the operator to bring it back.
+    """Order a robot back, and return `DriveLease.end_state`.
 
-    Return `DriveLease.end_state`.
+    If the robot does not come back and `by_hand` is set, the operator is asked to bring it back.
 
     Without `by_hand` a robot that did not come back stays where it is: before robots move again, a person is asked to
     put it at its place (`fieldkit.motion.running.permission`).

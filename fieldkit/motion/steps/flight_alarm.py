@@ -14,17 +14,17 @@ from fieldkit.steps.scene import Announce, Planned
 
 
 @contextmanager
-def alarmed(
+def alarm_after_failure(
     flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, announce: Announce, *, landing_s: float
 ) -> Iterator[None]:
-    """If the body fails, wait for the landing; raise an alarm if the drone may still be in the air.
+    """If the body fails, wait for the landing; report an alarm if the drone may still be in the air.
 
-    It waits only after a `RobotError`, so that Ctrl-C and a lost link are not delayed.
+    This function waits only after a `RobotError`, so that Ctrl-C and a lost link are not delayed.
 
     Args:
         flight: Lease of the pilot.
         guard: Job of the guard.
-        rescue: Rescue of the same flight; must be active until this context is left.
+        rescue: Rescue of the same flight; it must be active until this context is left.
         log: File of the drone's positions.
         announce: Receives the alarm.
         landing_s: Maximum duration of a landing.
@@ -42,8 +42,8 @@ def alarmed(
 def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, within_s: float) -> str:
     """Return the alarm; empty if the drone is on the ground or lands in this time.
 
-    It does not wait if no program can land the drone any more: its pilot and its guard have exited, and there is no
-    rescue or the rescue has exited, too.
+    The function does not wait if no program can land the drone any longer: its pilot and its guard have exited, and
+    there is no rescue or the rescue has exited, too.
     """
     deadline = Deadline.after(within_s)
     names = (log, guard.job.log, rescue.job.log, jobs.exit_file(guard.job), jobs.exit_file(rescue.job))
@@ -55,20 +55,20 @@ def _alarm(flight: FlightLease, guard: Planned, rescue: FlightRescue, log: str, 
         _, guard_lines, rescue_lines, guard_code, rescue_code = tails
         if any(line.endswith(" landed") for line in (*guard_lines, *rescue_lines)):
             return ""
-        gave_up = any("ALARM:" in line for line in (*guard_lines, *rescue_lines, *flight.last_lines))
-        ended = flight.exit_code and guard_code and (rescue_code or not rescue.may_land)
-        if deadline.expired or gave_up or ended:
+        has_alarm = any("ALARM:" in line for line in (*guard_lines, *rescue_lines, *flight.last_lines))
+        have_exited = flight.exit_code and guard_code and (rescue_code or not rescue.may_land)
+        if deadline.expired or has_alarm or have_exited:
             break
         flight.pause()
     if not flight.is_aloft:
         return ""
-    places, guard_lines, rescue_lines, *_ = tails
+    position_lines, guard_lines, rescue_lines, *_ = tails
     pilot_line = flight.last_lines[-1] if flight.last_lines else "none"
     guard_line, rescue_line = (
         shorten(lines[-1].partition(" ")[2]) if lines else "none" for lines in (guard_lines, rescue_lines)
     )
     return (
-        f"ALARM: {flight.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state(places)}. {MANUAL_ACTION}. "
+        f"ALARM: {flight.robot} MAY STILL BE IN THE AIR. LAST KNOWN: {_state(position_lines)}. {MANUAL_ACTION}. "
         f"Last line of its pilot: {pilot_line}; of its guard: {guard_line}; of its rescue: {rescue_line}"
     )
 

@@ -1,4 +1,4 @@
-"""The rescue of a drone from the laptop: lands it if its pilot and its guard have both exited or are suspended.
+"""Rescue of a drone from the laptop: it is landed if its pilot and its guard have both exited or are suspended.
 
 The pilot and the guard monitor each other. The rescue monitors both by the counters in the file that they share. It
 polls several times a second, so it is used only if the control connection does not cross the radio under test.
@@ -50,8 +50,8 @@ class LivenessMonitor:
         elapsed_s, self._polled_s = min(now_s - self._polled_s, _MAX_STEP_S), now_s
         self._silent_s = self._silent_s + elapsed_s if iterations == self._iterations else 0.0
         self._iterations = iterations
-        flies = programs[PILOT].state in {FLYING, LANDING} or programs[GUARD].state == LANDING
-        return flies and self._silent_s >= SILENCE_TIMEOUT_S
+        is_flying = programs[PILOT].state in {FLYING, LANDING} or programs[GUARD].state == LANDING
+        return is_flying and self._silent_s >= SILENCE_TIMEOUT_S
 
 
 class FlightRescue:
@@ -66,7 +66,7 @@ class FlightRescue:
 
     Attributes:
         job: The job of the rescue.
-        failure: Why the rescue could not be started; empty otherwise.
+        failure: The reason why the rescue could not be started; empty otherwise.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class FlightRescue:
         self._file = f"{job.folder}/{liveness}"
         self._alarm = alarm
         self._may_send = may_send
-        self._left = threading.Event()
+        self._exit_event = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="rescue", daemon=True)
 
     def __enter__(self) -> Self:
@@ -87,18 +87,18 @@ class FlightRescue:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._left.set()
+        self._exit_event.set()
         if self._may_send:
             self._thread.join()
 
     @property
     def may_land(self) -> bool:
-        """Whether the rescue can still land the drone: it monitors, or has started the job."""
+        """Whether the rescue can still land the drone: it monitors the programs, or has started the job."""
         return self._may_send and not self.failure
 
     def _watch(self) -> None:
         monitor = LivenessMonitor()
-        while not self._left.wait(_POLL_S):
+        while not self._exit_event.wait(_POLL_S):
             try:
                 sample = halting.read_liveness(self._shell, self._file, Deadline.after(jobs.REPLY_S))
             except FieldkitError:  # the link may be restored

@@ -18,10 +18,10 @@ from fieldkit.core.units import format_duration
 from fieldkit.motion.abort_actions import OnAbort, abort_of
 from fieldkit.motion.logs import fly_checks, fly_log, motion_log, motion_sources
 from fieldkit.motion.origins import origins_of
-from fieldkit.motion.profile_sections import flies, mavlink_of
+from fieldkit.motion.profile_sections import can_fly, mavlink_of
 from fieldkit.motion.steps import piloting
 from fieldkit.motion.steps.arming_need import arming_need
-from fieldkit.motion.steps.flight_alarm import alarmed
+from fieldkit.motion.steps.flight_alarm import alarm_after_failure
 from fieldkit.motion.steps.flight_rescue import FlightRescue
 from fieldkit.motion.steps.lease import orders_file, run_inside
 from fieldkit.motion.steps.link_need import link_need
@@ -87,12 +87,12 @@ class FlyLeg(PathLeg):
 
 
 class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNeeds, UsesSpace, Summarizes):
-    """Lets a drone take off, fly its path while the steps in `during` run, and land.
+    """Makes a drone take off, fly its path while the steps in `during` run, and land.
 
-    See [MAVLink](mavlink.md#fly-in-a-procedure). Forward is where its nose points before take-off: place it with its
-    nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond `limits`
-    of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before each
-    take-off its autopilot, PX4 or ArduCopter, must report [that it can be
+    See [MAVLink](mavlink.md#fly-in-a-procedure). Forward is the direction of its nose before take-off: place it with
+    its nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond
+    `limits` of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before
+    each take-off its autopilot, PX4 or ArduCopter, must report [that it can be
     armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
     flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
     [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, `fly.log` and `fly.orders`.
@@ -101,14 +101,14 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         robot: Role that flies.
         height: Height above the take-off point to which it climbs first; together with all segments upwards at most
             `limits.max_height_m`.
-        path: Its path after the climb, a list of straight segments; forward is where its nose points before
+        path: Its path after the climb, a list of straight segments; forward is the direction of its nose before
             take-off. Without a path it hovers; at the end of the path it waits. Every corner must be within
             `limits.fence_m` of the take-off point.
         speed: Speed, at most `limits.max_speed_m_s`.
         climb: Rate of climb, at most `limits.max_speed_m_s`.
-        then: Where it lands: `return` to the take-off point, or `land` where it is.
-        lease: How long it continues without contact to the laptop, 3 s to 10 min; then it performs the action of
-            `on_abort`, or lands.
+        then: End of the flight: `return` to the take-off point, or `land` at the current position.
+        lease: Time for which it continues without contact to the laptop, 3 s to 10 min; then it performs the action
+            of `on_abort`, or lands.
         during: Steps that run at the same time.
     """
 
@@ -183,7 +183,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
 
     def _pilot(self, scene: Scene) -> Planned:
         limit_s = _LIMIT_S + self.expected_s(scene.protocol)
-        return piloting.planned(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
+        return piloting.flight_job(scene, self.robot, self.prefixed_name("fly"), self._plan(scene), limit_s)
 
     @property
     def _lease_s(self) -> float:
@@ -191,7 +191,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         return max(self.lease, piloting.LEASE_S)
 
     def _guard(self, scene: Scene) -> Planned:
-        return piloting.guard(
+        return piloting.guard_job(
             scene,
             self.robot,
             self.prefixed_name("guard"),
@@ -220,7 +220,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
         duration = format_duration(self._descent_s + _SLACK_S)
-        note = f"if it is in the air: this takes up to about {duration}, also after fieldkit has exited"
+        note = f"if it is in the air: this takes up to about {duration}, even if fieldkit has exited"
         yield f"{scene.robot(self.robot).name} {self._abort_action(scene)}, {note}"
 
     @override
@@ -230,7 +230,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         limits = profile.limits
         if mavlink_of(profile) is None:
             yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
-        elif not flies(scene.robot(self.robot)):
+        elif not can_fly(scene.robot(self.robot)):
             remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
             yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
         for quantity, planned_m, limit_m, key in (
@@ -238,28 +238,28 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
             ("distance from the take-off point", self._farthest_m, limits.fence_m, "fence_m"),
         ):
             if limit_m is None:
-                why = f"its profile has no limit for the {quantity}"
-                yield Refusal(self.robot, why, f"write limits: {{{key}: ...}} in robots/{name}.yaml")
+                reason = f"its profile has no limit for the {quantity}"
+                yield Refusal(self.robot, reason, f"write limits: {{{key}: ...}} in robots/{name}.yaml")
             elif planned_m > limit_m:
-                why = f"its {quantity} is limited to {limit_m:g} m, but the flight needs {planned_m:g} m"
+                reason = f"its {quantity} is limited to {limit_m:g} m, but the flight needs {planned_m:g} m"
                 yield Refusal(
-                    self.robot, why, f"reduce it in the procedure; the limit is limits.{key} in its profile"
+                    self.robot, reason, f"reduce it in the procedure; the limit is limits.{key} in its profile"
                 )
         speed_m_s = max(self.speed, self.climb)
         if speed_m_s > limits.max_speed_m_s:
-            why = f"its top speed is {limits.max_speed_m_s:g} m/s, but the flight needs {speed_m_s:g} m/s"
+            reason = f"its top speed is {limits.max_speed_m_s:g} m/s, but the flight needs {speed_m_s:g} m/s"
             remedy = "reduce the speed in the procedure; the limit is limits.max_speed_m_s in its profile"
-            yield Refusal(self.robot, why, remedy)
+            yield Refusal(self.robot, reason, remedy)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
         """Return the size of the log, which covers the time from before the take-off until the motors are off."""
-        lasts_s = self.expected_s(scene.protocol) + _AT_REST_S
-        return _LOG_BYTES_PER_S * lasts_s if role == self.robot else 0.0
+        duration_s = self.expected_s(scene.protocol) + _AT_REST_S
+        return _LOG_BYTES_PER_S * duration_s if role == self.robot else 0.0
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
-        """Yield the checks of the connection to the autopilot, and that it can be armed for this flight."""
+        """Yield the checks that the autopilot can be reached, and that it can be armed for this flight."""
         robot = scene.robot(self.robot)
         if (
             mavlink_of(robot.profile) is not None and robot.profile.limits.max_height_m is not None
@@ -278,7 +278,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
                 scene, shell, self._pilot(scene), lease_s=self.lease, body_s=body_s, exit_s=_SLACK_S
             ) as flight,
             self._rescue(scene, shell, flight, announce) as rescue,
-            alarmed(flight, guard, rescue, self._log, announce, landing_s=self._descent_s + _SLACK_S),
+            alarm_after_failure(flight, guard, rescue, self._log, announce, landing_s=self._descent_s + _SLACK_S),
         ):
             self._fly(scene, testbed, announce, flight)
 
@@ -286,17 +286,17 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         """Return the rescue, which is inactive if the control connection crosses the radio under test."""
 
         def raise_alarm(text: str) -> None:
-            flight.lost = "neither its pilot nor its guard runs"
+            flight.lost_reason = "neither its pilot nor its guard runs"
             announce(text, None)
 
         guard_name = self.prefixed_name("guard")
         abort = abort_of(scene, self.robot).value
-        job = piloting.rescue(scene, self.robot, self.prefixed_name("rescue"), guard_name, abort=abort)
+        job = piloting.rescue_job(scene, self.robot, self.prefixed_name("rescue"), guard_name, abort=abort)
         may_send = scene.robot(self.robot).control is not Control.RADIO
         return FlightRescue(shell, job, piloting.liveness_file(guard_name), raise_alarm, may_send=may_send)
 
     def _fly(self, scene: Scene, testbed: Testbed, announce: Announce, flight: piloting.FlightLease) -> None:
-        """Give the orders of the flight; the origin is stored before the first order that moves the drone."""
+        """Send the orders of the flight; the origin is stored before the first order that moves the drone."""
         name = scene.robot(self.robot).name
         self._wait_for_start(scene, flight)
         with origins_of(scene).moving(self.robot) as motion:
@@ -362,7 +362,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         for step in (*view.within, *steps_inside(self)):
             if isinstance(step, MavlinkStep) and step.robot == self.robot and not reasons:
                 reasons += filter(None, (fly_checks.telemetry_contradiction(log, step.places_m(view)),))
-        yield from (f"{self._log}: {why}" for why in reasons)
+        yield from (f"{self._log}: {reason}" for reason in reasons)
 
     @override
     def measure(self, view: View) -> Measured:

@@ -38,14 +38,17 @@ def orders_file(name: str) -> str:
 
 @contextmanager
 def start_program(shell: Shell, job: Job) -> Iterator[None]:
-    """Install the agent on a robot and start a program of it; the body stops it. Errors as `jobs.start`."""
+    """Install the agent on a robot and start one of its programs, which the body stops.
+
+    Raises the errors of `jobs.start`.
+    """
     agent.install(shell)
     jobs.start(shell, job)
     yield
 
 
 class LeaseKeeper:
-    """Gives a program orders and renews the last order until the context is left.
+    """Sends orders to a program and renews the last order until the context is left.
 
     Args:
         shell: Connection to the robot.
@@ -86,8 +89,8 @@ class LeaseKeeper:
         self._changed_s = time.monotonic()
         self._end_body: Callable[[], None] | None = None
         self._lock = threading.Lock()
-        self._left = threading.Event()
-        self._thread = threading.Thread(target=self._renew_until_left, name="lease", daemon=True)
+        self._exit_event = threading.Event()
+        self._thread = threading.Thread(target=self._renew_until_exit, name="lease", daemon=True)
 
     def __enter__(self) -> Self:
         self.renew()
@@ -95,7 +98,7 @@ class LeaseKeeper:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._left.set()
+        self._exit_event.set()
         self._thread.join()
 
     def give_order(self, order: str) -> None:
@@ -110,7 +113,7 @@ class LeaseKeeper:
         self.renew()
 
     def renew(self) -> bytes:
-        """Renew the last order, and return the content of the output file; errors as `give_order`."""
+        """Renew the last order, and return the content of the output file; raises the errors of `give_order`."""
         return self._send(jobs.REPLY_S)
 
     def pause(self) -> None:
@@ -119,15 +122,15 @@ class LeaseKeeper:
 
     @property
     def end_reason(self) -> str:
-        """Why the program has ended too early, from its output or exit code; empty while it runs."""
+        """The reason why the program ended early, from its output or exit code; empty while it runs."""
         return f"its program has ended with exit code {self.exit_code}" if self.exit_code else ""
 
-    def failure(self, why: str) -> RobotError:
+    def failure(self, reason: str) -> RobotError:
         """Return the error of a program that failed for this reason."""
-        return RobotError(why, where=self._shell.robot, remedy=f"see {self._job.log} of this attempt")
+        return RobotError(reason, where=self._shell.robot, remedy=f"see {self._job.log} of this attempt")
 
     def check_running(self) -> None:
-        """Check that the program has not ended too early.
+        """Check that the program has not ended early.
 
         Raises:
             RobotError: It has ended; the message is `end_reason`.
@@ -137,14 +140,14 @@ class LeaseKeeper:
 
     @contextmanager
     def run_while_leased(self, end: Callable[[], None]) -> Iterator[None]:
-        """Run the body; abort it if the program ends. Without renewals the end is noticed only after the body.
+        """Run the body; abort it if the program ends. Without renewals, the end is detected only after the body.
 
         Args:
             end: Aborts the operations that the body waits for. It is called at each renewal, because the body may
                 have started to wait for another operation.
 
         Raises:
-            RobotError: The program ended before the body. An error that the body raised then is the cause.
+            RobotError: The program ended before the body. An error of the body is the cause of this error.
         """
         self._end_body = end
         try:
@@ -173,8 +176,8 @@ class LeaseKeeper:
             self.output, self._changed_s = result.stdout, time.monotonic()
         return result.stdout
 
-    def _renew_until_left(self) -> None:
-        while self._renewal_s is not None and not self._left.wait(self._renewal_s):
+    def _renew_until_exit(self) -> None:
+        while self._renewal_s is not None and not self._exit_event.wait(self._renewal_s):
             with suppress(FieldkitError):  # the link may be restored before the order expires
                 self._send(min(self._lease_s, jobs.REPLY_S))
             end_body = self._end_body
@@ -183,15 +186,15 @@ class LeaseKeeper:
 
 
 def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-    """Run the steps inside `nest`; abort them if its leased program ends. Errors as `run_while_leased`."""
-    inner = replace(scene, halt=scene.halt.child())
+    """Run the steps inside `nest`; abort them if its leased program ends. Raises the errors of `run_while_leased`."""
+    inner_scene = replace(scene, halt=scene.halt.child())
 
     def end() -> None:
-        inner.halt.set()
+        inner_scene.halt.set()
         with suppress(FieldkitError):  # it is called again at the next renewal
-            end_inside(nest, inner, testbed)
+            end_inside(nest, inner_scene, testbed)
 
     with keeper.run_while_leased(end):
         for entry in nest.during:
-            if not inner.halt.is_set:
-                entry.step.run(inner, testbed, announce)
+            if not inner_scene.halt.is_set:
+                entry.step.run(inner_scene, testbed, announce)

@@ -74,7 +74,7 @@ def _is_message(name: str) -> str:
 class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, WritesOnLaptop, Summarizes):
     """Records the telemetry of a robot's autopilot while the steps in `during` run.
 
-    Telemetry is position, speed, attitude, battery and losses; see [MAVLink](mavlink.md#record-telemetry), also for
+    Telemetry is position, speed, attitude, battery and losses. [MAVLink](mavlink.md#record-telemetry) also describes
     the columns. The profile of the robot needs `mavlink`. Writes `mavlink.tlog`, `mavlink.json` (counters of the
     recorder) and `ROLE-mavlink.log`; with `positions` also `positions.json` and the columns of a `track`.
 
@@ -89,13 +89,13 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
             for `GLOBAL_POSITION_INT`. Such a step must not be inside a move, a fault or a `together`.
         facing: With `local`, direction of the robot when the step begins: `away`, `towards`, `left` or `right`, seen
             by an observer who looks away from the other end of its link.
-        times: Time of a message: `header`, the autopilot's own time, or `received`, when it arrived.
+        times: Time of a message: `header` for the autopilot's time, or `received` for the time of arrival.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         heights: Whether heights above the sea are used, with `global`.
         during: Steps that run at the same time.
     """
 
-    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.OF_POSITIONS)
+    cross_checks = (*motion_sources.OF_TELEMETRY, *position_checks.POSITION_CHECKS)
 
     robot: Role
     at: Role | None = None
@@ -231,7 +231,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
 
     @override
     def flows(self, scene: Scene) -> Iterator[Flow]:
-        """Yield the telemetry, if another robot records it over the radio."""
+        """Yield the flow of the telemetry if another robot records it over the radio."""
         mavlink = mavlink_of(scene.robot(self.robot).profile)
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
@@ -257,18 +257,18 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         try:
             counters = view.evidence.read(tlog.read_summary, self._counters_file)
             log = self._read(view)
-            total = view.evidence.read(tlog.crc32_of, self._file)
+            file_crc32 = view.evidence.read(tlog.crc32_of, self._file)
         except EvidenceError as error:
             yield f"{self._file}: {error.what}"
             return
-        if counters.left_out:
-            yield f"{self._file} lacks {counters.left_out} received frames, because it reached its maximum size"
+        if counters.dropped_frames:
+            yield f"{self._file} lacks {counters.dropped_frames} received frames, because it reached its maximum size"
         if log.frames != counters.frames:
-            yield f"{self._file} has {log.frames} frames, its recorder wrote {counters.frames}"
+            yield f"{self._file} has {log.frames} frames, but its recorder wrote {counters.frames}"
         window = view.attempt_window(self.recorder)
-        yield from (f"{self._file} {why}" for why in tlog.contradictions(log, counters, total, window))
+        yield from (f"{self._file} {reason}" for reason in tlog.contradictions(log, counters, file_crc32, window))
         for name in self.rates:
-            if (result := counters.refused.get(MESSAGES[name])) is not None:
+            if (result := counters.refusals.get(MESSAGES[name])) is not None:
                 yield f"the autopilot refused the request for {name} (MAV_RESULT {result})"
             elif name not in log.kinds:
                 yield f"{self._file}: no {name}, which was requested"

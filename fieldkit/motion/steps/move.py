@@ -14,7 +14,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Protocol, Role
 from fieldkit.measure.positions import recorded_positions
 from fieldkit.motion.logs import drive_checks, drive_log, motion_log, motion_sources
-from fieldkit.motion.profile_sections import drive_of, drives
+from fieldkit.motion.profile_sections import can_drive, drive_of
 from fieldkit.motion.steps import driving
 from fieldkit.motion.steps.lease import run_inside
 from fieldkit.ros.streams import stream_options
@@ -56,12 +56,12 @@ class MoveStep(
 ):
     """Moves a robot while the steps in `during` run; afterwards the robot is at its place again.
 
-    So all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a lab move
-    on the ground of their world, and return instantly; in the field the operator is asked to start the motion and
-    to bring the robot back. Ground robots that [fieldkit drives](motion.md) move and return automatically, with
-    `--allow-motion`, and write `drive.jsonl`. `--dry-run` describes the path. A move may be inside a move of another
-    robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move, but not
-    a move inside a fault.
+    Therefore, all repeats start from the same place. At the end of its path the robot stops and waits. Robots of a
+    lab move on the ground of their world, and return instantly; in the field the operator is asked to start the
+    motion and to bring the robot back. Ground robots that [fieldkit drives](motion.md) move and return automatically,
+    with `--allow-motion`, and write `drive.jsonl`. `--dry-run` describes the path. A move may be inside a move of
+    another robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move,
+    but not a move inside a fault.
 
     Attributes:
         robot: Role that moves.
@@ -71,7 +71,7 @@ class MoveStep(
         within_limits: Whether a robot whose `limits.max_speed_m_s` or `limits.fence_m` are exceeded moves as far and
             as fast as they allow, and stops half a metre before the fence; `trial.yaml` records the actual motion.
             Otherwise the trial is refused.
-        driven: Whether there are columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
+        driven: Whether trials have columns of its [automatic drive](motion.md#evidence-of-a-drive). A robot that
             fieldkit drives always has them.
         during: Steps that run at the same time.
     """
@@ -99,7 +99,7 @@ class MoveStep(
             if fence_m is not None and geometry.farthest_m(legs) > fence_m:
                 margin_m = min(_FENCE_MARGIN_M, fence_m / 2)
                 path = tuple(filter(None, map(PathLeg.of, geometry.clip_path(legs, fence_m - margin_m)))) or path
-        update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or drives(robot)}
+        update = {"path": path, "speed": speed_m_s, "within_limits": False, "driven": self.driven or can_drive(robot)}
         step = self.model_copy(update=update)
         return super(MoveStep, step).resolved(cast, step.path_s(robot))
 
@@ -114,7 +114,7 @@ class MoveStep(
 
     @property
     def motion(self) -> model.Move:
-        """The move, as passed to the testbed.
+        """The move in the form for the testbed.
 
         Raises:
             ValueError: The step has no speed, because it is not resolved.
@@ -125,29 +125,29 @@ class MoveStep(
 
     @property
     def straight_s(self) -> float:
-        """Duration of the path at its speed without the time for turns, in seconds, to the millisecond."""
+        """Duration of the path at its speed, without turns, in seconds, rounded to milliseconds."""
         motion = self.motion
         return round(geometry.length_m(motion) / motion.speed_m_s, 3)
 
     def path_s(self, robot: Robot) -> float:
         """Return the duration of the path in seconds, including turns if the robot drives automatically."""
-        return driving.path_duration_s(robot, self.motion) if drives(robot) else self.straight_s
+        return driving.path_duration_s(robot, self.motion) if can_drive(robot) else self.straight_s
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         """Yield the job that drives the robot, unless the testbed moves it, and the jobs of the steps inside."""
-        if drives(scene.robot(self.robot)):
+        if can_drive(scene.robot(self.robot)):
             yield self._driving(scene)
         yield from self.inside(scene)
 
     def _driving(self, scene: Scene) -> Planned:
         """Return the job that drives the robot."""
         inside_s = sum(planned.job.limit_s for planned in self.inside(scene))
-        return driving.planned(scene, self.motion, inside_s, self._name_pattern)
+        return driving.drive_job(scene, self.motion, inside_s, self._name_pattern)
 
     @property
     def _name_pattern(self) -> str:
-        """Pattern of the names of jobs and files, see `driving.planned`."""
+        """Pattern of the names of jobs and files, see `driving.drive_job`."""
         return self.prefixed_name("{}")
 
     @property
@@ -158,17 +158,17 @@ class MoveStep(
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
         robot = scene.robot(self.robot)
         driving_note = ""
-        if (drive := drive_of(robot.profile)) is not None and drives(robot):
+        if (drive := drive_of(robot.profile)) is not None and can_drive(robot):
             driving_note = (
                 f", and back, automatically: velocities on {drive.topic}, odometry of {drive.odometry}; it stops if "
-                f"the laptop is silent for {drive.lease:g} s, and {robot.profile.limits.fence_m:g} m from its place"
+                f"no order arrives for {drive.lease:g} s, or {robot.profile.limits.fence_m:g} m from its origin"
             )
         duration = f"for up to {round(self.path_s(robot), 1):g} s"
         yield f"{robot.name} moves {geometry.describe_move(self.motion)}, {duration}{driving_note}"
 
     @override
     def abort_notes(self, scene: Scene) -> Iterator[str]:
-        if drives(scene.robot(self.robot)):
+        if can_drive(scene.robot(self.robot)):
             yield f"{scene.robot(self.robot).name} stops where it is"
 
     @override
@@ -183,14 +183,14 @@ class MoveStep(
                 "reduce the speed in the procedure, or write within_limits: true; the limit is "
                 "limits.max_speed_m_s in its profile",
             )
-        if drives(robot):
+        if can_drive(robot):
             yield from driving.refusals(scene, self.motion)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
-        """Return the size of the log of a driving robot, which covers path, steps inside and the return."""
+        """Return the size of the log of a driving robot, which covers the path, the steps inside and the return."""
         robot = scene.robot(role)
-        if role != self.robot or not drives(robot) or drive_of(robot.profile) is None:
+        if role != self.robot or not can_drive(robot) or drive_of(robot.profile) is None:
             return 0.0
         return _LOG_BYTES_PER_S * (2 * self.path_s(robot) + self.inside_s(scene.protocol))
 
@@ -198,15 +198,17 @@ class MoveStep(
     def needs(self, scene: Scene) -> Iterator[Need]:
         """Yield the check of the middleware's Python package for a robot that drives automatically."""
         robot = scene.robot(self.robot)
-        if drives(robot):
+        if can_drive(robot):
             yield stream_options.need(self.robot, robot, driving.middleware_of(robot))
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         robot = scene.robot(self.robot)
         announce(f"move {robot.name}", None)
-        if drives(robot):
-            with driving.driven(scene, testbed, self._driving(scene), self.motion, self._name_pattern) as drive_lease:
+        if can_drive(robot):
+            with driving.drive_robot(
+                scene, testbed, self._driving(scene), self.motion, self._name_pattern
+            ) as drive_lease:
                 run_inside(self, drive_lease, scene, testbed, announce)
                 announce(f"drive {robot.name} back", self.path_s(robot))
             return
@@ -231,7 +233,7 @@ class MoveStep(
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the log of the drive is damaged or contradicts the plan."""
-        if not (self.driven and drives(view.scene.robot(self.robot))):
+        if not (self.driven and can_drive(view.scene.robot(self.robot))):
             return
         try:
             log = view.evidence.read(drive_log.read, self._log)
@@ -242,7 +244,7 @@ class MoveStep(
         motion = self.motion
         plan = drive_checks.DrivePlan(motion.legs, motion.speed_m_s, view.attempt_window(self.robot))
         reasons = [damage] if damage else drive_checks.contradictions(log, plan)
-        yield from (f"{self._log}: {why}" for why in reasons)
+        yield from (f"{self._log}: {reason}" for reason in reasons)
 
     @override
     def measure(self, view: View) -> Measured:
@@ -255,10 +257,14 @@ class MoveStep(
             return measured
         during_ns = (log[0].utc_ns, log[-1].utc_ns) if log[0].utc_ns else None
         away_m = max(moment.off_m for moment in log)
-        why = recorded_positions.distance_contradiction(
+        reason = recorded_positions.travel_contradiction(
             view.evidence, self.robot, away_m, self.motion.speed_m_s, during_ns
         )
-        return measured.without({name: why for name in measured.values if name != "drive_ended"}) if why else measured
+        return (
+            measured.without({name: reason for name in measured.values if name != "drive_ended"})
+            if reason
+            else measured
+        )
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

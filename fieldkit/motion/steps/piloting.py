@@ -45,7 +45,7 @@ _GUARD_EXIT_S: Final = 10.0
 """Maximum time from the order `LEAVE` to the exit of a guard."""
 _QUERY_S: Final = 5.0
 """Timeout of a query, so that a robot that does not answer delays an alarm for at most this time."""
-_END_LINE: Final = re.compile(r"(?:[0-9.]+ )?(?:error|land|return): (?P<why>.+)")
+_END_LINE: Final = re.compile(r"(?:[0-9.]+ )?(?:error|land|return): (?P<reason>.+)")
 """Line of the program when it aborts the flight or stops sending to the autopilot."""
 _SEPARATOR: Final = "\x1e"
 _TAILS: Final = 'for name do tail -c 2000 "$name" 2>/dev/null | tr "\\036" " "; printf "\\036"; done'
@@ -64,7 +64,7 @@ def connection(robot: Robot) -> str:
     return mavlink.onboard_connection
 
 
-def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: float) -> Planned:
+def flight_job(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: float) -> Planned:
     """Return the job of a flight program on a drone.
 
     Args:
@@ -81,7 +81,7 @@ def planned(scene: Scene, role: Role, name: str, plan: FlightPlan, limit_s: floa
     return Planned(role, job, program=robot.profile.tools.python, permitted_causes=BY_EXIT)
 
 
-def guard(
+def guard_job(
     scene: Scene, role: Role, name: str, *, abort: str, lease_s: float = LEASE_S, has_pilot: bool = False
 ) -> Planned:
     """Return the job of the program that guards a drone, and ends its flight if the attempt is aborted.
@@ -102,10 +102,10 @@ def guard(
         guards=True,
         liveness=liveness_file(name) if has_pilot else "",
     )
-    return planned(scene, role, name, plan, _GUARD_S)
+    return flight_job(scene, role, name, plan, _GUARD_S)
 
 
-def rescue(scene: Scene, role: Role, name: str, guard_name: str, *, abort: str) -> Job:
+def rescue_job(scene: Scene, role: Role, name: str, guard_name: str, *, abort: str) -> Job:
     """Return the job that ends the flight of a drone if neither its pilot nor its guard runs.
 
     Args:
@@ -113,7 +113,7 @@ def rescue(scene: Scene, role: Role, name: str, guard_name: str, *, abort: str) 
         role: Role of the drone.
         name: Name of the job.
         guard_name: Name of the guard's job.
-        abort: As for `guard`.
+        abort: As for `guard_job`.
     """
     plan = FlightPlan(
         connection=connection(scene.robot(role)),
@@ -123,7 +123,7 @@ def rescue(scene: Scene, role: Role, name: str, guard_name: str, *, abort: str) 
         rescues=True,
         liveness=liveness_file(guard_name),
     )
-    return replace(planned(scene, role, name, plan, _RESCUE_S).job, ready=None)
+    return replace(flight_job(scene, role, name, plan, _RESCUE_S).job, ready=None)
 
 
 def liveness_file(guard_name: str) -> str:
@@ -135,7 +135,7 @@ def liveness_file(guard_name: str) -> str:
 def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
-    """Start the guard of a drone, yield its lease, and stop it after the body; errors as `leased_program`."""
+    """Start the guard of a drone, yield its lease, and stop it after the body; errors as for `leased_program`."""
     with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, exit_s=_GUARD_EXIT_S) as flight:
         yield flight
         flight.release()
@@ -152,12 +152,12 @@ class FlightLease(LeaseKeeper):
             does not cross the radio under test.
 
     Attributes:
-        lost: Why the program cannot report its end; empty if it can.
+        lost_reason: The reason why the program cannot report its end; empty if it can.
     """
 
     def __init__(self, shell: Shell, program: Planned, lease_s: float, silent_lease_s: float | None) -> None:
         job = program.job
-        self.lost = ""
+        self.lost_reason = ""
         super().__init__(
             shell,
             job,
@@ -171,8 +171,8 @@ class FlightLease(LeaseKeeper):
     @property
     @override
     def end_reason(self) -> str:
-        why = self._reported_reason or self.lost
-        return f"its flight ended early: {why}" if why else super().end_reason
+        reason = self._reported_reason or self.lost_reason
+        return f"its flight ended early: {reason}" if reason else super().end_reason
 
     @property
     def _lines(self) -> Sequence[str]:
@@ -180,12 +180,12 @@ class FlightLease(LeaseKeeper):
 
     @property
     def _reported_reason(self) -> str:
-        """The reason for which the program ended the flight, from its log; empty if it did not."""
+        """The reason why the program ended the flight, from its log; empty if it did not end it."""
         match = next(filter(None, map(_END_LINE.match, self._lines)), None)
-        return shorten(match["why"]) if match else ""
+        return shorten(match["reason"]) if match else ""
 
     def release(self) -> None:
-        """Order the program to exit without a command to the drone; errors as `give_order`."""
+        """Order the program to exit without a command to the drone; raises the errors of `give_order`."""
         self.give_order(LEAVE)
 
     @property
@@ -225,9 +225,9 @@ class FlightLease(LeaseKeeper):
         return any(line.endswith(f" {MISPLACED}") for line in self._lines)
 
     def tails(self, names: Sequence[str]) -> list[list[str]]:
-        """Return the lines in the last 2,000 bytes of files in the attempt's folder; errors as `give_order`.
+        """Return the lines in the last 2,000 bytes of files in the attempt's folder; a missing file has no lines.
 
-        A file that is empty or missing has no lines.
+        Raises the errors of `give_order`.
         """
         files = [f"{self._job.folder}/{name}" for name in names]
         result = self._shell.run(("sh", "-c", _TAILS, "sh", *files), deadline=Deadline.after(_QUERY_S))
@@ -235,14 +235,14 @@ class FlightLease(LeaseKeeper):
         return [[shorten(line, 1000) for line in tail.splitlines()] for tail in tails]
 
     def refresh(self) -> None:
-        """Renew the order with a short timeout; errors as `give_order`."""
+        """Renew the order with a short timeout; raises the errors of `give_order`."""
         self._send(_QUERY_S)
 
     def wait_for(self, mark: str, within_s: float) -> None:
         """Wait until the program reports that it has reached a state.
 
         Args:
-            mark: The state, as printed at the end of a line of the log.
+            mark: The state, which is the last word of a line of the log.
             within_s: Timeout in seconds.
 
         Raises:
@@ -254,11 +254,11 @@ class FlightLease(LeaseKeeper):
             self.renew()
             if any(line.endswith(f" {mark}") for line in self._lines):
                 return
-            if why := self._reported_reason or self.lost or self.end_reason:
-                raise self.failure(why)
+            if reason := self._reported_reason or self.lost_reason or self.end_reason:
+                raise self.failure(reason)
             if deadline.expired:
-                last = shorten(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
-                raise self.failure(f"it is not {mark} after {within_s:.0f} s; its last line: {last}")
+                last_line = shorten(self._lines[-1].partition(" ")[2]) if self._lines else "nothing"
+                raise self.failure(f"it did not report {mark!r} in {within_s:.0f} s; its last line: {last_line}")
             self.pause()
 
 
@@ -275,14 +275,14 @@ def _motion_origin(values: Mapping[str, Any]) -> MotionOrigin:
 def leased_program(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float, exit_s: float
 ) -> Iterator[FlightLease]:
-    """Start a flight program on a drone, yield its lease, and wait for its exit after the body has ordered it.
+    """Start a flight program on a drone, yield its lease, and wait for the exit that the body has ordered.
 
     If the body fails, the program continues until its lease expires or the clean-up of the attempt stops its job.
 
     Args:
         scene: The attempt.
         shell: Connection to the robot.
-        program: The job, from `planned`.
+        program: The job, from `flight_job`.
         lease_s: Time in seconds until an order expires.
         body_s: Approximate duration of the body, needed if the control connection must be silent meanwhile.
         exit_s: Maximum time for the exit of the program.

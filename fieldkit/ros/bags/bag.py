@@ -21,8 +21,8 @@ _READER: Final = SandboxedReader("fieldkit.ros.bags.bag_reader")
 
 _BLOCK_BYTES: Final = 512  # unit of st_blocks on every file system
 _MIN_ALLOCATED_BYTES: Final = 64 << 20
-"""Some file systems update the block count of a file only seconds after a write, so up to this size, the file size
-is used."""
+"""Up to this size, the file size is used, because some file systems update the block count of a file only seconds
+after a write."""
 
 
 def read(path: Path) -> RecordingContents:
@@ -50,14 +50,14 @@ def read(path: Path) -> RecordingContents:
         contents = query(path)
     except ReaderError as error:
         raise EvidenceError(
-            f"the bag cannot be read, it is unindexed, truncated or not a bag: {error}",
+            f"the bag cannot be read; it is unindexed, truncated or not a bag: {error}",
             where=where,
             remedy="stop the recorder with SIGINT and wait for it, or repair the bag with `fieldkit bag repair`",
         ) from error
     messages, metadata_messages = contents["messages"], contents.get("metadata_messages", contents["messages"])
     if messages != metadata_messages:
         raise EvidenceError(
-            f"the file contains {messages} messages, {METADATA} states {metadata_messages}",
+            f"the file contains {messages} messages, but {METADATA} states {metadata_messages}",
             where=where,
             remedy="is the bag split into several files? omit --max-bag-size and --max-bag-duration in `record`",
         )

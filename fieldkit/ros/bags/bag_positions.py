@@ -1,4 +1,4 @@
-"""Position samples of one robot from a bag: entry points of `fieldkit.positions`."""
+"""Position samples of one robot from a bag: an entry point of `fieldkit.positions`."""
 
 from pathlib import Path
 
@@ -35,15 +35,15 @@ def read_bag(path: Path, position_source: PositionSource) -> Samples:
         )
     times = np.array([row[:2] for row in topic_data["rows"]], dtype=np.int64)
     values = np.array([row[2:] for row in topic_data["rows"]], dtype=float)
-    stamped = position_source.stamps == "header"
+    uses_header_stamps = position_source.stamps == "header"
     stale_s = abs(np.median(times[:, 0] - times[:, 1])) / 1e9
-    if stamped and stale_s > MAX_STALE_S:
+    if uses_header_stamps and stale_s > MAX_STALE_S:
         raise EvidenceError(
             f"the stamps of {topic} differ by {stale_s:.0f} s from the times of reception",
             where=str(path),
             remedy="write times: received, in the step",
         )
-    times_ns, first = np.unique(times[:, 0 if stamped else 1], return_index=True)
+    times_ns, first = np.unique(times[:, 0 if uses_header_stamps else 1], return_index=True)
     frames = {"sensor_msgs/msg/NavSatFix": WGS84, "nav_msgs/msg/Odometry": PLACED}
     is_odometry = frames.get(kind) == PLACED
     yaws_rad = values[first, 3] if is_odometry else None

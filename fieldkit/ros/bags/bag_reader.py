@@ -1,4 +1,4 @@
-"""Reader of bags with the rosbags library, which `bag` runs in a sandboxed process. No other module reads bags."""
+"""Reader of bags with the rosbags library, which `bag` runs in a sandboxed process."""
 
 import math
 from contextlib import closing
@@ -17,27 +17,27 @@ if TYPE_CHECKING:
 
 _BATTERY: Final = "sensor_msgs/msg/BatteryState"
 _TF_MESSAGE: Final = "tf2_msgs/msg/TFMessage"
-# Times and counts of a bag are below this; rosbags does not check what it reads from text or a database.
+# Limit for times and counts of a bag; rosbags does not check the values that it reads from text or a database.
 _MAX_COUNT: Final = 1 << 63
 _MAX_TOPICS: Final = 10_000
 
 
-def answer(question: Json) -> Json:
-    """Return the answer to a query about the bag at `path`.
+def answer(request: Json) -> Json:
+    """Return the answer to a request about the bag at `path`.
 
-    A query with `topic_stats` returns the message times by topic, with `topic` the last battery state, with
-    `positions` the positions in one topic, and any other query the contents of the bag.
+    The keys of the request select the answer: the message times by topic (`topic_stats`), the last battery state
+    (`topic`), the positions in one topic (`positions`), or else the contents of the bag.
 
     Raises:
         Exception: The bag cannot be read; rosbags and its dependencies raise any exception for invalid bytes.
     """
-    path = Path(question["path"])
-    if "positions" in question:
-        return positions(path, question["positions"], question["child"])
-    if "topic" in question:
-        share = battery_share(path, question["topic"])
+    path = Path(request["path"])
+    if "positions" in request:
+        return positions(path, request["positions"], request["child"])
+    if "topic" in request:
+        share = battery_share(path, request["topic"])
         return {"share": None if math.isnan(share) else share}
-    if "topic_stats" in question:
+    if "topic_stats" in request:
         return {"topics": topic_stats(_open_ros2(path.parent) if path.suffix in bag.ROS2 else rosbag1.Reader(path))}
     if path.suffix not in bag.ROS2:
         return contents(rosbag1.Reader(path))
@@ -172,7 +172,7 @@ def _pose(msgtype: str, message: Any, child: str) -> tuple[float, float, float, 
 
 
 def _check_database(path: Path) -> None:
-    """Check every page, because the count of messages can be right although messages are truncated."""
+    """Check every page, because the message count can be correct even if messages are truncated."""
     import sqlite3  # noqa: PLC0415 (as above)
 
     with closing(sqlite3.connect(f"{path.absolute().as_uri()}?immutable=1", uri=True)) as database:

@@ -1,4 +1,4 @@
-"""Formats of bags, detected by the first bytes of their files."""
+"""Formats of bags, which are detected by the first bytes of their files."""
 
 import os
 from dataclasses import dataclass

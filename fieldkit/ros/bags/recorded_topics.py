@@ -47,7 +47,7 @@ COLUMNS: Final = columns(
         "s",
         (
             "Longest time without a message of a topic, between its first message and the end of the recording's "
-            "duration. Empty if bag_discovery_s is."
+            "duration. Empty if bag_discovery_s is empty."
         ),
         Figure("longest gap between messages", Kind.MEDIAN),
     ),
@@ -122,16 +122,16 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
     Raises:
         EvidenceError: The log is missing.
     """
-    start_ns = subscribed_ns(reading.text(folder / log), topics)
-    all_subscribed = start_ns.keys() >= set(topics)
+    start_ns = subscription_ns(reading.text(folder / log), topics)
+    is_subscribed_to_all = start_ns.keys() >= set(topics)
     try:
         by_topic = topic_stats(folder / file)
     except EvidenceError:
         # A recorder that cannot reach its master never subscribes and writes no bag.
-        return RecordingReception(None if all_subscribed else False, None, None, None)
+        return RecordingReception(None if is_subscribed_to_all else False, None, None, None)
     discovered = by_topic.keys() >= set(topics)
     messages = sum(by_topic[topic].messages for topic in topics if topic in by_topic)
-    if not (discovered and all_subscribed):
+    if not (discovered and is_subscribed_to_all):
         return RecordingReception(discovered, messages, None, None)
     first_ns = (by_topic[topic].first_utc_ns - start_ns[topic] for topic in topics)
     ends_ns = {topic: start_ns[topic] + round(duration_s * _NS) for topic in topics}
@@ -139,12 +139,12 @@ def read(folder: Path, log: str, file: str, topics: Sequence[str], duration_s: f
     return RecordingReception(discovered, messages, max(0, *first_ns) / _NS, max(gap_ns) / _NS)
 
 
-def subscribed_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
+def subscription_ns(log: str, topics: Sequence[str]) -> dict[str, int]:
     """Return the time of subscription or start of discovery by topic, from the log; nanoseconds since 1970 UTC."""
     by_topic = {match["topic"]: _stamp_ns(match) for match in _ROS1.finditer(log)}
-    all_topics = _ROS2.search(log)
-    if all_topics is not None:
-        return dict.fromkeys(topics, _stamp_ns(all_topics))
+    ros2_start = _ROS2.search(log)
+    if ros2_start is not None:
+        return dict.fromkeys(topics, _stamp_ns(ros2_start))
     return {topic: by_topic[topic] for topic in topics if topic in by_topic}
 
 

@@ -51,15 +51,15 @@ class BagConnection:
     qos: str = ""
 
 
-SavedMessage = tuple[BagConnection, int, bytes]
+RecoveredMessage = tuple[BagConnection, int, bytes]
 """Connection of a message, time of its recording in nanoseconds since 1970, and the serialized message."""
 
 
-def messages(bag_format: BagFormat, file: Path) -> Iterator[SavedMessage]:
+def messages(bag_format: BagFormat, file: Path) -> Iterator[RecoveredMessage]:
     """Yield the messages of a data file in their order in the file.
 
     Raises:
-        DamagedError: The file is damaged; all readable messages were yielded before.
+        DamagedError: The file is damaged; all readable messages have been yielded.
     """
     readers = {BagFormat.ROS1: _ros1, BagFormat.SQLITE: _sqlite, BagFormat.MCAP: _mcap}
     return readers[bag_format](file)
@@ -75,12 +75,12 @@ _KNOWN_KINDS: Final = range(2, 8)
 _MAX_CHUNK_BYTES: Final = 1 << 30
 
 
-def _ros1(file: Path) -> Iterator[SavedMessage]:
+def _ros1(file: Path) -> Iterator[RecoveredMessage]:
     data = file.read_bytes()
     yield from _records(memoryview(data)[len(_MAGIC) :], {})
 
 
-def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterator[SavedMessage]:
+def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterator[RecoveredMessage]:
     """Yield the messages in a sequence of records, from a file or from a chunk."""
     offset = 0
     while offset < len(data):
@@ -105,7 +105,7 @@ def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterato
         elif kind == _MESSAGE:
             number = _number(fields, "conn")
             if number not in connections:
-                raise DamagedError(f"a message is of connection {number}, which the bag does not define")
+                raise DamagedError(f"a message belongs to connection {number}, which the bag does not define")
             if len(fields.get("time", b"")) != _TIME.size:
                 raise DamagedError("a message has no time")
             seconds, nanoseconds = _TIME.unpack(fields["time"])
@@ -113,10 +113,10 @@ def _records(data: memoryview, connections: dict[int, BagConnection]) -> Iterato
 
 
 def _read_sized(data: memoryview, offset: int) -> tuple[memoryview, int]:
-    """Return the bytes that follow their length at a position, and the position of their end."""
+    """Return the content of a length-prefixed field at a position, and the position after the field."""
     end = offset + _LENGTH.size + _length(data, offset)
     if end > len(data):
-        raise DamagedError(f"the file ends {end - len(data)} bytes before a record does")
+        raise DamagedError(f"the file ends {end - len(data)} bytes before the end of a record")
     return data[offset + _LENGTH.size : end], end
 
 
@@ -177,7 +177,7 @@ def _decompress(fields: dict[str, bytes], body: memoryview) -> bytes:
 # SQLite: rosbag2_storage_sqlite3's schema.
 
 
-def _sqlite(file: Path) -> Iterator[SavedMessage]:
+def _sqlite(file: Path) -> Iterator[RecoveredMessage]:
     # The last writes of a killed recorder are in separate files (sqlite.org/wal.html). A copy is opened, because
     # opening the bag would merge these files into it.
     with tempfile.TemporaryDirectory(prefix="fieldkit-") as folder:
@@ -192,19 +192,19 @@ def _sqlite(file: Path) -> Iterator[SavedMessage]:
             raise DamagedError(str(error)) from error
 
 
-def _rows(database: sqlite3.Connection) -> Iterator[SavedMessage]:
+def _rows(database: sqlite3.Connection) -> Iterator[RecoveredMessage]:
     connections = dict(_topics(database))
-    last = 0
-    for number, topic, at_ns, data in database.execute(
+    last_read_id = 0
+    for message_id, topic, at_ns, data in database.execute(
         "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
     ):
         if topic not in connections:
-            raise DamagedError(f"message {number} is of topic {topic}, which the bag does not define")
-        last = number
+            raise DamagedError(f"message {message_id} belongs to topic {topic}, which the bag does not define")
+        last_read_id = message_id
         yield connections[topic], int(at_ns), bytes(data)
     (last_id,) = database.execute("SELECT max(id) FROM messages").fetchone()
-    if last_id is not None and last_id > last:
-        raise DamagedError(f"only {last} of {last_id} messages can be read")
+    if last_id is not None and last_id > last_read_id:
+        raise DamagedError(f"only {last_read_id} of {last_id} messages can be read")
 
 
 def _topics(database: sqlite3.Connection) -> Iterator[tuple[int, BagConnection]]:
@@ -241,7 +241,7 @@ def _columns(database: sqlite3.Connection, table: str) -> set[str]:
 
 
 class _ExactReader:
-    """Reads a file; a read beyond its end raises EOFError instead of returning less."""
+    """Reads a file; a read beyond its end raises EOFError instead of returning fewer bytes."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -252,11 +252,11 @@ class _ExactReader:
             raise EOFError(f"a record states a length of {length} bytes, but the file has {self._size_bytes}")
         data = self._file.read(length)
         if len(data) < length:
-            raise EOFError(f"the file ends {length - len(data)} bytes before a record does")
+            raise EOFError(f"the file ends {length - len(data)} bytes before the end of a record")
         return data
 
 
-def _mcap(file: Path) -> Iterator[SavedMessage]:
+def _mcap(file: Path) -> Iterator[RecoveredMessage]:
     schemas: dict[int, Schema] = {}
     connections: dict[int, BagConnection] = {}
     with file.open("rb") as stream:

@@ -1,4 +1,4 @@
-"""The process that opens bags with libraries: inspects, repairs and converts them.
+"""The process that inspects, repairs and converts bags with third-party libraries.
 
 `fieldkit.ros.bags.contents` runs it in a sandbox, because files from a robot may be malicious
 (`fieldkit.measure.evidence.sandbox`).
@@ -55,24 +55,24 @@ def answer(request: Json) -> Json:
 def inspect(bag: BagFiles, *, read_all: bool) -> Json:
     """Return the contents of a bag from its index, and its problems; `read_all` reads and decodes all messages."""
     result: Json = {"topics": [], "started_utc_ns": 0, "duration_s": 0.0, "compression": "none"}
-    problems = list(_unclosed(bag))
+    problems = list(_unclosed_problems(bag))
     if not problems:
         try:
             with _reader(bag) as reader:
                 result |= _contents(reader)
             if read_all:
                 problems += _problems(bag)
-        except Exception as error:  # noqa: BLE001 (as for `answer`; the error is a part of the result)
+        except Exception as error:  # noqa: BLE001 (as in `answer`; the error is a part of the result)
             problems.append(_error_text(error))
     if problems:
-        saved = _count_recoverable(bag)
-        result |= {"saved": saved}
-        if not bag.closed and saved["why"]:  # the files were not read otherwise
-            problems.append(saved["why"])
+        recoverable = _count_recoverable(bag)
+        result |= {"saved": recoverable}
+        if not bag.closed and recoverable["why"]:  # no other function has read the files of an unclosed bag
+            problems.append(recoverable["why"])
     return result | {"problems": problems[:_MAX_PROBLEMS]}
 
 
-def _unclosed(bag: BagFiles) -> Iterator[str]:
+def _unclosed_problems(bag: BagFiles) -> Iterator[str]:
     if not bag.closed:
         yield "there is no metadata.yaml: the recorder was stopped before it closed the bag, or it was not copied"
 
@@ -106,28 +106,28 @@ def _contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
 
 def _problems(bag: BagFiles) -> Iterator[str]:
     """Read all messages, and yield the problems."""
-    read: Counter[str] = Counter()
-    undecoded: dict[str, str] = {}
+    read_counts: Counter[str] = Counter()
+    errors_by_type: dict[str, str] = {}
     with _any_reader(bag) as reader:
-        begin_ns, end_ns = reader.start_time, reader.end_time
-        outside = 0
+        start_ns, end_ns = reader.start_time, reader.end_time
+        outside_count = 0
         for connection, at_ns, data in reader.messages():
-            read[connection.topic] += 1
-            outside += not begin_ns <= at_ns <= end_ns
-            if connection.msgtype in undecoded or connection.msgtype not in reader.typestore.fielddefs:
+            read_counts[connection.topic] += 1
+            outside_count += not start_ns <= at_ns <= end_ns
+            if connection.msgtype in errors_by_type or connection.msgtype not in reader.typestore.fielddefs:
                 continue
             try:
                 reader.deserialize(data, connection.msgtype)
-            except Exception as error:  # noqa: BLE001 (as `answer`)
-                message_name = f"message {read[connection.topic]} of {connection.topic}"
-                undecoded[connection.msgtype] = (
+            except Exception as error:  # noqa: BLE001 (as in `answer`)
+                message_name = f"message {read_counts[connection.topic]} of {connection.topic}"
+                errors_by_type[connection.msgtype] = (
                     f"{message_name} is not a valid {connection.msgtype}: {_error_text(error)}"
                 )
-        if reader.message_count != sum(read.values()):
-            yield f"its index counts {reader.message_count} messages, but it contains {sum(read.values())}"
-        if outside:
-            yield f"{outside} messages are outside the time range of its index"
-    yield from undecoded.values()
+        if reader.message_count != sum(read_counts.values()):
+            yield f"its index counts {reader.message_count} messages, but it contains {sum(read_counts.values())}"
+        if outside_count:
+            yield f"{outside_count} messages are outside the time range of its index"
+    yield from errors_by_type.values()
 
 
 def _any_reader(bag: BagFiles) -> AnyReader:
@@ -199,15 +199,15 @@ def _connection(writer: rosbag1.Writer | rosbag2.Writer, source: BagConnection, 
 # Conversion.
 
 
-def types_of(distribution: str) -> Typestore:
-    """Return the message types of a distribution of ROS."""
+def message_types(distribution: str) -> Typestore:
+    """Return the message types of a ROS distribution."""
     return get_typestore(Stores(f"ros{1 if distribution == 'noetic' else 2}_{distribution}"))
 
 
 def convert_bag(bag: BagFiles, to: Path, storage: str, distribution: str) -> Json:
     """Write a bag in another format with the message types of a distribution; return the remarks of the converter."""
     output = io.StringIO()
-    with contextlib.redirect_stdout(output):  # standard output carries the answers
+    with contextlib.redirect_stdout(output):  # standard output is reserved for the answers
         convert(
             srcs=[bag.path],
             dst=to,
@@ -216,7 +216,7 @@ def convert_bag(bag: BagFiles, to: Path, storage: str, distribution: str) -> Jso
             compress=None,
             compress_mode="file",
             default_typestore=get_typestore(Stores.ROS2_HUMBLE),
-            typestore=types_of(distribution),
+            typestore=message_types(distribution),
             exclude_topics=(),
             include_topics=(),
             exclude_msgtypes=(),

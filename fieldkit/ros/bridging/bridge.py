@@ -1,8 +1,8 @@
 """Bridge topics between two middlewares as serialized messages: ROS 1, DDS and Zenoh.
 
-Between ROS 1 and ROS 2 rosbags converts the bytes without deserializing them. Headers of
-ROS 2 have no `seq`: it is omitted in messages to ROS 2, and is 0 in messages to ROS 1. Samples do not loop: each side
-ignores the samples that it has published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
+Between ROS 1 and ROS 2, rosbags converts the bytes without deserializing them. Headers of ROS 2 have no `seq`: it is
+omitted in messages to ROS 2, and is 0 in messages to ROS 1. Samples do not loop: each side ignores the samples that
+it has published, identified by caller id (ROS 1), participant (DDS) or session (Zenoh).
 """
 
 import os
@@ -56,7 +56,7 @@ class Forwarder:
         crossing: The topic and its direction.
         source: The side whose nodes publish it.
         target: The side that it is forwarded to.
-        described: The topic as described for the source, and for the target.
+        topic_pair: The topic as the source and as the target describe it.
         convert: Converts a message of the source to one of the target; raises `SerdeError` for an invalid message.
     """
 
@@ -65,21 +65,21 @@ class Forwarder:
         crossing: Crossing,
         source: "_RunningSide",
         target: "_RunningSide",
-        described: tuple[Topic, Topic],
+        topic_pair: tuple[Topic, Topic],
         convert: Convert,
     ) -> None:
-        self._crossing, self._source, self._target, self._described = crossing, source, target, described
+        self._crossing, self._source, self._target, self._topic_pair = crossing, source, target, topic_pair
         self._convert = convert
         self._tally = CrossingTally()
         self._lock = threading.Lock()
-        self._ended = False
-        self._publisher: Publisher = target.running.publisher(described[1])
-        source.running.subscribe(described[0], self._forward)
+        self._is_stopped = False
+        self._publisher: Publisher = target.middleware.publisher(topic_pair[1])
+        source.middleware.subscribe(topic_pair[0], self._forward)
 
     def _forward(self, data: bytes, arrived_ns: int) -> None:
         """Forward a sample. Called in threads of the source; samples are forwarded in sequence."""
         with self._lock:
-            if self._ended:
+            if self._is_stopped:
                 return
             try:
                 converted = self._convert(data)
@@ -94,11 +94,11 @@ class Forwarder:
     def end(self) -> None:
         """Stop forwarding samples, after the one that is being forwarded."""
         with self._lock:
-            self._ended = True
+            self._is_stopped = True
 
     def other_types(self) -> Sequence[str]:
-        """Return a sentence for each different type of the topic on either side, which is not forwarded."""
-        sides = zip((self._source, self._target), self._described, strict=True)
+        """Return a sentence for each other type of the topic on either side; its messages are not forwarded."""
+        sides = zip((self._source, self._target), self._topic_pair, strict=True)
         return [sentence for side, topic in sides for sentence in side.other_types(topic)]
 
     def counts(self) -> CrossingCounts:
@@ -113,22 +113,22 @@ class _RunningSide:
 
     over: str
     network: Network
-    running: Middleware
+    middleware: Middleware
 
     def other_types(self, topic: Topic) -> Sequence[str]:
-        """Return a sentence for each different type of the topic on this side."""
-        others = sorted(self.running.other_types(topic))
-        return [f"{topic.name} is of type {other} in {self.over}, not {topic.type}" for other in others]
+        """Return a sentence for each other type of the topic on this side."""
+        types = sorted(self.middleware.other_types(topic))
+        return [f"{topic.name} is of type {other_type} in {self.over}, not {topic.type}" for other_type in types]
 
 
 @contextmanager
-def bridged(
+def bridge_topics(
     near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes
 ) -> Iterator[Sequence[Forwarder]]:
-    """Bridge two sides while the body runs.
+    """Bridge topics between two sides while the body runs.
 
     Args:
-        near: The source of topics, and the target of topics with `Crossing.back`.
+        near: The source of topics, but the target of topics with `Crossing.back`.
         far: The other side.
         crossings: The topics.
         types: The message types.
@@ -152,7 +152,7 @@ def bridged(
 
 
 def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTypes) -> None:
-    """Check that all topics can be bridged, before anything starts.
+    """Check that all topics can be bridged, before any middleware starts.
 
     Raises:
         ConfigurationError: A topic cannot be bridged.
@@ -167,15 +167,17 @@ def check(near: Side, far: Side, crossings: Sequence[Crossing], types: MessageTy
         topic, type_name = crossing.topic, crossing.type_name
         if directions.count((topic, crossing.back)) > 1:
             raise ConfigurationError(f"{topic} is named twice for the same direction", remedy="name it once")
-        is_same = counterparts.of_type(types, type_name) if _is_ros1(near, far) else types.get(type_name).rihs01
-        if not is_same:
+        has_same_content = (
+            counterparts.of_type(types, type_name) if _uses_ros1(near, far) else types.get(type_name).rihs01
+        )
+        if not has_same_content:
             raise ConfigurationError(
                 f"{topic}: {type_name} differs between ROS 1 and ROS 2, or exists in one of them only",
                 remedy="bridge a topic of another type",
             )
 
 
-def _is_ros1(*sides: "Side | _RunningSide") -> bool:
+def _uses_ros1(*sides: "Side | _RunningSide") -> bool:
     return any(side.over == "ros1" for side in sides)
 
 
@@ -183,8 +185,8 @@ def _is_ros1(*sides: "Side | _RunningSide") -> bool:
 def _running_side(side: Side) -> Iterator[_RunningSide]:
     """Start the middleware of a side, and stop it after the body."""
     with ExitStack() as stack:
-        if _is_ros1(side):
-            # rospy writes a log, which is not needed.
+        if _uses_ros1(side):
+            # rospy always writes a log. It is not needed, so it is deleted with the folder.
             os.environ["ROS_LOG_DIR"] = stack.enter_context(tempfile.TemporaryDirectory(prefix="fieldkit-"))
         try:
             running = middleware.adapter(side.over)(side.network)
@@ -198,8 +200,8 @@ def _create_forwarder(
     crossing: Crossing, source: _RunningSide, target: _RunningSide, types: MessageTypes, number: int
 ) -> Forwarder:
     sides = (source, target)
-    pair = counterparts.of_type(types, crossing.type_name) if _is_ros1(*sides) else None
-    described = [
+    pair = counterparts.of_type(types, crossing.type_name) if _uses_ros1(*sides) else None
+    topic_pair = [
         Topic.from_json(
             topics.describe(
                 types,
@@ -213,19 +215,19 @@ def _create_forwarder(
         )
         for side in sides
     ]
-    for side, topic in zip(sides, described, strict=True):
+    for side, topic in zip(sides, topic_pair, strict=True):
         # With gradual discovery, endpoints with another type may be discovered only later.
         for sentence in side.other_types(topic):
             raise ConfigurationError(sentence, remedy="name the topic with that type")
-    convert = _conversion(_is_ros1(source), pair, types)
-    return Forwarder(crossing, source, target, (described[0], described[1]), convert)
+    convert = _conversion(_uses_ros1(source), pair, types)
+    return Forwarder(crossing, source, target, (topic_pair[0], topic_pair[1]), convert)
 
 
 def _type_at(side: _RunningSide, crossing: Crossing, pair: Counterparts | None) -> str:
     """Return the name of a crossing's type on one side."""
     if pair is None:
         return crossing.type_name
-    return pair.ros1 if _is_ros1(side) else pair.ros2
+    return pair.ros1 if _uses_ros1(side) else pair.ros2
 
 
 def _conversion(from_ros1: bool, pair: Counterparts | None, types: MessageTypes) -> Convert:

@@ -114,9 +114,9 @@ def run(arguments: argparse.Namespace) -> int:
     crossings = _crossings(arguments)
     types = MessageTypes(Distribution(arguments.distribution), dict(map(_definition, arguments.type)))
     near, far = (Side(middleware, _network(middleware, arguments)) for middleware in (arguments.near, arguments.far))
-    with _until_signal() as stopped, bridge.bridged(near, far, crossings, types) as forwarders:
+    with _until_signal() as stop_event, bridge.bridge_topics(near, far, crossings, types) as forwarders:
         show_note(f"{BRIDGE_IS_UP}, {arguments.near} to {arguments.far}; Ctrl-C stops it")
-        _watch(forwarders, stopped)
+        _watch(forwarders, stop_event)
         counts = [forwarder.counts() for forwarder in forwarders]
     if arguments.json:
         print_text(json_text([asdict(topic_counts) for topic_counts in counts]))
@@ -197,19 +197,21 @@ def _domain(option_value: int | None) -> int:
 @contextmanager
 def _until_signal() -> Iterator[threading.Event]:
     """Yield an event that SIGINT and SIGTERM set while the body runs."""
-    stopped = threading.Event()
-    previous = {number: signal.signal(number, lambda *_: stopped.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    stop_event = threading.Event()
+    previous_handlers = {
+        number: signal.signal(number, lambda *_: stop_event.set()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
-        yield stopped
+        yield stop_event
     finally:
-        for number, handler in previous.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
-def _watch(forwarders: Sequence[Forwarder], stopped: threading.Event) -> None:
-    """Wait for `stopped`. If other nodes use a topic with another type, report this once."""
+def _watch(forwarders: Sequence[Forwarder], stop_event: threading.Event) -> None:
+    """Wait for `stop_event`. If other nodes use a topic with another type, report this once."""
     reported: set[str] = set()
-    while not stopped.wait(_POLL_S):
+    while not stop_event.wait(_POLL_S):
         for sentence in chain.from_iterable(forwarder.other_types() for forwarder in forwarders):
             if sentence not in reported:
                 reported.add(sentence)
@@ -220,7 +222,7 @@ def _watch(forwarders: Sequence[Forwarder], stopped: threading.Event) -> None:
 
 
 def _show(counts: Sequence[CrossingCounts]) -> None:
-    head = ("topic", "direction", "messages", "per second", "bytes", "refused", "unreadable", "median", "99 %")
+    header = ("topic", "direction", "messages", "per second", "bytes", "refused", "unreadable", "median", "99 %")
     rows = [
         (
             topic_counts.topic,
@@ -235,7 +237,7 @@ def _show(counts: Sequence[CrossingCounts]) -> None:
         )
         for topic_counts in counts
     ]
-    table(head, rows, right=range(2, len(head)))
+    table(header, rows, right=range(2, len(header)))
 
 
 def _milliseconds(delay_s: float | None) -> str:

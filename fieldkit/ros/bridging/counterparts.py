@@ -23,11 +23,11 @@ ROS2_NAMES: Final[Mapping[str, str]] = MappingProxyType(
         "std_msgs/msg/Duration": "builtin_interfaces/msg/Duration",
     }
 )
-"""Names in ROS 2 of types with different names, by the name in ROS 1."""
+"""Names in ROS 2 of types with different names in ROS 1 and ROS 2, by the name in ROS 1."""
 
 _ROS1_NAMES: Final = {ros2: ros1 for ros1, ros2 in ROS2_NAMES.items()}
 
-ADDED: Final[Mapping[str, Mapping[str, bytes]]] = MappingProxyType(
+ADDED_MEMBERS: Final[Mapping[str, Mapping[str, bytes]]] = MappingProxyType(
     {"sensor_msgs/msg/Range": {"variance": bytes(4)}}  # a float32; 0 means "unknown" (Range.msg)
 )
 """Members that ROS 2 adds at the end of a type, with their bytes in messages from ROS 1."""
@@ -40,12 +40,12 @@ class Counterparts:
     Attributes:
         ros1: Its name in ROS 1, for example `std_msgs/msg/Time`.
         ros2: Its name in ROS 2, for example `builtin_interfaces/msg/Time`.
-        added: Bytes that are appended to a message from ROS 1, in the serialization of ROS 1.
+        added_bytes: Bytes that are appended to a message from ROS 1, in the serialization of ROS 1.
     """
 
     ros1: str
     ros2: str
-    added: bytes = b""
+    added_bytes: bytes = b""
 
     def to_ros2(self, types: MessageTypes, data: bytes) -> bytes:
         """Return a message of ROS 1 in CDR.
@@ -54,7 +54,7 @@ class Counterparts:
             SerdeError: The data are not a message of this type.
         """
         with _any_error_as_serde_error(self.ros1):
-            return bytes(types.ros2.ros1_to_cdr(data + self.added, self.ros2))
+            return bytes(types.ros2.ros1_to_cdr(data + self.added_bytes, self.ros2))
 
     def to_ros1(self, types: MessageTypes, data: bytes) -> bytes:
         """Return a CDR message in the serialization of ROS 1.
@@ -64,9 +64,9 @@ class Counterparts:
         """
         with _any_error_as_serde_error(self.ros2):
             converted = bytes(types.ros2.cdr_to_ros1(data, self.ros2))
-        if len(converted) < len(self.added):
+        if len(converted) < len(self.added_bytes):
             raise SerdeError(f"a message of {self.ros2} of {len(converted)} bytes")
-        return converted[: len(converted) - len(self.added)]
+        return converted[: len(converted) - len(self.added_bytes)]
 
 
 @contextmanager
@@ -79,18 +79,18 @@ def _any_error_as_serde_error(kind: str) -> Iterator[None]:
 
 
 def of_type(types: MessageTypes, name: str) -> Counterparts | None:
-    """Return a type of ROS 1 and ROS 2 by either name, or None if the contents differ.
+    """Return the pair of types with a name in ROS 1 or ROS 2, or None if their contents differ.
 
     Raises:
-        ConfigurationError: Neither has such a type.
+        ConfigurationError: Neither ROS 1 nor ROS 2 has such a type.
     """
-    full = types.get(full_name(name)).name
-    ros1, ros2 = _ROS1_NAMES.get(full, full), ROS2_NAMES.get(full, full)
+    type_name = types.get(full_name(name)).name
+    ros1, ros2 = _ROS1_NAMES.get(type_name, type_name), ROS2_NAMES.get(type_name, type_name)
     if ros1 not in types.ros1.fielddefs or ros2 not in types.ros2.fielddefs:
         return None
-    if ros1 != ros2 or types.translatable(ros2):
+    if ros1 != ros2 or types.is_translatable(ros2):
         return Counterparts(ros1, ros2)
-    added = ADDED.get(ros2, {})
-    if added and types.adds_at_end(ros2, tuple(added)):
-        return Counterparts(ros1, ros2, b"".join(added.values()))
+    added_members = ADDED_MEMBERS.get(ros2, {})
+    if added_members and types.adds_at_end(ros2, tuple(added_members)):
+        return Counterparts(ros1, ros2, b"".join(added_members.values()))
     return None

@@ -22,7 +22,8 @@ _NAME: Final = re.compile(r"(/[A-Za-z]\w*)+", re.ASCII)
 DDS")."""
 
 _BUCKET: Final = math.log(1.01)
-"""Logarithmic width of the histogram classes of delays, 1 %: memory stays constant if a bridge runs for months."""
+"""Logarithmic width of the buckets in the histogram of delays: 1 %. A histogram needs constant memory, even if a
+bridge runs for months."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +47,10 @@ class Crossing:
         """Parse a text such as `/scan:sensor_msgs/LaserScan:sensor_data,depth=1`.
 
         Raises:
-            ConfigurationError: It has another syntax, or the quality of service does not exist.
+            ConfigurationError: The syntax is wrong, or the quality of service does not exist.
         """
-        topic, _, rest = text.partition(":")
-        type_name, _, quality = rest.partition(":")
+        topic, _, type_and_quality = text.partition(":")
+        type_name, _, quality = type_and_quality.partition(":")
         if not _NAME.fullmatch(topic) or not type_name:
             raise ConfigurationError(
                 f"{text!r} is not a topic with its type", remedy="write it as /scan:sensor_msgs/LaserScan"
@@ -94,8 +95,8 @@ class CrossingCounts:
         unreadable: Number of dropped messages that are not valid for the type.
         per_s: Messages per second between the first and the last; None for fewer than two.
         bytes_per_s: Bytes per second in the same time, without the first message.
-        delay_median_s: Median time from the arrival of a message here until the target accepted it, to 1 %.
-        delay_p99_s: 99th percentile of this time, to 1 %.
+        delay_median_s: Median time from the arrival of a message until the target accepted it; its precision is 1 %.
+        delay_p99_s: 99th percentile of this time; its precision is 1 %.
     """
 
     topic: str
@@ -119,17 +120,17 @@ class CrossingTally:
         self.refused = self.unreadable = 0
         self._messages = self._bytes = self._first_bytes = 0
         self._first_ns = self._last_ns = 0
-        self._classes: Counter[int] = Counter()
+        self._histogram: Counter[int] = Counter()
 
-    def count(self, size_bytes: int, arrived_ns: int, left_ns: int) -> None:
+    def count(self, size_bytes: int, arrived_ns: int, forwarded_ns: int) -> None:
         """Count a forwarded message."""
         if not self._messages:
-            self._first_ns, self._first_bytes = left_ns, size_bytes
+            self._first_ns, self._first_bytes = forwarded_ns, size_bytes
         self._messages += 1
         self._bytes += size_bytes
-        self._last_ns = left_ns
+        self._last_ns = forwarded_ns
         # If the clock was set back, the delay counts as 0.
-        self._classes[round(math.log(max(1, left_ns - arrived_ns)) / _BUCKET)] += 1
+        self._histogram[round(math.log(max(1, forwarded_ns - arrived_ns)) / _BUCKET)] += 1
 
     def counts(self, crossing: Crossing, source: str, target: str) -> CrossingCounts:
         """Return the counters."""
@@ -151,10 +152,10 @@ class CrossingTally:
         )
 
     def _delay_s(self, fraction: float) -> float | None:
-        """Return the smallest delay that this fraction of the messages does not exceed; None without messages."""
+        """Return the quantile of the delays for this fraction; None without messages."""
         remaining = math.ceil(fraction * self._messages)
-        for number in sorted(self._classes):
-            remaining -= self._classes[number]
+        for bucket in sorted(self._histogram):
+            remaining -= self._histogram[bucket]
             if remaining <= 0:
-                return math.exp(number * _BUCKET) / 1e9
+                return math.exp(bucket * _BUCKET) / 1e9
         return None

@@ -17,7 +17,7 @@ LIMIT_S: Final = 12 * 3600.0
 
 _MASTER_S: Final = 5
 _READY_S: Final = 40
-"""A small computer needs seconds to load Python, rospy and a middleware."""
+"""Timeout for the start: a small computer needs many seconds to load Python, rospy and a middleware."""
 _LOG: Final = "bridge.log"
 _REMEDY: Final = (
     "see its requirements: fieldkit docs bridge; on the robot: python3 -m pip install 'fieldkit[ros2]'; or correct "
@@ -33,8 +33,8 @@ def folder_of(session: str) -> str:
 def planned(cast: Cast, session: str) -> Iterator[Planned]:
     """Yield the bridge of each robot whose profile requests one: entry point `bridges` of `fieldkit.session_jobs`.
 
-    Of robots with a common ROS master only the first gets a bridge, which forwards the messages of all of them; a
-    second one would publish each message twice.
+    If several robots share a ROS master, only the first one has a bridge, which forwards the messages of all of them.
+    With a second bridge, each message would be published twice.
     """
     masters: set[str] = set()
     for role, robot in cast.items():

@@ -1,7 +1,8 @@
 """Names of topics, types and nodes in ROS 2 over DDS, and in rmw_zenoh.
 
-DDS: "Topic and Service name mapping to DDS" and the mapping of interfaces to IDL, of design.ros2.org.
-Zenoh: docs/design.md of github.com/ros2/rmw_zenoh, sections Publishers and Graph Cache, from its version 0.3 on.
+Sources for DDS: design.ros2.org, "Topic and Service name mapping to DDS" and "Interface definition and language
+mapping". Source for Zenoh: docs/design.md of github.com/ros2/rmw_zenoh since version 0.3, sections Publishers and
+Graph Cache.
 """
 
 from dataclasses import dataclass

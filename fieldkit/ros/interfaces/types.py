@@ -34,7 +34,7 @@ class Distribution(StrEnum):
 
     @classmethod
     def of(cls, name: str) -> "Distribution":
-        """Return the distribution with a name, or the newest one for an unknown name such as `rolling`."""
+        """Return the distribution with this name, or the newest one for an unknown name such as `rolling`."""
         return cls(name) if name in list(cls) else list(cls)[-1]
 
     @property
@@ -44,7 +44,7 @@ class Distribution(StrEnum):
 
     @property
     def gid_bytes(self) -> int:
-        """Length in bytes of a GID in the messages of its rmw_dds_common."""
+        """Length of a GID in the messages of its rmw_dds_common, in bytes."""
         return 16 if self.has_type_hashes else 24
 
 
@@ -119,12 +119,12 @@ class MessageTypes:
         Raises:
             ConfigurationError: There is no such type.
         """
-        full = full_name(name)
-        in_ros1, in_ros2 = full in self.ros1.fielddefs, full in self.ros2.fielddefs
+        type_name = full_name(name)
+        in_ros1, in_ros2 = type_name in self.ros1.fielddefs, type_name in self.ros2.fielddefs
         if not in_ros1 and not in_ros2:
-            raise self._unknown(full)
-        definition, md5 = self.ros1.generate_msgdef(full, ros_version=1) if in_ros1 else ("", "")
-        return MessageType(full, definition, md5, self.ros2.hash_rihs01(full) if in_ros2 else "")
+            raise self._unknown_type_error(type_name)
+        definition, md5 = self.ros1.generate_msgdef(type_name, ros_version=1) if in_ros1 else ("", "")
+        return MessageType(type_name, definition, md5, self.ros2.hash_rihs01(type_name) if in_ros2 else "")
 
     def fields(self, name: str) -> Mapping[str, tuple[MessageField, ...]]:
         """Return the members of a type in ROS 2, which is the first key, and of all nested types, by type name.
@@ -139,12 +139,12 @@ class MessageTypes:
             if kind in types:
                 continue
             if kind not in self.ros2.fielddefs:
-                raise self._unknown(kind)
+                raise self._unknown_type_error(kind)
             types[kind] = tuple(_field(*member) for member in self.ros2.fielddefs[kind][1])
             pending += [member.type for member in types[kind] if "/" in member.type]
         return types
 
-    def translatable(self, type_name: str) -> bool:
+    def is_translatable(self, type_name: str) -> bool:
         """Return True if the type is the same in ROS 1 and ROS 2, except for `seq` of headers."""
         return all(
             name == _HEADER
@@ -157,28 +157,28 @@ class MessageTypes:
 
     def adds_at_end(self, type_name: str, names: tuple[str, ...]) -> bool:
         """Return True if a type of ROS 2 has the members of ROS 1, followed by members with exactly these names."""
-        full = full_name(type_name)
-        ros1_members = _char_as_uint8(self.ros1.fielddefs[full][1])
-        common, added = self.ros2.fielddefs[full][1][: -len(names)], self.ros2.fielddefs[full][1][-len(names) :]
-        return common == ros1_members and tuple(name for name, _ in added) == names
+        key = full_name(type_name)
+        ros1_members, ros2_members = _char_as_uint8(self.ros1.fielddefs[key][1]), self.ros2.fielddefs[key][1]
+        common, additional = ros2_members[: -len(names)], ros2_members[-len(names) :]
+        return common == ros1_members and tuple(name for name, _ in additional) == names
 
-    def _unknown(self, name: str) -> ConfigurationError:
+    def _unknown_type_error(self, name: str) -> ConfigurationError:
         type_names = self.ros1.fielddefs.keys() | self.ros2.fielddefs.keys()
-        full_names = {full.rpartition("/")[2]: full for full in type_names}
-        remedy = did_you_mean(name, full_names.values(), "give its definition")
+        names_by_suffix = {type_name.rpartition("/")[2]: type_name for type_name in type_names}
+        remedy = did_you_mean(name, names_by_suffix.values(), "give its definition")
         return ConfigurationError(f"there is no message type {name}", remedy=remedy)
 
 
 @cache
-def shipped(distribution: Distribution = Distribution.JAZZY) -> MessageTypes:
+def standard_types(distribution: Distribution = Distribution.JAZZY) -> MessageTypes:
     """Return the standard types of ROS, without custom types."""
     return MessageTypes(distribution)
 
 
 def full_name(name: str) -> str:
     """Return a type name in the spelling of ROS 2, for example `sensor_msgs/msg/LaserScan`."""
-    package, _, rest = name.partition("/")
-    return f"{package}/msg/{rest}" if rest and "/" not in rest else name
+    package, _, short_name = name.partition("/")
+    return f"{package}/msg/{short_name}" if short_name and "/" not in short_name else name
 
 
 def _add(store: Typestore, definitions: Mapping[str, str]) -> None:

@@ -20,7 +20,7 @@ class MiddlewareName(StrEnum):
 
 
 class Discovery(StrEnum):
-    """A discovery method: how publisher and subscriber find each other."""
+    """Method by which publishers and subscribers discover each other."""
 
     MULTICAST = "multicast"
     PEERS = "peers"
@@ -82,7 +82,7 @@ BINDINGS: Final = MappingProxyType(
 _KEY_OF_VARIABLE: Final = MappingProxyType(
     {"ROS_DOMAIN_ID": "domain", "ROS_AUTOMATIC_DISCOVERY_RANGE": "discovery", "ROS_STATIC_PEERS": "discovery"}
 )
-"""Environment variables of ROS 2 that are not settings, because a key of the step sets them; each with this key."""
+"""Environment variables of ROS 2 that are invalid as settings, and the key of the step that sets each of them."""
 
 OVER_DDS: Final = frozenset({MiddlewareName.DDS, MiddlewareName.ROS2})
 """Middlewares whose ports follow the rule of RTPS (for ROS 2, if its RMW uses DDS)."""

@@ -1,4 +1,4 @@
-"""Ports and multicast groups of middlewares, by which captures identify their packets.
+"""Ports and multicast groups of middlewares, which identify the packets of a middleware in captures.
 
 DDS: RTPS 2.5, section 9.6.2 (PB 7400, DG 250, PG 2, d0 0, d1 10, d2 1, d3 11). Zenoh and ROS 1 do not use their
 default ports, so that fieldkit's routers, masters and nodes can run beside those of a robot. Each domain has separate
@@ -14,7 +14,7 @@ _ROS1_FIRST: Final = 11500
 _ROS1_PORTS: Final = 3
 
 _PARTICIPANTS: Final = 4
-"""Maximum number of participants of a domain on a robot: one of fieldkit, and some of the robot."""
+"""Maximum number of participants of a domain on a robot: one of fieldkit, and up to three of the robot."""
 
 MAX_DOMAIN: Final = 101
 """Maximum domain: the DDS ports of higher domains are in the ephemeral port range of Linux."""
@@ -52,7 +52,7 @@ def zenoh_listener(domain: int) -> int:
 
 
 def zenoh(domain: int, *, multicast: bool) -> MiddlewarePorts:
-    """Return Zenoh's ports in a domain; declarations of a session use the port of its data."""
+    """Return Zenoh's ports in a domain; a session sends declarations and data over the same port."""
     data = frozenset({zenoh_listener(domain)})
     if not multicast:
         return MiddlewarePorts(data=data, discovery=frozenset())

@@ -1,4 +1,4 @@
-"""Settings of middlewares that their developers or ROS 2 recommend as a first attempt for a lossy radio.
+"""Settings of middlewares that their developers or ROS 2 recommend as a first step on a lossy radio.
 
 Comments contain the default and the source of each setting. Kernel settings (`net.core.rmem_max`,
 `net.ipv4.ipfrag_time`) are not included, because they apply to the whole machine, need root and remain after a trial;

@@ -1,4 +1,4 @@
-"""Test datagrams between all robots: what arrives by multicast, by unicast, and in fragments."""
+"""Exchange of test datagrams between all robots: multicast, unicast, and unicast in fragments."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -36,7 +36,8 @@ class Arrivals:
     """Test datagrams of one robot that arrived at another.
 
     Attributes:
-        counts: Number by kind (`datagrams.SIZES`), of `COUNT`; a kind of which nothing arrived is missing.
+        counts: Number of arrived datagrams by kind (`datagrams.SIZES`), out of `COUNT`; kinds without arrivals are
+            omitted.
         error: The reason why the numbers are unknown; empty if they are known.
     """
 
@@ -45,7 +46,7 @@ class Arrivals:
 
 
 def multicast_port(domain: int) -> int:
-    """Return the port of multicast test datagrams, on which also the participants of the DDS domain listen."""
+    """Return the port of multicast test datagrams; the participants of the DDS domain listen on it, too."""
     return min(middleware_ports.dds(domain, multicast=True).discovery)
 
 
@@ -64,17 +65,17 @@ def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[
         trial: Name of a folder on the robots, which is deleted afterwards.
 
     Returns:
-        The arrivals by source and destination. An error of a robot is part of them.
+        The arrivals by source and destination. They contain the error if a robot failed.
     """
-    running = _Exchange(cast, shells, domain, trial)
+    exchange_run = _Exchange(cast, shells, domain, trial)
     try:
-        run_parallel(running.listen, cast)
+        run_parallel(exchange_run.listen, cast)
         for role in cast:
-            running.send(role)
+            exchange_run.send(role)
     finally:
-        run_parallel(running.end, cast)
+        run_parallel(exchange_run.end, cast)
     return {
-        (source, destination): running.arrivals(source, destination)
+        (source, destination): exchange_run.arrivals(source, destination)
         for source in cast
         for destination in cast
         if source is not destination
@@ -82,7 +83,7 @@ def exchange(cast: Cast, shells: Shells, domain: int, trial: str) -> dict[tuple[
 
 
 class _Exchange:
-    """An exchange while it runs; the arguments are those of `exchange`."""
+    """A running exchange; the arguments are those of `exchange`."""
 
     def __init__(self, cast: Cast, shells: Shells, domain: int, trial: str) -> None:
         self._cast = cast
@@ -93,9 +94,9 @@ class _Exchange:
         self._counts: dict[Role, Mapping[str, Mapping[str, int]]] = {}
 
     def listen(self, role: Role) -> None:
-        """Start to count datagrams on a robot."""
-        shell, job = self._shells[role], self._listening(role)
-        with self._recording_error(role):
+        """Start counting datagrams on a robot."""
+        shell, job = self._shells[role], self._counting_job(role)
+        with self._store_error(role):
             evidence.begin(shell, job.folder, role, self._cast[role].profile.radio.interface)
             agent.install(shell)
             jobs.start(shell, job)
@@ -106,13 +107,13 @@ class _Exchange:
         argv = agent_commands.python(
             self._cast[role], agent.path_from_home(), "datagrams", self._arguments(role, peers=peers)
         )
-        with self._recording_error(role):
+        with self._store_error(role):
             self._shells[role].run(argv, deadline=Deadline.after(_SEND_S))
 
     def end(self, role: Role) -> None:
-        """Stop the count on a robot, read it, and delete the files of the exchange."""
-        shell, job = self._shells[role], self._listening(role)
-        with self._recording_error(role):
+        """Stop counting on a robot, read the counts, and delete the files of the exchange."""
+        shell, job = self._shells[role], self._counting_job(role)
+        with self._store_error(role):
             try:
                 jobs.stop(shell, job)
                 counts = shell.run(("cat", f"{job.folder}/{_COUNTS_FILE}"), deadline=Deadline.after(_READ_S))
@@ -121,13 +122,13 @@ class _Exchange:
                 evidence.discard(shell, self._trial)
 
     def arrivals(self, source: Role, destination: Role) -> Arrivals:
-        """Return what arrived from one robot at another."""
+        """Return the test datagrams of one robot that arrived at another."""
         for role in (source, destination):
             if role in self._errors:
                 return Arrivals({}, f"{self._cast[role].name}: {self._errors[role]}")
         return Arrivals(self._counts[destination].get(self._cast[source].address, {}))
 
-    def _listening(self, role: Role) -> Job:
+    def _counting_job(self, role: Role) -> Job:
         robot = self._cast[role]
         limit_s = 2 * _SEND_S * len(self._cast)
         arguments = self._arguments(role, limit_s=limit_s)
@@ -153,8 +154,8 @@ class _Exchange:
         return agent_commands.compact({"ports": asdict(ports), **options})
 
     @contextmanager
-    def _recording_error(self, role: Role) -> Iterator[None]:
-        """Record the first error of a robot, which is then part of its arrivals."""
+    def _store_error(self, role: Role) -> Iterator[None]:
+        """Store the first error of a robot, which `arrivals` returns."""
         try:
             yield
         except FieldkitError as error:
@@ -165,7 +166,7 @@ def parse_counts(output: bytes) -> dict[str, dict[str, int]]:
     """Return the counts by address of the sender and kind from the output of a robot.
 
     Raises:
-        RobotError: The output is not of this form.
+        RobotError: The output has another form.
     """
     try:
         counts = json.loads(output)
@@ -178,7 +179,9 @@ def parse_counts(output: bytes) -> dict[str, dict[str, int]]:
 
 def _is_valid(counts: Any) -> bool:  # noqa: ANN401 (any JSON value)
     return isinstance(counts, dict) and all(
-        isinstance(kinds, dict)
-        and all(kind in datagrams.SIZES and type(n) is int and 0 <= n <= COUNT for kind, n in kinds.items())
-        for kinds in counts.values()
+        isinstance(by_kind, dict)
+        and all(
+            kind in datagrams.SIZES and type(count) is int and 0 <= count <= COUNT for kind, count in by_kind.items()
+        )
+        for by_kind in counts.values()
     )

@@ -1,7 +1,7 @@
-"""`fieldkit check --ros`: the known causes for which ROS programs of several robots do not reach each other.
+"""`fieldkit check --ros`: search for known reasons why ROS programs on several robots do not reach each other.
 
-It follows the order in which a person searches: settings of each robot, their agreement, what really arrives between
-the robots. Clock, power save and signal are checks of every `fieldkit check`.
+The checks run in the order in which a person would search: the settings of each robot, their agreement, and the
+datagrams that arrive. Every `fieldkit check` also checks clock, power save and signal.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ _CHECK: Final = "ROS network"
 
 
 def check_network(plan: Plan, shells: Shells, reports: Mapping[Role, Report]) -> None:
-    """Add the findings on the network of all robots with ROS. It is the entry point `ros` of `fieldkit.fleet_checks`.
+    """Add the findings on the network of all robots with ROS: the entry point `ros` of `fieldkit.fleet_checks`.
 
     Args:
         plan: The plan of a trial.
@@ -35,13 +35,13 @@ def check_network(plan: Plan, shells: Shells, reports: Mapping[Role, Report]) ->
             reports[role].ok(_CHECK, "its profile has no ROS")
     states: dict[Role, RosState] = {}
 
-    def read(role: Role) -> None:
+    def read_state(role: Role) -> None:
         try:
             states[role] = state.read(cast[role], shells[role])
         except FieldkitError as error:
             reports[role].fail(_CHECK, error.what, error.remedy)
 
-    run_parallel(read, cast)
+    run_parallel(read_state, cast)
     states = {role: states[role] for role in cast if role in states}
     for role, robot_state in states.items():
         settings.judge_robot(cast[role], robot_state, reports[role])

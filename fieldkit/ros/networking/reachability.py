@@ -16,7 +16,7 @@ from fieldkit.ros.networking.state import RosState
 from fieldkit.trial.check.report import Report
 
 MIN_ARRIVED: Final = 18
-"""Number of `COUNT` datagrams from which a link is reported as good: 10 % loss."""
+"""Minimum number of arrived datagrams, out of `COUNT`, on a good link: 10 % loss."""
 
 _RESOLVE_S: Final = 15.0
 _LOOPBACK: Final = {None, "localhost", "127.0.0.1", "::1"}
@@ -30,7 +30,7 @@ def judge_arrivals(
 
     Args:
         source: The sender.
-        arrivals: What arrived.
+        arrivals: The datagrams that arrived.
         state: State of the receiver.
         domain: ROS domain of the test.
         report: Receives the findings.
@@ -40,46 +40,53 @@ def judge_arrivals(
         report.fail(f"datagrams from {source.name}", f"not tested: {arrivals.error}", "fieldkit check   # first")
         return
     unicast, multicast, fragmented = (arrivals.counts.get(kind, 0) for kind in (UNICAST, MULTICAST, FRAGMENTED))
-    blocked = f"; firewall: {state.drop_rules[0]}" if state.drop_rules else ""
+    firewall_note = f"; firewall: {state.drop_rules[0]}" if state.drop_rules else ""
     remedy = settings.ports_remedy(domain)
-    _judge_count(f"UDP from {source.name}", unicast, report, nothing=f"no unicast arrives{blocked}", remedy=remedy)
+    _judge_count(
+        f"UDP from {source.name}", unicast, report, none_reason=f"no unicast arrives{firewall_note}", remedy=remedy
+    )
     if not ros2:
         return
     if settings.needs_multicast(state.variables):
         check, peers = f"multicast from {source.name}", f"export ROS_STATIC_PEERS={source.address}"
         if unicast:
-            nothing, advice = f"no multicast arrives, unicast does{blocked}", f"{peers}   # or a discovery server"
+            none_reason, advice = (
+                f"no multicast arrives, unicast does{firewall_note}",
+                f"{peers}   # or a discovery server",
+            )
         else:
-            nothing, advice = f"no multicast arrives{blocked}", remedy
-        _judge_count(check, multicast, report, nothing=nothing, remedy=advice)
+            none_reason, advice = f"no multicast arrives{firewall_note}", remedy
+        _judge_count(check, multicast, report, none_reason=none_reason, remedy=advice)
     if unicast:
         _judge_count(
             f"fragments from {source.name}",
             fragmented,
             report,
-            nothing=f"no datagram of {SIZES[FRAGMENTED]} B arrives, those of {SIZES[UNICAST]} B do{blocked}",
+            none_reason=f"{SIZES[UNICAST]} B arrive, but {SIZES[FRAGMENTED]} B do not{firewall_note}",
             remedy="allow IP fragments in the firewall; or keep datagrams below the MTU: settings: tuned",
-            what=f"datagrams of {SIZES[FRAGMENTED]} B ({_FRAGMENTS} fragments)",
+            datagram_text=f"datagrams of {SIZES[FRAGMENTED]} B ({_FRAGMENTS} fragments)",
         )
 
 
 def _judge_count(
-    check: str, count: int, report: Report, *, nothing: str, remedy: str, what: str = "datagrams"
+    check: str, count: int, report: Report, *, none_reason: str, remedy: str, datagram_text: str = "datagrams"
 ) -> None:
     if not count:
-        report.fail(check, f"0 of {COUNT} {what}: {nothing}", remedy)
+        report.fail(check, f"0 of {COUNT} {datagram_text}: {none_reason}", remedy)
     elif count < MIN_ARRIVED:
         report.warn(
-            check, f"{count} of {COUNT} {what}: the link loses packets", "bring the robots closer, then again"
+            check,
+            f"{count} of {COUNT} {datagram_text}: the link loses packets",
+            "bring the robots closer, and check again",
         )
     else:
-        report.ok(check, f"{count} of {COUNT} {what}")
+        report.ok(check, f"{count} of {COUNT} {datagram_text}")
 
 
 def advertised_name(state: RosState) -> str:
     """Return the name under which nodes of ROS 1 are reached (wiki.ros.org/ROS/EnvironmentVariables)."""
     name = state.variables.get("ROS_HOSTNAME") or state.variables.get("ROS_IP") or state.hostname
-    return name.lstrip("-")  # otherwise getent would take it as an option
+    return name.lstrip("-")  # getent would parse a leading hyphen as an option
 
 
 def _host(uri: str) -> str | None:
@@ -92,14 +99,16 @@ def _host(uri: str) -> str | None:
 def judge_names(
     role: Role, cast: Mapping[Role, Robot], states: Mapping[Role, RosState], shell: Shell, report: Report
 ) -> None:
-    """Add whether a robot with ROS 1 resolves the names of the others on its master to their addresses on the radio.
+    """Check that a robot with ROS 1 resolves the names of the other robots on its master to their radio addresses.
 
     Raises:
         LinkError: The robot did not answer.
     """
     master = states[role].variables.get("ROS_MASTER_URI", "")
     if _host(master) in _LOOPBACK:
-        report.ok("ROS network", f"its ROS master, {master}, is its own: its topics reach no other robot")
+        report.ok(
+            "ROS network", f"its ROS master, {master}, runs on the robot itself: its topics do not reach other robots"
+        )
         return
     for other, state in states.items():
         if other is role or settings.is_ros2(cast[other]) or state.variables.get("ROS_MASTER_URI") != master:

@@ -16,7 +16,7 @@ from fieldkit.ros.networking.state import RosProgram, RosState, Variables
 from fieldkit.trial.check.report import Report
 
 DEFAULT_RMW: Final = "rmw_fastrtps_cpp"
-"""RMW of all distributions from Foxy to Kilted if the environment names none (REP 2000)."""
+"""Default RMW of all distributions from Foxy to Kilted (REP 2000)."""
 _ZENOH_PORT: Final = 7447
 _SERVER_PORT: Final = 11811
 """Default port of a discovery server of Fast DDS."""
@@ -51,8 +51,8 @@ def uses_zenoh(variables: Variables) -> bool:
 
 def needs_multicast(variables: Variables) -> bool:
     """Return True if nodes with this environment discover other robots by multicast only."""
-    configured = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
-    return not uses_zenoh(variables) and not any(variables.get(name) for name in configured)
+    alternatives = ("ROS_STATIC_PEERS", "ROS_DISCOVERY_SERVER")
+    return not uses_zenoh(variables) and not any(variables.get(name) for name in alternatives)
 
 
 def judge_robot(robot: Robot, state: RosState, report: Report) -> None:
@@ -89,38 +89,46 @@ def judge_agreement(
 
 
 def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
-    own = domain(state.variables)
-    if own is None:
+    own_domain = domain(state.variables)
+    if own_domain is None:
         report.fail("ROS domain", f"ROS_DOMAIN_ID is {state.variables['ROS_DOMAIN_ID']!r}", "use a number, 0 to 101")
         return
     count = len(state.programs)
-    others = _differing(state.programs, lambda variables: domain(variables) == own, "ROS_DOMAIN_ID", "0")
-    if others:
+    other_values = _differing_values(
+        state.programs, lambda variables: domain(variables) == own_domain, "ROS_DOMAIN_ID", "0"
+    )
+    if other_values:
         report.warn(
             "ROS domain",
-            f"{own} by its setup files and profile, but of {count} running ROS programs: {others}",
-            f"start them in domain {own}, or correct ROS_DOMAIN_ID: {copy_profile_command(robot.profile.name)}",
+            f"{own_domain} by its setup files and profile, but not in all of {count} running ROS programs: "
+            f"{other_values}",
+            f"start them in domain {own_domain}, or correct ROS_DOMAIN_ID: "
+            f"{copy_profile_command(robot.profile.name)}",
         )
     else:
-        report.ok("ROS domain", f"{own}; {count} running ROS programs, all in this domain" if count else str(own))
+        report.ok(
+            "ROS domain",
+            f"{own_domain}; {count} running ROS programs, all in this domain" if count else str(own_domain),
+        )
     own_rmw = rmw(state.variables)
-    others = _differing(
+    other_values = _differing_values(
         state.programs, lambda variables: rmw(variables) == own_rmw, "RMW_IMPLEMENTATION", DEFAULT_RMW
     )
-    if others:
+    if other_values:
         report.warn(
             "RMW",
-            f"{own_rmw} by its setup files and profile, but of {count} running ROS programs: {others}",
+            f"{own_rmw} by its setup files and profile, but not in all of {count} running ROS programs: "
+            f"{other_values}",
             "set RMW_IMPLEMENTATION for all programs of the robot, and restart them: ros2 daemon stop",
         )
     else:
         report.ok("RMW", own_rmw)
 
 
-def _differing(
+def _differing_values(
     programs: tuple[RosProgram, ...], is_equal: Callable[[Variables], bool], name: str, default: str
 ) -> str:
-    """Return the values of a variable in programs that differ, with their numbers; empty if none differs."""
+    """Return the values of a variable that differ, with the number of programs; empty if no value differs."""
     values = Counter(
         program.variables.get(name) or default for program in programs if not is_equal(program.variables)
     )
@@ -135,17 +143,19 @@ def _judge_range(variables: Variables, report: Report) -> None:
             "unset ROS_LOCALHOST_ONLY   # in its setup files and in .bashrc",
         )
         return
-    chosen = (variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET").upper()
-    if chosen == "OFF" or (chosen == "LOCALHOST" and not variables.get("ROS_STATIC_PEERS")):
+    discovery_range = (variables.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET").upper()
+    if discovery_range == "OFF" or (discovery_range == "LOCALHOST" and not variables.get("ROS_STATIC_PEERS")):
         report.fail(
             "discovery range",
-            f"ROS_AUTOMATIC_DISCOVERY_RANGE={chosen}: its nodes do not discover other robots",
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE={discovery_range}: its nodes do not discover other robots",
             "export ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET   # or list the robots in ROS_STATIC_PEERS",
         )
         return
     peers, server = variables.get("ROS_STATIC_PEERS"), variables.get("ROS_DISCOVERY_SERVER")
-    words = [chosen, *([f"peers {peers}"] if peers else []), *([f"discovery server {server}"] if server else [])]
-    report.ok("discovery range", ", ".join(words))
+    parts = [discovery_range]
+    parts += [f"peers {peers}"] if peers else []
+    parts += [f"discovery server {server}"] if server else []
+    report.ok("discovery range", ", ".join(parts))
 
 
 def _judge_router(state: RosState, report: Report) -> None:
@@ -157,14 +167,16 @@ def _judge_router(state: RosState, report: Report) -> None:
             f"no router listens on TCP port {_ZENOH_PORT}, without which nodes do not discover each other",
             "ros2 run rmw_zenoh_cpp rmw_zenohd",
         )
-    elif not any(p.variables.get("ZENOH_ROUTER_CONFIG_URI") for p in (_as_program(state), *state.programs)):
+    elif not any(
+        program.variables.get("ZENOH_ROUTER_CONFIG_URI") for program in (_as_program(state), *state.programs)
+    ):
         report.warn(
             "Zenoh router",
-            "a router runs, with the default configuration, which connects to no other router",
-            "list the other robots in connect.endpoints of a file that ZENOH_ROUTER_CONFIG_URI names   # on one side",
+            "a router runs with the default configuration, which does not connect to other routers",
+            "list the other robots in connect.endpoints of the file ZENOH_ROUTER_CONFIG_URI   # on one side",
         )
     else:
-        report.ok("Zenoh router", f"listens on TCP port {_ZENOH_PORT}, with a configuration of its own")
+        report.ok("Zenoh router", f"listens on TCP port {_ZENOH_PORT}, with a separate configuration file")
 
 
 def _as_program(state: RosState) -> RosProgram:
@@ -173,17 +185,17 @@ def _as_program(state: RosState) -> RosProgram:
 
 def _judge_rmw_interfaces(robot: Robot, state: RosState, report: Report) -> None:
     radio, check = robot.profile.radio.interface, "RMW settings"
-    named = state.rmw_interfaces
+    interfaces = state.rmw_interfaces
     if state.unreadable_settings:
         report.fail(check, state.unreadable_settings, "correct CYCLONEDDS_URI or FASTDDS_DEFAULT_PROFILES_FILE")
-    elif named and not {radio, robot.address} & set(named):
+    elif interfaces and not {radio, robot.address} & set(interfaces):
         report.fail(
             check,
-            f"limited to {', '.join(named)}: its nodes do not use {radio}",
+            f"limited to {', '.join(interfaces)}: its nodes do not use {radio}",
             f"name {radio} in the file of CYCLONEDDS_URI or FASTDDS_DEFAULT_PROFILES_FILE",
         )
-    elif named:
-        report.ok(check, f"limited to {', '.join(named)}")
+    elif interfaces:
+        report.ok(check, f"limited to {', '.join(interfaces)}")
 
 
 def _judge_multicast_route(robot: Robot, state: RosState, report: Report) -> None:
@@ -195,7 +207,7 @@ def _judge_multicast_route(robot: Robot, state: RosState, report: Report) -> Non
     elif state.multicast_interface != radio:
         report.warn(
             "multicast route",
-            f"239.255.0.1 leaves by {state.multicast_interface}; a middleware that follows the route misses {radio}",
+            f"packets to 239.255.0.1 leave by {state.multicast_interface}, not by {radio}",
             f"sudo ip route add 224.0.0.0/4 dev {radio}   # or name {radio} in the settings of the RMW",
         )
     else:
@@ -224,9 +236,11 @@ def _judge_firewall(state: RosState, report: Report) -> None:
     if state.drop_rules is None:
         report.ok("firewall", "rules not known: reading them needs root, nft or iptables")
     elif state.drop_rules:
-        shown = "; ".join(state.drop_rules[:3])
+        first_rules = "; ".join(state.drop_rules[:3])
         report.warn(
-            "firewall", f"rules drop packets: {shown}", "sudo nft list ruleset   # do they drop those of ROS?"
+            "firewall",
+            f"rules drop packets: {first_rules}",
+            "sudo nft list ruleset   # check that ROS packets are accepted",
         )
     else:
         report.ok("firewall", "no rule drops received packets")
@@ -236,7 +250,7 @@ def _compare_domains(first: Robot, expected: Variables, actual: Variables, repor
     if domain(actual) != domain(expected):
         report.fail(
             "same ROS domain",
-            f"domain {domain(actual)}, but {first.name} is in domain {domain(expected)}: they do not see each other",
+            f"domain {domain(actual)}, but {first.name} is in domain {domain(expected)}: no discovery",
             "use one ROS_DOMAIN_ID on all robots",
         )
 
@@ -259,21 +273,21 @@ def _compare_rmws(first: Robot, expected: Variables, actual: Variables, report: 
 
 
 def _compare_distributions(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
-    own, other = actual.get("ROS_DISTRO", ""), expected.get("ROS_DISTRO", "")
-    if own and other and own != other:
+    own_distro, first_distro = actual.get("ROS_DISTRO", ""), expected.get("ROS_DISTRO", "")
+    if own_distro and first_distro and own_distro != first_distro:
         report.warn(
             "same ROS distribution",
-            f"{own}, but {first.name} has {other}: ROS does not support different distributions",
+            f"{own_distro}, but {first.name} has {first_distro}: ROS does not support different distributions",
             "install one distribution on all robots, or compare the types: ros2 topic info -v TOPIC",
         )
 
 
 def _compare_servers(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
-    own, other = actual.get("ROS_DISCOVERY_SERVER", ""), expected.get("ROS_DISCOVERY_SERVER", "")
-    if own != other:
+    own_server, first_server = actual.get("ROS_DISCOVERY_SERVER", ""), expected.get("ROS_DISCOVERY_SERVER", "")
+    if own_server != first_server:
         report.fail(
             "same discovery server",
-            f"{own or 'no discovery server'}, but {first.name} has {other or 'none'}: no discovery",
+            f"{own_server or 'no discovery server'}, but {first.name} has {first_server or 'none'}: no discovery",
             "use one ROS_DISCOVERY_SERVER on all robots, or on none",
         )
 
@@ -281,22 +295,24 @@ def _compare_servers(first: Robot, expected: Variables, actual: Variables, repor
 def judge_servers(
     cast: Mapping[Role, Robot], states: Mapping[Role, RosState], reports: Mapping[Role, Report]
 ) -> None:
-    """Add a finding on each discovery server that should run on one of the robots."""
+    """Add a finding on each discovery server."""
     roles = {cast[role].address: role for role in states}
     for role, state in states.items():
         for server in filter(None, state.variables.get("ROS_DISCOVERY_SERVER", "").split(";")):
             address, _, port_text = server.partition(":")
             port = int(port_text) if port_text.isascii() and port_text.isdecimal() else _SERVER_PORT
-            holder = roles.get(address)
-            if holder is None:
-                reports[role].ok("discovery server", f"{server} is on none of the robots, and is not checked")
-            elif port in states[holder].udp_ports:
-                reports[role].ok("discovery server", f"{server}: a program of {cast[holder].name} has this UDP port")
+            server_role = roles.get(address)
+            if server_role is None:
+                reports[role].ok("discovery server", f"{server} runs on none of the robots, so it is not checked")
+            elif port in states[server_role].udp_ports:
+                reports[role].ok(
+                    "discovery server", f"{server}: a program of {cast[server_role].name} has this UDP port"
+                )
             else:
                 reports[role].fail(
                     "discovery server",
-                    f"{server}: no program of {cast[holder].name} has UDP port {port}",
-                    f"on {cast[holder].name}: fastdds discovery -i 0 -l {address} -p {port}",
+                    f"{server}: no program of {cast[server_role].name} has UDP port {port}",
+                    f"on {cast[server_role].name}: fastdds discovery -i 0 -l {address} -p {port}",
                 )
 
 

@@ -37,7 +37,7 @@ _IPTABLES_DROP: Final = re.compile(
 _HOOK: Final = re.compile(r"\bhook (?P<hook>[a-z]+) ", re.ASCII)
 _NFT_DROP: Final = re.compile(r"\b(?:drop|reject)\b", re.ASCII)
 _OTHER_HOOKS: Final = {"output", "forward", "postrouting", "egress"}
-"""Hooks of nftables that received packets of the robot's own programs do not pass."""
+"""Hooks of nftables that packets to the robot's programs do not traverse."""
 
 Variables = Mapping[str, str]
 
@@ -57,7 +57,7 @@ class RosProgram:
 
 @dataclass(frozen=True)
 class RosState:
-    """State of a robot; what it did not report is None or empty.
+    """State of a robot. An attribute that it did not report is None or empty.
 
     Attributes:
         variables: Variables of the network in the environment of its setup files and its profile.
@@ -106,11 +106,11 @@ def parse(sections: Sections) -> RosState:
 
     route = _ROUTE.search(text("route"))
     sockets = [(match["state"], int(match["port"], 16)) for match in _SOCKET.finditer(text("listeners"))]
-    settings = (line.split() for line in text("kernel").splitlines())
+    kernel_rows = (line.split() for line in text("kernel").splitlines())
     return RosState(
         variables=_variables(text("environment")),
         programs=_programs(text("programs")),
-        kernel={words[0]: int(words[1]) for words in settings if len(words) == 2 and _DECIMAL.fullmatch(words[1])},
+        kernel={words[0]: int(words[1]) for words in kernel_rows if len(words) == 2 and _DECIMAL.fullmatch(words[1])},
         multicast_interface=route["interface"] if route else None,
         tcp_ports=frozenset(port for state, port in sockets if state == "0A"),
         udp_ports=frozenset(port for state, port in sockets if state == "07"),
@@ -154,7 +154,7 @@ def _drop_rules(sections: Sections) -> tuple[str, ...] | None:
 
 
 def _nftables_drops(ruleset: str) -> Iterator[str]:
-    """Yield the rules and policies that drop, without those of chains for sent or forwarded packets (nft(8))."""
+    """Yield the rules and policies that drop packets, except in chains for sent or forwarded packets (nft(8))."""
     hook = ""
     for line in ruleset.splitlines():
         words = line.strip()

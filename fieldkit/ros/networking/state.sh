@@ -1,5 +1,5 @@
-# State of a robot that determines whether its ROS programs reach other robots. Run by `sh -s`, after its
-# ROS setup files were sourced. It only reads. A section is its name, its exit code and its output, as of probe.sh.
+# Prints the state of a robot that determines whether its ROS programs reach other robots. Run by `sh -s`, after its
+# ROS setup files were sourced. It changes nothing. Each section has a name, an exit code and an output, as in probe.sh.
 export LC_ALL=C
 
 section() { # NAME COMMAND...
@@ -9,13 +9,13 @@ section() { # NAME COMMAND...
     printf '==> %s: %s <==\n%s\n' "$name" "$?" "$output"
 }
 
-admin() ( # a session without a terminal often lacks the folders of administration programs
+admin() ( # PATH of a session without a terminal often lacks the folders of administration programs
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     [ "$(id -u)" = 0 ] || set -- sudo -n "$@"
     timeout 5 "$@"
 )
 
-ros_variables() { # of an environment on standard input, one variable per line
+ros_variables() { # filters an environment on standard input, one variable per line
     grep -E '^(ROS_(DISTRO|VERSION|DOMAIN_ID|LOCALHOST_ONLY|AUTOMATIC_DISCOVERY_RANGE|STATIC_PEERS|DISCOVERY_SERVER|MASTER_URI|HOSTNAME|IP)|RMW_IMPLEMENTATION|CYCLONEDDS_URI|FASTRTPS_DEFAULT_PROFILES_FILE|FASTDDS_DEFAULT_PROFILES_FILE|ZENOH_ROUTER_CONFIG_URI|ZENOH_SESSION_CONFIG_URI)=' | cut -c1-2000
 }
 
@@ -34,7 +34,7 @@ ros_programs() { # the variables of each running program that has a ROS distribu
     done 2>/dev/null | head -c 100000
 }
 
-settings_of() { # URI: a file of settings of the RMW, or the settings themselves
+settings_of() { # URI: a file with settings of the RMW, or the settings themselves
     case $1 in
     file://*) head -c 20000 "${1#file://}" ;;
     /*) head -c 20000 "$1" ;;

@@ -1,9 +1,9 @@
 """Judge which middleware settings meet a criterion on a measured link, from the repeats of `topics` steps.
 
 A candidate is a middleware with its settings and its quality of service. It passes only if it meets the criterion in
-every cell, that is, for every sample size at every place. Missing data never counts as good: a candidate stays
-undecided if there are too few valid repeats, if a delay was withheld, or if a publisher found no subscription. The
-rule is the same as for expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or
+every cell, that is, for every sample size at every place. Missing data never counts as a pass: a candidate stays
+undecided if there are too few valid repeats, if a delay was withheld, or if a publisher discovered no subscription.
+The rule is the same as for expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or
 `90 % of loss <= BOUND` if a share is given.
 """
 
@@ -46,7 +46,7 @@ class Candidate:
     quality: str
 
     @property
-    def by_path(self) -> Mapping[str, str]:
+    def settings_by_path(self) -> Mapping[str, str]:
         """Its settings by path."""
         return dict(json.loads(self.settings))
 
@@ -62,19 +62,19 @@ class Assessment:
     Attributes:
         candidate: The candidate.
         cells: Its measured cells.
-        failed: Reasons why it does not meet the criterion; one sentence each.
-        lacking: Missing evidence; one sentence each.
+        failures: Reasons why it does not meet the criterion; one sentence each.
+        missing_evidence: Descriptions of the missing evidence; one sentence each.
     """
 
     candidate: Candidate
     cells: tuple[LinkCell, ...]
-    failed: tuple[str, ...]
-    lacking: tuple[str, ...]
+    failures: tuple[str, ...]
+    missing_evidence: tuple[str, ...]
 
     @property
     def passed(self) -> bool:
         """Whether every cell meets the criterion."""
-        return not self.failed and not self.lacking
+        return not self.failures and not self.missing_evidence
 
     @property
     def rank(self) -> tuple[float, float]:
@@ -104,9 +104,9 @@ def assess(attempts: Repeats, criterion: LinkCriterion) -> list[Assessment]:
     cells: dict[Candidate, list[LinkCell]] = {}
     for (candidate, place, size_bytes), cell_tables in sorted(tables.items(), key=str):
         cells.setdefault(candidate, []).append(link_cell(place, size_bytes, cell_tables))
-    required = {(cell.place, cell.size_bytes) for candidate_cells in cells.values() for cell in candidate_cells}
+    required_cells = {(cell.place, cell.size_bytes) for candidate_cells in cells.values() for cell in candidate_cells}
     return [
-        assess_candidate(candidate, candidate_cells, required, criterion)
+        assess_candidate(candidate, candidate_cells, required_cells, criterion)
         for candidate, candidate_cells in cells.items()
     ]
 
@@ -127,8 +127,8 @@ def _rmw(folder: Path, step: StreamOptions) -> str:
     if step.over is not MiddlewareName.ROS2 or not isinstance(step, Step):
         return ""
     logs = folder.glob(f"repeats/*/{step.prefixed_name(f'{step.sender}-topic.log')}")
-    reported = {match[0] for log in logs for match in _RMW.finditer(reading.text(log))}
-    return reported.pop() if len(reported) == 1 else "unknown"
+    rmws = {match[0] for log in logs for match in _RMW.finditer(reading.text(log))}
+    return rmws.pop() if len(rmws) == 1 else "unknown"
 
 
 def _candidate(stream: StreamOptions, rmw: str) -> Candidate:
@@ -143,32 +143,35 @@ def _candidate(stream: StreamOptions, rmw: str) -> Candidate:
 
 
 def assess_candidate(
-    candidate: Candidate, cells: Sequence[LinkCell], required: set[tuple[str, float]], criterion: LinkCriterion
+    candidate: Candidate, cells: Sequence[LinkCell], required_cells: set[tuple[str, float]], criterion: LinkCriterion
 ) -> Assessment:
     """Return the assessment of a candidate.
 
     Args:
         candidate: The candidate.
         cells: Its measured cells.
-        required: The places and sample sizes at which any candidate was measured.
+        required_cells: The places and sample sizes at which any candidate was measured.
         criterion: The criterion.
     """
-    failed: list[str] = []
-    lacking: list[str] = []
-    for place, size_bytes in sorted(required - {(cell.place, cell.size_bytes) for cell in cells}):
-        lacking.append(f"{place}, {size_bytes:g} B: not measured, although other candidates were")
+    failures: list[str] = []
+    missing_evidence: list[str] = []
+    for place, size_bytes in sorted(required_cells - {(cell.place, cell.size_bytes) for cell in cells}):
+        missing_evidence.append(f"{place}, {size_bytes:g} B: not measured, although other candidates were")
     for cell in cells:
-        n = 0 if cell.loss is None else cell.loss.n
-        if n < criterion.repeats:
-            lacking.append(f"{cell}: {n} of {criterion.repeats} valid repeats with samples; run more")
+        valid_count = 0 if cell.loss is None else cell.loss.n
+        if valid_count < criterion.repeats:
+            missing_evidence.append(
+                f"{cell}: {valid_count} of {criterion.repeats} valid repeats with samples; run more"
+            )
         for judgement in judgements.judge(criterion.expectations, [cell.cell]):
             if not judgement.holds:
-                (failed if judgement.ruling is Ruling.FAILS else lacking).append(f"{cell}: {_reason(judgement)}")
-    return Assessment(candidate, tuple(cells), tuple(failed), tuple(lacking))
+                reasons = failures if judgement.ruling is Ruling.FAILS else missing_evidence
+                reasons.append(f"{cell}: {_reason(judgement)}")
+    return Assessment(candidate, tuple(cells), tuple(failures), tuple(missing_evidence))
 
 
 def _reason(judgement: Judgement) -> str:
-    """Return the reason why a judgement does not hold, with the measured values."""
+    """Return the reason why an expectation is not met, with the measured values."""
     unknown, expectation_text = judgement.why or "undecided", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
         return f"{expectation_text}: {unknown}"

@@ -1,4 +1,4 @@
-"""Write the settings of a middleware, as the step `topics` has them, in the middleware's configuration format.
+"""Write the settings of a step `topics` in the configuration format of its middleware.
 
 Formats: CycloneDDS, docs/manual/config/config_file_reference.rst (`CYCLONEDDS_URI`); Fast DDS, "XML profiles"
 (`FASTDDS_DEFAULT_PROFILES_FILE`); Zenoh, DEFAULT_CONFIG.json5 (`ZENOH_SESSION_CONFIG_URI` of rmw_zenoh).
@@ -12,7 +12,7 @@ from xml.etree import ElementTree as ET
 from fieldkit.core.errors import ConfigurationError
 
 FILES: Final[Mapping[str, str]] = {"dds": "cyclonedds.xml", "ros2": "fastdds.xml", "zenoh": "zenoh.json5"}
-"""File name by middleware, a value of the key `over`."""
+"""File name by middleware, which is a value of the key `over`."""
 VARIABLES: Final[Mapping[str, str]] = {
     "dds": "CYCLONEDDS_URI",
     "ros2": "FASTDDS_DEFAULT_PROFILES_FILE",
@@ -61,11 +61,11 @@ def _cyclonedds(settings: Mapping[str, str]) -> ET.Element:
     root = ET.Element("CycloneDDS")
     domain = ET.SubElement(root, "Domain", Id="any")
     for path, value in settings.items():
-        *names, last = path.split("/")
+        *names, last_name = path.split("/")
         element = domain
         for name in names:
             element = _child(element, name)
-        element_name, _, attribute = last.partition("@")
+        element_name, _, attribute = last_name.partition("@")
         element = _child(element, element_name)
         if attribute:
             element.set(attribute, value)
@@ -80,11 +80,11 @@ def _child(element: ET.Element, name: str) -> ET.Element:
 
 
 def _fastdds(settings: Mapping[str, str]) -> ET.Element:
-    others = settings.keys() - {_TRANSPORTS, "RMW_IMPLEMENTATION"}
+    unsupported = settings.keys() - {_TRANSPORTS, "RMW_IMPLEMENTATION"}
     rmw = settings.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
-    if others or not rmw.startswith("rmw_fastrtps"):
+    if unsupported or not rmw.startswith("rmw_fastrtps"):
         raise ConfigurationError(
-            f"profiles of Fast DDS cannot hold {', '.join(sorted(others)) or rmw}",
+            f"profiles of Fast DDS cannot contain {', '.join(sorted(unsupported)) or rmw}",
             remedy="set the same environment variables on your robots",
         )
     root = ET.Element("profiles", xmlns=_NAMESPACE)
@@ -98,12 +98,12 @@ def _zenoh(transport: str, settings: Mapping[str, str]) -> dict[str, Any]:
     """Return nested settings: the measured ones, and the transport of the listener."""
     tree: dict[str, Any] = {"mode": "peer", "listen": {"endpoints": [f"{transport}/0.0.0.0:0"]}}
     for path, text in settings.items():
-        *names, last = path.split("/")
+        *names, last_name = path.split("/")
         node = tree
         for name in names:
             node = node.setdefault(name, {})
         try:
-            node[last] = json.loads(text)
+            node[last_name] = json.loads(text)
         except ValueError:
-            node[last] = text
+            node[last_name] = text
     return tree

@@ -23,7 +23,13 @@ not exceed it."""
 _INTENDED: Final = "topic_intended"
 _CELL: Final = "cell"
 _LOSS: Final = Quantity(
-    "loss", "loss, samples never sent included", Kind.COUNTED, "share", "topic_received", _INTENDED, (0.0, 1.0)
+    "loss",
+    "loss, including samples that were never sent",
+    Kind.COUNTED,
+    "share",
+    "topic_received",
+    _INTENDED,
+    (0.0, 1.0),
 )
 _DELAY: Final = Quantity(
     "topic_delay_p95_s", "delay, 95 %", Kind.MEDIAN, "s", possible=(0.0, math.inf), of_sent="topic_delay_p95_sent_s"
@@ -37,9 +43,9 @@ class LinkCriterion:
     Attributes:
         max_loss: Share of the samples that may be lost, 0 to 1; samples that were never sent count as lost.
         max_delay_s: Limit for the delay of 95 % of all samples sent; None without a limit.
-        size_bytes: Only samples of this size count; None for all.
+        size_bytes: Only samples of this size are considered; None for all sizes.
         repeats: Number of valid repeats that a cell needs.
-        share: Share of repeats that must meet it, with 95 % confidence; None if every measured repeat must meet it.
+        share: Share of repeats that must meet the limits, with 95 % confidence; None if every repeat must meet them.
     """
 
     max_loss: float
@@ -125,10 +131,10 @@ def topic_columns(rows: Repeats, prefix: str) -> Repeats:
         rows: Attempts of a trial.
         prefix: Prefix of the step's columns.
     """
-    nothing = np.full(len(rows), np.nan)
+    all_missing = np.full(len(rows), np.nan)
 
     def values(name: str) -> NDArray[np.float64]:
-        return np.asarray(rows.numbers.get(step_prefixed(prefix, name), nothing), dtype=np.float64)
+        return np.asarray(rows.numbers.get(step_prefixed(prefix, name), all_missing), dtype=np.float64)
 
     names = ("topic_sent", "topic_refused", "topic_skipped", "topic_received", _DELAY.name, _DELAY.of_sent or "")
     texts = {"status": rows.texts["status"], SOURCE: rows.texts[SOURCE]}

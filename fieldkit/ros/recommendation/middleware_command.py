@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 
 _EPILOG = """\
-exit codes: 0 if a file was written for at least one middleware; 1 if nothing passed or the
-evidence does not suffice, so that nothing was written.
+exit codes: 0 if a file was written for at least one middleware; 1 if no file was written, because no
+configuration passed or the evidence is not sufficient.
 
 example: fieldkit middleware recommend trials/ -o config/ --max-loss 1% --max-delay 200ms"""
 
@@ -34,8 +34,8 @@ def add(parser: Parser) -> None:
         "recommend",
         help="write the configuration that passed on the measured link",
         description="Write the configuration of CycloneDDS, Fast DDS or Zenoh that passed on the measured link, with "
-        "the evidence in its comment. Exit code 0: a file was written; 1: no configuration passed, or the evidence "
-        "does not suffice, and nothing was written.",
+        "the evidence in its comment. Exit code 0: a file was written; 1: no file was written, because no "
+        "configuration passed or the evidence is not sufficient.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -85,9 +85,9 @@ def recommend(arguments: argparse.Namespace) -> int:
         return NOTHING_WRITTEN
     best: dict[str, Assessment] = {}
     for assessment in assessments:
-        result = "passed" if assessment.passed else "failed" if assessment.failed else "undecided"
+        result = "passed" if assessment.passed else "failed" if assessment.failures else "undecided"
         print_text(sanitized(f"{result}: {assessment.candidate}"))
-        for reason in (*assessment.failed, *assessment.lacking):
+        for reason in (*assessment.failures, *assessment.missing_evidence):
             print_text(sanitized(f"  {reason}"))
         current = best.get(assessment.candidate.over)
         if assessment.passed and (current is None or assessment.rank < current.rank):
@@ -118,14 +118,14 @@ def _parse_share(text: str, option: str, maximum: float = 1.0) -> float:
 
 
 def _write(arguments: argparse.Namespace, assessment: "Assessment", criterion: "LinkCriterion") -> bool:
-    """Write the file of settings that passed. Return False if the middleware has no file that can express them."""
+    """Write a file with the settings that passed. Return False if the middleware has no file for these settings."""
     from fieldkit.ros.recommendation import candidates
 
     middleware = assessment.candidate.over
     comment = list(candidates.evidence(assessment, criterion))
     try:
         text = configurations.configuration_text(
-            middleware, assessment.candidate.transport, assessment.candidate.by_path, comment
+            middleware, assessment.candidate.transport, assessment.candidate.settings_by_path, comment
         )
     except ConfigurationError as error:
         show_note(str(error))
@@ -133,5 +133,5 @@ def _write(arguments: argparse.Namespace, assessment: "Assessment", criterion: "
     arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / configurations.FILES[middleware]
     files.write(path, text.encode())
-    print_text(f"wrote {path}; name it in {configurations.VARIABLES[middleware]}")
+    print_text(f"wrote {path}; set {configurations.VARIABLES[middleware]} to its path")
     return True

@@ -49,8 +49,8 @@ DEFAULT_BAG: Final = "scan"
 # Measured: rosbag took 0.6 to 0.8 s longer than its duration, and 3.2 s longer on a lossy interface.
 START_AND_CLOSE_S: Final = 20.0
 
-# A recorder needs up to a second to subscribe, more on a small computer under load. If a bag then spans less than
-# half of its duration, the recording has failed.
+# A recorder needs up to a second to subscribe, and more on a small computer under load. A recording has failed if its
+# bag, plus this time, spans less than half of the duration.
 SUBSCRIBE_S: Final = 1.0
 MIN_RECORDED_SHARE: Final = 0.5
 
@@ -80,15 +80,15 @@ SUBSCRIBED: Final = "log:Subscribed to topic"
 class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpace, Records, Summarizes):
     """Records a ROS bag, by the record command of the robot's profile.
 
-    A robot may record several bags of different names, one after the other; a `transfer` then names its `file`.
+    A robot may record several bags with different names, one after the other; the `file` of a `transfer` selects one.
 
     Attributes:
         robot: Role that records.
-        topics: List of topics.
+        topics: The recorded topics.
         duration: Duration of the recording.
-        name: Name of the bag without its extension; names of its job and log begin with it, unless it is `scan`.
-        reception: Whether columns report how soon its topics were received, and how regularly: [what a recorder
-            received](method-delay.md#what-a-recorder-received).
+        name: Name of the bag without its extension; the names of its job and log start with it, unless it is `scan`.
+        reception: Whether columns report how soon and how regularly the messages of its topics were received: [what a
+            recorder received](method-delay.md#what-a-recorder-received).
     """
 
     cross_checks = (
@@ -208,7 +208,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
         return self.prefixed_name(f"{self.robot}-record.log")
 
     @override
-    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+    def recordings(self, cast: Cast) -> Iterator[RecordedFile]:
         robot = cast[self.robot]
         size_bytes = _BAG_BYTES + self.duration * sum(_bytes_per_s(robot, topic) for topic in self.topics)
         yield RecordedFile(self.robot, self.bag(robot), size_bytes, alias=self.name)
@@ -223,7 +223,7 @@ class RecordStep(Step, HasRefusals, HasNeeds, Subscribes, UsesSpace, ReservesSpa
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:
-        return sum(file.size_bytes for file in self.recorded(scene.cast) if file.role is role)
+        return sum(file.size_bytes for file in self.recordings(scene.cast) if file.role is role)
 
     @override
     def reserve_bytes(self, scene: Scene, role: Role) -> int:
@@ -304,7 +304,7 @@ def _bytes_per_s(robot: Robot, name: str) -> float:
 
 
 def _judge(robot: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:
-    """Return verdict, detail and remedy on the ROS environment after the setup files."""
+    """Return verdict, detail and remedy for the ROS environment that the setup files create."""
     ros, profile = _ros(robot), robot.profile.name
     command = ros.command
     distribution, _, master = answer.text.partition(" ")

@@ -41,7 +41,7 @@ def judge(master: Robot, answer: CommandResult) -> tuple[Verdict, str, str]:
     where = f"{master.name}, {master.address}:{ROS_MASTER_PORT}"
     if answer.ok and _OK in answer.text:
         return Verdict.OK, where, ""
-    received = answer.text or "no output"
+    output = answer.text or "no output"
     start = f"on {master.name}: ROS_HOSTNAME={master.address} roscore"
     remedy = f"{start}   # or bring the robots closer, or correct ros_master in the site file"
-    return Verdict.FAIL, f"no master answers at {where}: {received}", remedy
+    return Verdict.FAIL, f"no master answers at {where}: {output}", remedy

@@ -19,26 +19,26 @@ from fieldkit.steps.capabilities import Subscribes
 from fieldkit.steps.scene import Scene
 from fieldkit.trial.check import software
 from fieldkit.trial.check.report import Report
-from fieldkit.trial.check.software import Probed
+from fieldkit.trial.check.software import ProbeResult
 from fieldkit.trial.check.system import judge_battery
 from fieldkit.trial.plan import Plan
 
 RECORD_S: Final = 2.0
 LONGEST_S: Final = 20.0
 MESSAGES: Final = 2
-"""Number of messages that the recording waits for on a slow topic, for `LONGEST_S` at most."""
+"""Number of messages of a slow topic for which the recording waits, at most for `LONGEST_S`."""
 TOLERANCE: Final = 0.5
 """Allowed deviation of a topic's rate, as a fraction of the rate."""
 
 # A recorder that is stopped from outside also needs time to start: ros2 takes 3 s to load on a small computer.
 _START_S: Final = 4.0
-# A recorder waits for a missing ROS master; if only the battery is needed, it waits no longer than this.
+# Limit of a recording that is needed only for the battery, because a recorder waits for a missing ROS master.
 _SHORT_LIMIT_S: Final = 6.0
 _END_BYTES: Final = 4096
 _BATTERY: Final = "sensor_msgs/BatteryState"
 
 
-def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: Report) -> None:
+def check_topics(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResult, report: Report) -> None:
     """Record for a short time; report whether each recorded topic is published, and the charge of the battery.
 
     It is the entry point `topics` of `fieldkit.checks`.
@@ -48,30 +48,35 @@ def check_topics(plan: Plan, role: Role, shell: Shell, probed: Probed, report: R
         RobotError: The recorder did not start.
     """
     robot = plan.cast[role]
-    required_topics, battery = recorded(plan, role), "" if has_shared_battery(plan, role) else battery_of(robot)
-    topics = tuple(dict.fromkeys((*required_topics, *((battery,) if battery else ()))))
-    if not topics or not can_record(plan, role, probed):
+    topics_to_check, battery = (
+        required_topics(plan, role),
+        "" if has_shared_battery(plan, role) else battery_of(robot),
+    )
+    topics = tuple(dict.fromkeys((*topics_to_check, *((battery,) if battery else ()))))
+    if not topics or not can_record(plan, role, probe_result):
         return
     step = recording(role, robot, topics)
-    scene = plan.scene(RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: probed.variants})
+    scene = plan.scene(
+        RepeatId(plan.protocols[0], 1), jobs.work_folder(plan.trial, "check"), {role: probe_result.variants}
+    )
     with tempfile.TemporaryDirectory() as into:
         try:
-            path, recorded_bag = _record(scene, step, shell, Path(into), waits_full_time=bool(required_topics))
+            path, recorded_bag = _record(scene, step, shell, Path(into), waits_full_time=bool(topics_to_check))
         except EvidenceError as error:
-            judge(robot, required_topics, None, report, why=error.what)
+            judge(robot, topics_to_check, None, report, reason=error.what)
             return
         finally:
             evidence.discard(shell, plan.trial)
-        judge(robot, required_topics, recorded_bag, report)
+        judge(robot, topics_to_check, recorded_bag, report)
         _check_battery(path, battery, report)
 
 
-def can_record(plan: Plan, role: Role, probed: Probed) -> bool:
-    """Return True unless something that a recording needs is known to be missing on the robot."""
+def can_record(plan: Plan, role: Role, probe_result: ProbeResult) -> bool:
+    """Return False if a program that a recording needs is missing on the robot."""
     ros = plan.cast[role].profile.ros
-    if ros is None or not recorded(plan, role):
+    if ros is None or not required_topics(plan, role):
         return True
-    return probed.has_program(ros.command.record[0], software.needs_of(plan, role))
+    return probe_result.has_program(ros.command.record[0], software.needs_of(plan, role))
 
 
 def _check_battery(path: Path, topic: str, report: Report) -> None:
@@ -84,7 +89,7 @@ def _check_battery(path: Path, topic: str, report: Report) -> None:
         judge_battery(topic, 100 * share, report)
 
 
-def recorded(plan: Plan, role: Role) -> tuple[str, ...]:
+def required_topics(plan: Plan, role: Role) -> tuple[str, ...]:
     """Return the topics that the procedure requires to be published on the robot in `role`."""
     steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, Subscribes))
     topics = (topic for step in steps for topic in step.live_topics(role))
@@ -151,7 +156,7 @@ def _end(log: Path) -> str:
 
 
 def judge(
-    robot: Robot, topics: Sequence[str], content: RecordingContents | None, report: Report, *, why: str = ""
+    robot: Robot, topics: Sequence[str], content: RecordingContents | None, report: Report, *, reason: str = ""
 ) -> None:
     """Report whether each topic is published at its rate, from a recording or the reason why there is none."""
     for topic in topics:
@@ -161,7 +166,7 @@ def judge(
             tool = "rostopic hz" if robot.profile.ros and robot.profile.ros.variant == "ros1" else "ros2 topic hz"
             report.fail(
                 check,
-                f"silent: {why}" if why else "silent",
+                f"no message: {reason}" if reason else "no message",
                 f"{tool} {topic}   # start the node that publishes it, or correct the procedure",
             )
         elif rate_hz is None:
@@ -171,10 +176,10 @@ def judge(
 
 
 def _judge_rate(check: str, count: int, span_s: float, rate_hz: float, report: Report) -> None:
-    # The span is from the first message of any topic to the last, so the count may be off by one.
+    # The span is from the first message of any topic to the last one, so the count may be wrong by one.
     low, high = ((count + sign) / max(span_s, 1e-9) for sign in (-1, 1))
     detail = f"{count} messages in {span_s:.1f} s, expected {rate_hz:g} Hz"
     if high < (1 - TOLERANCE) * rate_hz or (count > 1 and low > (1 + TOLERANCE) * rate_hz):
-        report.warn(check, detail, "correct the rate in the profile, or find out what slows the topic: top")
+        report.warn(check, detail, "correct the rate in the profile, or find the program that slows it down: top")
     else:
         report.ok(check, detail)

@@ -48,8 +48,9 @@ MASTER: Final = "rosmaster"
 """Program of the ROS master."""
 
 KEPT_BYTES: Final = 256
-"""Bytes of a frame that contain the head of each sample. After an Ethernet header, the head ends at byte 138 for DDS,
-at 154 if DDS names the reader, and at about 190 for Zenoh, after attachment and key expression."""
+"""Captured bytes of each frame, so that they contain the head of a sample. With an Ethernet header, the head ends at
+byte 138 for DDS, at 154 if the message names the DDS reader, and at about 190 for Zenoh, after attachment and key
+expression."""
 
 BUFFER_KIB: Final = 32_768
 """Kernel buffer of a capture around a topic. In immediate mode a frame needs about 400 bytes of it with `KEPT_BYTES`,
@@ -67,8 +68,8 @@ _ENVELOPE_BYTES: Final = 100
 class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Streams samples of a topic from one robot to another over a middleware.
 
-    The program is part of fieldkit; both robots need the middleware for Python. See [topics](topics.md), also for the
-    columns. Inside a `capture` its traffic is counted, and delays are measured if there are packets in both
+    The program is part of fieldkit; both robots need the middleware for Python. [Topics](topics.md) describes the
+    columns, too. Inside a `capture` its traffic is counted, and delays are measured if there are packets in both
     directions. Writes `ROLE-topic.bin` and `ROLE-topic.log`, and `ROLE-serve.log` of a router or a master.
     """
 
@@ -161,11 +162,11 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             for role in self.participants:
                 silence_contexts.enter_context(testbed.shells[role].silence(publish.job.limit_s))
             code = jobs.run(testbed.shells[publish.role], publish.job)
-        stopped = [
+        exit_codes = [
             (planned, jobs.stop(testbed.shells[planned.role], planned.job, grace_s=_GRACE_S))
             for planned in reversed(other_jobs)
         ]
-        for planned, exit_code in ((publish, code), *stopped):
+        for planned, exit_code in ((publish, code), *exit_codes):
             if exit_code != 0:
                 raise scene.failure(planned, f"{planned.job.name} ended with exit code {exit_code}")
 
@@ -262,11 +263,13 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         flow, packets = self._traffic(view), self._packets(view)
         stall_values = topic_stalls.measure(flow, ends, packets, self._schedule)
         measured = topic_columns.measure(flow, *ends, *packets) | stall_values
-        measured = measured.without(topic_columns.withheld_reasons(measured, topic_evidence.dropped(self, view)))
-        measured = topic_evidence.checked(self, view, logs, measured)
+        measured = measured.without(
+            topic_columns.withheld_reasons(measured, topic_evidence.dropped_reason(self, view))
+        )
+        measured = topic_evidence.without_contradicted_times(self, view, logs, measured)
         return (
             measured
-            | topic_columns.withheld_mark(topic_evidence.dropped(self, view))
+            | topic_columns.withheld_mark(topic_evidence.dropped_reason(self, view))
             | self._measure_reads(view, ends, packets)
         )
 
@@ -329,15 +332,15 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
 
     def _packets(self, view: View) -> "tuple[Packets | None, Packets | None]":
         """Return the packets in the captures of sender and receiver."""
-        sent, received = (view.capture(role) for role in (self.sender, self.receiver))
-        return sent.packets if sent else None, received.packets if received else None
+        sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
+        return sender.packets if sender else None, receiver.packets if receiver else None
 
     @property
     def _schedule(self) -> "FlowSchedule":
         from fieldkit.measure.transfers.deliveries import FlowSchedule  # noqa: PLC0415 (as above)
 
         # The last sample is sent one interval before the end.
-        return FlowSchedule(interval_s=1 / self.rate, lasts_s=max(self.duration - 1 / self.rate, 0.0))
+        return FlowSchedule(interval_s=1 / self.rate, duration_s=max(self.duration - 1 / self.rate, 0.0))
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:

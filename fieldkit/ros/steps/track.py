@@ -70,7 +70,7 @@ class Spot(Strict):
     z: Number | schema.Int = 0.0
 
     @schema.model_validator(mode="after")
-    def _is_one_place(self) -> "Spot":
+    def _has_one_position(self) -> "Spot":
         on_earth, in_frame = (self.lat, self.lon), (self.frame, self.x, self.y)
         if None in (in_frame if self.frame is not None else on_earth) or {*on_earth, *in_frame} - {None} == set():
             raise schema.validation_error("a position needs lat and lon, or frame, x and y")
@@ -99,8 +99,8 @@ class TrackedRobot(Strict):
             robot at the other end of its link; `towards`: towards that robot; `left` and `right`: to the left and to
             the right of the direction `away`.
         child: Frame of the robot in a tree of transforms, whose parent is the tracker's frame.
-        times: Time of a message: `header`, its stamp, or `received`, when the recorder received it, if the
-            stamps are from another clock.
+        times: Time of a message: `header` for its stamp, or `received` for its time of reception, if the stamps are
+            from another clock.
         gap: If two consecutive messages are further apart than this, the position between them is unknown.
         at: A fixed position, instead of a topic.
     """
@@ -123,11 +123,10 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
     """Records the position of each robot on that robot, with its profile's record command, while inner steps run.
 
     The distance and speed columns of the transfers and pings inside use these positions
-    ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to be where they were
-    placed, unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the
-    columns `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and
-    `positions.json`, which records the source of each position and how far the robots' clocks were ahead of the
-    laptop's.
+    ([method](method-radio.md#where-robots-were)). Robots that are not listed are assumed to stay at their placement,
+    unless they move. A repeat has at most one `track`; moves, faults and `together` are inside it. Adds the columns
+    `positions_from` and `positions_clock_error_s`. Writes `track_ROLE.bag` (ROS 2: a folder) and `positions.json`,
+    which records the source of each position and how far the robots' clocks were ahead of the laptop's.
 
     Attributes:
         robots: Source of each robot's position, by role.
@@ -135,7 +134,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         during: Steps that run at the same time.
     """
 
-    cross_checks = position_checks.OF_POSITIONS
+    cross_checks = position_checks.POSITION_CHECKS
 
     robots: Annotated[dict[Role, TrackedRobot], Field(min_length=1)]
     heights: schema.Bool = False
@@ -164,7 +163,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
         return replace(planned, job=job, permitted_causes=BY_FIELDKIT, least_s=0.0)
 
     def _recorders(self, duration_s: float) -> Mapping[Role, RecordStep]:
-        """Return the equivalent `record` step of each robot with a topic, for a duration."""
+        """Return a `record` step with this duration for each robot with a topic."""
         return {
             role: RecordStep.model_validate(
                 {
@@ -230,7 +229,7 @@ class TrackStep(Nest, ChecksPlacement, HasRefusals, HasNeeds, Subscribes, UsesSp
             ros = scene.robot(role).profile.ros
             kinds = {topic.name: topic.type for topic in ros.topics} if ros else {}
             if kinds.get(recorder.topics[0]) == ODOMETRY and self.robots[role].facing is None:
-                what = "its odometry needs its direction at the start of the step"
+                what = "its odometry is relative to its direction at the start of the step, which is unknown"
                 yield Refusal(role, what, "write facing: away, towards, left or right, in the step track")
 
     @override

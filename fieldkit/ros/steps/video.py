@@ -230,7 +230,7 @@ class VideoStep(AlongStep, Prepares, HasNeeds, UsesSpace, Listens, SendsTraffic,
             reliable=False,
             depth=None,
             in_order=True,
-            on_ports=True,
+            uses_expected_ports=True,
         )
 
     @property

@@ -18,7 +18,7 @@ MIN_SAMPLES: Final = 20
 """Maximum time between the packet of a sample and its record, for the fastest sample; the larger value is for fewer
 than `MIN_SAMPLES` samples. A program on a busy robot delays single samples for longer, but not all of them."""
 _MAX_RELEASE_WAIT_NS: Final = 600_000_000
-"""If a sample is permanently lost, the next ones may wait this long for the message that reports the loss."""
+"""If a sample is permanently lost, the next samples may wait for this time until the loss is reported."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,24 +26,24 @@ class SampleArrivals:
     """Samples in the subscriber's log that are also in its capture.
 
     Attributes:
-        after_ns: Time of the sample's record in the log minus time of the first packet with the sample's head.
+        record_delay_ns: Time of the sample's record in the log minus time of the first packet with the sample's head.
         latency_s: Time of the record minus time of the packet that completed the sample and all earlier ones. Only
             for samples for which this packet is known; None if it is known for no sample.
     """
 
-    after_ns: Ints
+    record_delay_ns: Ints
     latency_s: Floats | None
 
     @classmethod
     def of(cls, samples: TopicSamples, subscriber: SampleFlow, *, complete: bool, reliable: bool) -> "SampleArrivals":
-        """Return the arrivals of samples that occur once; for the flags see `CapturedTopic` and `TopicPlan`."""
+        """Return the arrivals of samples that occur once; `CapturedTopic` and `TopicPlan` describe the flags."""
         heads = subscriber.heads.first()
-        _, logged, captured = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
-        at_ns, head_ns = samples.at_ns[logged], heads.at_ns[captured]
+        _, log_index, capture_index = np.intersect1d(samples.sequence, heads.sequence, return_indices=True)
+        at_ns, head_ns = samples.at_ns[log_index], heads.at_ns[capture_index]
         complete_ns = _complete_ns(subscriber, heads, complete=complete, reliable=reliable) if len(heads) else None
         if complete_ns is None:
             return cls(at_ns - head_ns, None)
-        latency_s = (at_ns - complete_ns[captured]) / 1e9
+        latency_s = (at_ns - complete_ns[capture_index]) / 1e9
         return cls(
             at_ns - head_ns,
             latency_s[~_may_have_waited(samples, heads)] if reliable and not subscriber.is_tcp else latency_s,
@@ -51,19 +51,19 @@ class SampleArrivals:
 
     def contradictions(self) -> Iterator[str]:
         """Yield contradictions between the times in the log and in the capture."""
-        early_ns = -int(self.after_ns.min(initial=0))
+        early_ns = -int(self.record_delay_ns.min(initial=0))
         if early_ns > STAMP_NS:
-            early_count = int((self.after_ns < -STAMP_NS).sum())
+            early_count = int((self.record_delay_ns < -STAMP_NS).sum())
             early_text = f"{format_count(early_count, 'sample')} in the subscriber's log arrived up to"
             yield f"{early_text} {early_ns / 1e9:.6f} s earlier than their packets in its capture"
         if self.latency_s is not None and len(self.latency_s) > 2:
-            least_s = float(self.latency_s.min())
-            if least_s > (MAX_LATENCY_NS if len(self.latency_s) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS) / 1e9:
-                yield f"the subscriber's log is {least_s:.6f} s or more later than its capture for every sample"
+            min_latency_s = float(self.latency_s.min())
+            if min_latency_s > (MAX_LATENCY_NS if len(self.latency_s) >= MIN_SAMPLES else MAX_LATENCY_FEW_NS) / 1e9:
+                yield f"the subscriber's log is {min_latency_s:.6f} s or more later than its capture for every sample"
 
 
 def _complete_ns(subscriber: SampleFlow, heads: SampleHeads, *, complete: bool, reliable: bool) -> Ints | None:
-    """Return the time at which each sample and all earlier ones had arrived, by number; None if it is unknown."""
+    """Return the time at which each sample and all earlier ones had arrived, by sample number; None if unknown."""
     if subscriber.is_tcp:
         return _contiguous_ns(subscriber, heads.end)
     if heads.is_complete.all():
@@ -111,8 +111,8 @@ def seq_difference(number: Ints, base: int) -> Ints:
 
 def _before_next_ns(subscriber: SampleFlow, heads: SampleHeads) -> Ints:
     """Return the time of the last packet before the next sample starts, for samples in several packets."""
-    times_ns, begins_ns = np.sort(subscriber.packets.time_ns), np.sort(heads.at_ns)
-    next_index = np.searchsorted(begins_ns, heads.at_ns, side="right")
-    next_ns = np.append(begins_ns, times_ns[-1] + 1)[next_index]
-    last: Ints = times_ns[np.maximum(np.searchsorted(times_ns, next_ns, side="left") - 1, 0)]
-    return last
+    times_ns, head_ns = np.sort(subscriber.packets.time_ns), np.sort(heads.at_ns)
+    next_index = np.searchsorted(head_ns, heads.at_ns, side="right")
+    next_ns = np.append(head_ns, times_ns[-1] + 1)[next_index]
+    last_ns: Ints = times_ns[np.maximum(np.searchsorted(times_ns, next_ns, side="left") - 1, 0)]
+    return last_ns

@@ -53,7 +53,7 @@ class StreamQos(Strict):
             with ROS 2's values. The other keys override it.
         reliability: `reliable` or `best_effort`.
         history: `keep_last` or `keep_all`.
-        depth: How many samples are kept, with `keep_last`.
+        depth: Number of samples that are kept with `keep_last`.
         durability: `volatile` or `transient_local`.
         deadline: Maximum expected time between two samples.
     """
@@ -106,11 +106,11 @@ class StreamOptions(Strict):
             `ros1`; `environment` (the robot's own), `multicast` or `peers` for `ros2`. The first of these is the
             default.
         server: Role that runs the router or the master.
-        duration: How long it streams.
-        patience: How long the publisher waits for a subscription; if it finds none, it sends nothing, which is a
-            valid measurement.
-        domain: ROS domain, 0 to 101; it must differ from the robots' own. Each domain has its own ports, also for
-            Zenoh and ROS 1: simultaneous streams on one robot need different domains.
+        duration: Duration of the stream.
+        patience: Maximum time for which the publisher waits for a subscription. If it discovers none, it sends
+            nothing, which is a valid measurement.
+        domain: ROS domain, 0 to 101; it must differ from the domains of other programs on the robots. Each domain has
+            separate ports, also for Zenoh and ROS 1: simultaneous streams on one robot need different domains.
         transport: Transport of `zenoh`: `tcp` or `udp`.
         settings: `default`; `tuned`, for a lossy radio: [the tuned
             settings](studies/middleware.md#the-tuned-settings); or the middleware's own settings by their path:
@@ -162,8 +162,8 @@ class StreamOptions(Strict):
         if self.image is not None and self.bytes != _DEFAULT_BYTES:
             raise schema.validation_error("the size of an image is width x height; leave bytes out", "bytes")
         for name in self.middleware_settings if self.over is MiddlewareName.ROS2 else ():
-            if why := invalid_setting_reason(name):
-                raise schema.validation_error(why, "settings")
+            if reason := invalid_setting_reason(name):
+                raise schema.validation_error(reason, "settings")
         return self
 
     @property
@@ -183,7 +183,7 @@ class StreamOptions(Strict):
 
     @property
     def discovery_method(self) -> Discovery:
-        """The discovery method: the given or the default one."""
+        """The discovery method; the default one of the middleware if `discovery` is not set."""
         return self.discovery or DISCOVERY_METHODS[self.over][0]
 
     @property
@@ -210,7 +210,7 @@ class StreamOptions(Strict):
 
     @property
     def listening_port(self) -> int:
-        """Port of the router, of the master, or of Zenoh's listeners; 0 for DDS, which has no fixed one."""
+        """Port of the router, of the master, or of Zenoh's listeners; 0 for DDS, which has no fixed port."""
         if self.over in OVER_DDS:
             return 0
         return (
@@ -254,8 +254,13 @@ class StreamOptions(Strict):
         from fieldkit.ros.interfaces import topics, types  # noqa: PLC0415
 
         network = self.network(scene, role)
-        described = topics.describe(
-            types.shipped(), self.topic, self.message, self.qos.resolved(), domain=self.domain, node=network["node"]
+        topic_description = topics.describe(
+            types.standard_types(),
+            self.topic,
+            self.message,
+            self.qos.resolved(),
+            domain=self.domain,
+            node=network["node"],
         )
         stream: dict[str, Any] = {
             "over": self.over.value,
@@ -268,7 +273,7 @@ class StreamOptions(Strict):
             stream["reads_hz"] = self.reads.rate
         if self.image:
             stream["width"], stream["height"] = dimensions(self.image)
-        return agent_commands.compact({"network": network, "topic": described, "stream": stream})
+        return agent_commands.compact({"network": network, "topic": topic_description, "stream": stream})
 
 
 def need(role: Role, robot: Robot, over: MiddlewareName, environment: Mapping[str, str] | None = None) -> Need:

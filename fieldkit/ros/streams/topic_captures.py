@@ -1,7 +1,7 @@
 """Contradictions between the logs of a topic and the captures of its ends.
 
-A capture shows the head of most samples: number and time of sending (`topic_samples`). Each sample in a log is
-therefore compared with its packet. Their times are comparable, because both are from one robot's clock. If TCP or a
+A capture contains the head of most samples: number and time of sending (`topic_samples`). Therefore, each sample in a
+log is compared with its packet. Their times are comparable, because both are from one robot's clock. If TCP or a
 middleware put several samples into one packet, so that the capture shows no heads, counts and bytes are compared.
 """
 
@@ -56,7 +56,7 @@ _GRACE_NS: Final = 300_000_000
 
 
 _READ_BURST_NS: Final = 1_000_000
-"""Within this time a subscriber's program reads all samples in its queue."""
+"""Time in which a subscriber's program reads all samples in its queue."""
 
 _OVERHEAD_BYTES: Final = 200
 _OVERHEAD_ONCE_BYTES: Final = 20_000
@@ -86,13 +86,15 @@ def is_complete(publisher: SampleFlow, subscriber: SampleFlow) -> bool:
     return len(sent_packets) > 0 and bool(match(sent_packets, received_packets).arrived.all())
 
 
-def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured: CapturedTopic) -> Iterator[str]:
+def check_captures(
+    plan: TopicPlan, publisher_log: TopicLog, subscriber_log: TopicLog, captured: CapturedTopic
+) -> Iterator[str]:
     """Yield each contradiction between the logs and the captures as a sentence.
 
     Args:
         plan: Settings of the procedure.
-        sent: Complete log of the publisher.
-        received: Complete log of the subscriber.
+        publisher_log: Complete log of the publisher.
+        subscriber_log: Complete log of the subscriber.
         captured: The topic in both captures.
     """
     if any(
@@ -101,29 +103,31 @@ def check_captures(plan: TopicPlan, sent: TopicLog, received: TopicLog, captured
     ):
         return
     if captured.publisher is not None:
-        yield from _content_contradictions(captured.publisher.heads, sent.samples, sent.samples.sequence, "publisher")
+        yield from _content_contradictions(
+            captured.publisher.heads, publisher_log.samples, publisher_log.samples.sequence, "publisher"
+        )
         yield from _sending_contradictions(captured.publisher.heads)
     if captured.subscriber is not None:
-        yield from _content_contradictions(captured.subscriber.heads, received.samples, None, "subscriber")
-        yield from _arrival_contradictions(plan, received, captured.subscriber, complete=captured.complete)
+        yield from _content_contradictions(captured.subscriber.heads, subscriber_log.samples, None, "subscriber")
+        yield from _arrival_contradictions(plan, subscriber_log, captured.subscriber, complete=captured.complete)
 
 
 def _arrival_contradictions(
-    plan: TopicPlan, received: TopicLog, subscriber: SampleFlow, *, complete: bool
+    plan: TopicPlan, subscriber_log: TopicLog, subscriber: SampleFlow, *, complete: bool
 ) -> Iterator[str]:
     """Yield the contradictions between the subscriber's log and its capture."""
-    arrived = first_arrivals(received)
-    yield from SampleArrivals.of(arrived, subscriber, complete=complete, reliable=plan.reliable).contradictions()
-    yield from _surplus_copies(received.samples, subscriber)
-    yield from _uncaptured_samples(plan, arrived, subscriber)
-    if missing := _missing_count(plan, received, subscriber, complete=complete):
-        missing_text = f"{format_count(missing, 'sample')} arrived according to the subscriber's capture"
+    arrivals = first_arrivals(subscriber_log)
+    yield from SampleArrivals.of(arrivals, subscriber, complete=complete, reliable=plan.reliable).contradictions()
+    yield from _surplus_copies(subscriber_log.samples, subscriber)
+    yield from _uncaptured_samples(plan, arrivals, subscriber)
+    if missing_count := _missing_count(plan, subscriber_log, subscriber, complete=complete):
+        missing_text = f"{format_count(missing_count, 'sample')} arrived according to the subscriber's capture"
         yield f"{missing_text}, but are not in the subscriber's log"
 
 
-def withheld(
+def withheld_columns(
     values: Mapping[str, Value],
-    arrived: TopicSamples,
+    arrivals: TopicSamples,
     captured: CapturedTopic,
     *,
     reliable: bool,
@@ -133,20 +137,20 @@ def withheld(
 
     Args:
         values: Columns of the topic from the logs.
-        arrived: Samples that arrived, each once.
+        arrivals: Samples that arrived, each once.
         captured: The topic in both captures.
         reliable: As in `TopicPlan`.
         deadline_s: Deadline of the topic; None if it has no deadline.
     """
-    if captured.subscriber is None or not len(arrived):
+    if captured.subscriber is None or not len(arrivals):
         return {}
     latency_s = SampleArrivals.of(
-        arrived, captured.subscriber, complete=captured.complete, reliable=reliable
+        arrivals, captured.subscriber, complete=captured.complete, reliable=reliable
     ).latency_s
     if latency_s is None or not len(latency_s):
         return {}
     # A sample of unknown latency affects the columns, too. It is assumed to have the largest known latency.
-    latency_s = np.append(latency_s, np.full(len(arrived) - len(latency_s), latency_s.max()))
+    latency_s = np.append(latency_s, np.full(len(arrivals) - len(latency_s), latency_s.max()))
     figures_s = {
         "median": float(np.median(latency_s)),
         "mean": float(latency_s.mean()),
@@ -166,8 +170,11 @@ def withheld(
 
 def _quantile_of_sent(latency_s: Floats, values: Mapping[str, Value], share: float) -> float:
     """Return the quantile of the received samples that corresponds to this quantile of the sent samples."""
-    sent, received = values.get("topic_sent"), values.get("topic_received")
-    sent_per_received = sent / received if isinstance(sent, int) and isinstance(received, int) and received else 1.0
+    sent_count, received_count = values.get("topic_sent"), values.get("topic_received")
+    if isinstance(sent_count, int) and isinstance(received_count, int) and received_count:
+        sent_per_received = sent_count / received_count
+    else:
+        sent_per_received = 1.0
     return float(np.quantile(latency_s, min(share * sent_per_received, 1.0)))
 
 
@@ -175,13 +182,13 @@ def _content_contradictions(
     heads: SampleHeads, samples: TopicSamples, numbers: Ints | None, name: str
 ) -> Iterator[str]:
     """Yield differences in the time of sending between capture and log, and captured samples without a record."""
-    if numbers is not None and (unlogged := int((~np.isin(heads.sequence, numbers)).sum())):
-        yield f"{format_count(unlogged, 'sample')} in the {name}'s capture are not in its log"
+    if numbers is not None and (unlogged_count := int((~np.isin(heads.sequence, numbers)).sum())):
+        yield f"{format_count(unlogged_count, 'sample')} in the {name}'s capture are not in its log"
     first = heads.first()
-    _, logged, captured = np.intersect1d(samples.sequence, first.sequence, return_indices=True)
-    if different := int((samples.sent_ns[logged] != first.sent_ns[captured]).sum()):
-        what = f"{format_count(different, 'sample')} in the {name}'s log"
-        yield f"{what} have another time of sending than in its capture"
+    _, log_index, capture_index = np.intersect1d(samples.sequence, first.sequence, return_indices=True)
+    if different_count := int((samples.sent_ns[log_index] != first.sent_ns[capture_index]).sum()):
+        samples_text = format_count(different_count, "sample")
+        yield f"{samples_text} have different times of sending in the {name}'s log and in its capture"
 
 
 def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
@@ -211,13 +218,13 @@ def _surplus_copies(samples: TopicSamples, subscriber: SampleFlow) -> Iterator[s
         yield f"the subscriber's log has {format_count(surplus, 'sample')} more often than they arrived"
 
 
-def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
+def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: SampleFlow) -> Iterator[str]:
     """Yield a contradiction if the capture has too few packets for the samples in a log without duplicates."""
-    if not plan.on_ports and not len(subscriber.heads):
+    if not plan.uses_expected_ports and not len(subscriber.heads):
         return
     packets = subscriber.packets
     size_bytes = plan.size_bytes + plan.envelope_bytes
-    without_head = int((~np.isin(arrived.sequence, subscriber.heads.sequence)).sum())
+    without_head = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
     if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
@@ -227,7 +234,7 @@ def _uncaptured_samples(plan: TopicPlan, arrived: TopicSamples, subscriber: Samp
         missing_text = f"{format_count(without_head - max(capacity, 0), 'sample')} in the subscriber's log"
         yield f"{missing_text} are not in its capture"
     if not len(subscriber.heads):
-        yield from _early_samples(arrived, packets.time_ns, payload_bytes, size_bytes)
+        yield from _early_samples(arrivals, packets.time_ns, payload_bytes, size_bytes)
 
 
 _DATAGRAM_BYTES: Final = 1_200
@@ -235,7 +242,7 @@ _DATAGRAM_BYTES: Final = 1_200
 
 
 def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, size_bytes: int) -> Iterator[str]:
-    """Yield a contradiction if samples are logged before enough bytes had arrived; for captures without heads."""
+    """Yield a contradiction if samples were logged before enough bytes had arrived; for captures without heads."""
     order, arrival = np.argsort(times_ns, kind="stable"), np.sort(samples.at_ns)
     bytes_until = np.concatenate(([0], np.cumsum(payload_bytes[order])))
     captured_bytes = bytes_until[np.searchsorted(times_ns[order], arrival + STAMP_NS, side="right")]
@@ -254,13 +261,13 @@ def _missing_count(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow, *, co
     if not len(subscriber.heads):
         return _missing_bytes(plan, log, subscriber)
     heads = subscriber.heads.first()
-    begins_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
-    settled = (heads.at_ns > begins_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
-    received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
-    is_missing = settled & received & ~np.isin(heads.sequence, log.samples.sequence)
+    start_ns = int(log.times_ns[-1] if log.matched_ns is None else log.matched_ns)
+    is_settled = (heads.at_ns > start_ns + _GRACE_NS) & (heads.at_ns < log.times_ns[-1] - _GRACE_NS)
+    is_received = _is_received(plan, heads, log.samples, subscriber, complete=complete)
+    is_missing = is_settled & is_received & ~np.isin(heads.sequence, log.samples.sequence)
     if not is_missing.any():
         return 0
-    return int((~_overflowed(plan, log.samples, heads, is_missing, int(log.times_ns[-1]))).sum())
+    return int((~_may_have_overflowed(plan, log.samples, heads, is_missing, int(log.times_ns[-1]))).sum())
 
 
 def _is_received(
@@ -278,8 +285,8 @@ def _is_received(
         next_index = np.searchsorted(numbers, heads.sequence, side="right")
         next_ns = np.append(samples.at_ns[first], -1)[next_index]
         return has_all_bytes & (gapless | (next_ns >= heads.at_ns))
-    received: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
-    return received
+    is_delivered: Mask = has_all_bytes & (heads.at_ns >= np.maximum.accumulate(heads.at_ns))
+    return is_delivered
 
 
 def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
@@ -292,8 +299,10 @@ def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
     return acknowledged
 
 
-def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_missing: Mask, end_ns: int) -> Mask:
-    """Return, for each sample that a log lacks, True if a queue of the subscriber may have dropped it."""
+def _may_have_overflowed(
+    plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_missing: Mask, end_ns: int
+) -> Mask:
+    """Return a mask of the samples missing in a log that a queue of the subscriber may have dropped."""
     if plan.depth is None:
         return np.zeros(int(is_missing.sum()), dtype=np.bool_)
     arrived_ns, read_ns = np.sort(heads.at_ns), np.append(np.sort(samples.at_ns), end_ns)
@@ -311,7 +320,7 @@ def _overflowed(plan: TopicPlan, samples: TopicSamples, heads: SampleHeads, is_m
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:
-    """Return how many samples a log lacks, from the TCP bytes that arrived, if the capture has no heads."""
+    """Return the number of samples that a log lacks, from the TCP bytes that arrived; for captures without heads."""
     if not subscriber.is_tcp:
         return 0
     max_bytes = plan.size_bytes + plan.envelope_bytes + _OVERHEAD_BYTES

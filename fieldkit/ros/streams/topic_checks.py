@@ -17,9 +17,9 @@ from fieldkit.ros.streams import topic_samples
 from fieldkit.ros.streams.topic_samples import TopicLog
 
 MAX_SLEW_NS: Final = 1_000_000
-"""A slewed clock may reverse two consecutive times of one program by at most this."""
+"""A slewed clock may reverse the order of two consecutive times of one program by at most this time."""
 
-SETTLES_NS: Final = 500_000_000
+SETTLING_NS: Final = 500_000_000
 """Minimum time between the record of the match and the first sample
 (`fieldkit.agent.messaging.stream.SETTLING_S`)."""
 
@@ -41,7 +41,7 @@ class TopicPlan:
         reliable: True if samples are retransmitted until they arrive.
         depth: Number of samples that a subscriber queues until its program reads them; None for all.
         in_order: True if one thread of the subscriber's program reads all samples.
-        on_ports: True if all packets of the topic use the ports that the procedure expects.
+        uses_expected_ports: True if all packets of the topic use the ports that the procedure expects.
     """
 
     topic: str
@@ -51,35 +51,35 @@ class TopicPlan:
     reliable: bool
     depth: int | None
     in_order: bool
-    on_ports: bool
+    uses_expected_ports: bool
 
 
-def check_logs(plan: TopicPlan, sent: TopicLog, received: TopicLog) -> Iterator[str]:
+def check_logs(plan: TopicPlan, publisher_log: TopicLog, subscriber_log: TopicLog) -> Iterator[str]:
     """Yield each contradiction in the two logs of one stream as a sentence.
 
     Args:
         plan: Settings of the procedure.
-        sent: Complete log of the publisher.
-        received: Complete log of the subscriber.
+        publisher_log: Complete log of the publisher.
+        subscriber_log: Complete log of the subscriber.
     """
-    yield from _wrong_end(plan, sent, topic_samples.PUBLISHER)
-    yield from _wrong_end(plan, received, topic_samples.SUBSCRIBER)
-    yield from _publisher_problems(plan, sent)
-    yield from _wrong_sizes(plan, received, PADDING_BYTES, "subscriber")
-    if plan.in_order and (reversed_s := _reversed_s(received)):
+    yield from _end_contradictions(plan, publisher_log, topic_samples.PUBLISHER)
+    yield from _end_contradictions(plan, subscriber_log, topic_samples.SUBSCRIBER)
+    yield from _publisher_problems(plan, publisher_log)
+    yield from _wrong_sizes(plan, subscriber_log, PADDING_BYTES, "subscriber")
+    if plan.in_order and (reversed_s := _reversed_s(subscriber_log)):
         yield f"a sample in the subscriber's log is {reversed_s:.3f} s earlier than the previous one"
-    samples, arrived = sent.samples, received.samples
-    if unsent := int((~np.isin(arrived.sequence, sent.numbers)).sum()):
-        yield f"{format_count(unsent, 'sample')} arrived with numbers that the publisher's log does not have"
-    _, sent_index, received_index = np.intersect1d(samples.sequence, arrived.sequence, return_indices=True)
-    if (samples.sent_ns[sent_index] != arrived.sent_ns[received_index]).any():
+    samples, arrivals = publisher_log.samples, subscriber_log.samples
+    if unsent_count := int((~np.isin(arrivals.sequence, publisher_log.numbers)).sum()):
+        yield f"{format_count(unsent_count, 'sample')} arrived with numbers that the publisher's log does not have"
+    _, sent_index, received_index = np.intersect1d(samples.sequence, arrivals.sequence, return_indices=True)
+    if (samples.sent_ns[sent_index] != arrivals.sent_ns[received_index]).any():
         yield "samples arrived that the publisher did not send: another stream has the same topic and domain"
-    if len(sent_index) > 1 and (samples.at_ns[sent_index] == arrived.at_ns[received_index]).all():
+    if len(sent_index) > 1 and (samples.at_ns[sent_index] == arrivals.at_ns[received_index]).all():
         yield "the subscriber's log is a copy of the publisher's"
 
 
 def check_times(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int, int] | None]) -> Iterator[str]:
-    """Yield the logs with records from before or after the attempt, by the clock of the robot.
+    """Yield a sentence for each log with records from before or after the attempt, by the clock of the robot.
 
     Args:
         logs: Logs by role.
@@ -97,17 +97,20 @@ def check_times(logs: Mapping[Role, TopicLog], windows: Mapping[Role, tuple[int,
             yield f"the {role}'s topic log has a record from {late_s:.3f} s after the attempt, by the robot's clock"
 
 
-def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
-    """Yield a contradiction if a log is from the other end of the topic, or from another topic."""
-    name = _NAMES[end]
-    if log.end is not None and log.end != end:
-        yield f"the {name}'s log was written by the {_NAMES.get(log.end, 'unknown end')} of the topic"
+def _end_contradictions(plan: TopicPlan, log: TopicLog, role: int) -> Iterator[str]:
+    """Yield the contradictions if a log is from the other end of the topic, or from another topic."""
+    name = _NAMES[role]
+    if log.role is not None and log.role != role:
+        yield f"the {name}'s log was written by the {_NAMES.get(log.role, 'unknown end')} of the topic"
     if log.topic_sum is not None and log.topic_sum != zlib.crc32(plan.topic.encode()):
         yield f"the {name}'s log is of another topic than {plan.topic}"
-    has_valid_count = (log.kinds.get(topic_samples.BEGUN) == 1, log.kinds.get(topic_samples.MATCHED, 0) <= 1)
+    has_valid_count = (
+        log.kinds.get(topic_samples.DISCOVERY_STARTED) == 1,
+        log.kinds.get(topic_samples.MATCHED, 0) <= 1,
+    )
     unexpected_kinds = (
         (topic_samples.FOREIGN, topic_samples.READ, topic_samples.UNREADABLE)
-        if end == topic_samples.PUBLISHER
+        if role == topic_samples.PUBLISHER
         else (topic_samples.REFUSED, topic_samples.SKIPPED)
     )
     if not all(has_valid_count) or any(log.kinds.get(kind) for kind in unexpected_kinds):
@@ -119,21 +122,21 @@ def _wrong_end(plan: TopicPlan, log: TopicLog, end: int) -> Iterator[str]:
         yield f"the {name}'s log has samples, but the other end was never discovered"
 
 
-def _publisher_problems(plan: TopicPlan, sent: TopicLog) -> Iterator[str]:
+def _publisher_problems(plan: TopicPlan, publisher_log: TopicLog) -> Iterator[str]:
     """Yield the properties of a log that no publisher can produce."""
-    samples, numbers = sent.samples, sent.numbers
+    samples, numbers = publisher_log.samples, publisher_log.numbers
     if (numbers != np.arange(len(numbers))).any():
-        yield "the publisher's log does not number its samples from 0 on without a gap"
-    offered = len(numbers) + sent.skipped
-    if sent.matched_ns is not None and offered != plan.samples:
+        yield "the sample numbers in the publisher's log do not start at 0, or have a gap"
+    offered = len(numbers) + publisher_log.skipped
+    if publisher_log.matched_ns is not None and offered != plan.samples:
         yield f"the publisher's log accounts for {offered} instead of {format_count(plan.samples, 'sample')}"
-    yield from _wrong_sizes(plan, sent, 0, "publisher")
+    yield from _wrong_sizes(plan, publisher_log, 0, "publisher")
     if len(samples) and (samples.at_ns < samples.sent_ns - MAX_SLEW_NS).any():
         yield "the publisher's log has a sample that the middleware accepted before it was created"
-    if (np.diff(sent.times_ns) < -MAX_SLEW_NS).any() or (np.diff(samples.sent_ns) < -MAX_SLEW_NS).any():
-        yield "the records of the publisher's log are not in the order of time"
-    if len(samples) and sent.matched_ns is not None:
-        early_ns = sent.matched_ns + SETTLES_NS - int(samples.sent_ns[0])
+    if (np.diff(publisher_log.times_ns) < -MAX_SLEW_NS).any() or (np.diff(samples.sent_ns) < -MAX_SLEW_NS).any():
+        yield "the records of the publisher's log are not in chronological order"
+    if len(samples) and publisher_log.matched_ns is not None:
+        early_ns = publisher_log.matched_ns + SETTLING_NS - int(samples.sent_ns[0])
         if early_ns > MAX_SLEW_NS:
             yield f"the publisher's log has its first sample {early_ns / 1e9:.3f} s too early after the subscription"
 
@@ -147,7 +150,7 @@ def _wrong_sizes(plan: TopicPlan, log: TopicLog, padding_bytes: int, name: str) 
 
 
 def _reversed_s(log: TopicLog) -> float:
-    """Return the largest time by which a sample is earlier than the previous one; 0 if none is."""
+    """Return the largest time by which a sample is earlier than the previous one; 0 if the order is correct."""
     reversed_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
     return reversed_ns / 1e9 if reversed_ns > MAX_SLEW_NS else 0.0
 

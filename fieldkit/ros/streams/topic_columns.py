@@ -35,7 +35,7 @@ _COUNTS: Final = columns(
     ),
     ("topic_repeated", "count", "Samples that the subscriber received more than once."),
     ("topic_refused", "count", "Samples that the publisher's middleware did not accept in time."),
-    ("topic_skipped", "count", "Samples that were never sent: their time passed while an earlier one was written."),
+    ("topic_skipped", "count", "Samples that were never sent, because writing an earlier one took too long."),
     (
         "topic_discovered",
         "bool",
@@ -188,30 +188,30 @@ class TopicTraffic:
 
 def measure(
     flow: TopicTraffic,
-    sent: TopicLog | None,
-    received: TopicLog | None,
-    sender: Packets | None,
-    receiver: Packets | None,
+    publisher_log: TopicLog | None,
+    subscriber_log: TopicLog | None,
+    publisher_packets: Packets | None,
+    subscriber_packets: Packets | None,
 ) -> Measured:
-    """Return all columns of a topic.
+    """Return the measured columns of a topic.
 
     Args:
         flow: Identifies its packets.
-        sent: Log of the publisher; None if it is incomplete.
-        received: Log of the subscriber; None if it is incomplete.
-        sender: Packets that the publisher's robot captured; None without a complete capture.
-        receiver: Packets that the subscriber's robot captured; None without a complete capture.
+        publisher_log: Log of the publisher; None if it is incomplete.
+        subscriber_log: Log of the subscriber; None if it is incomplete.
+        publisher_packets: Packets that the publisher's robot captured; None without a complete capture.
+        subscriber_packets: Packets that the subscriber's robot captured; None without a complete capture.
     """
-    traffic = _packet_loss(flow, sender, receiver) | _traffic(flow, sender)
-    if sent is None or received is None:
-        of_logs = (*_COUNTS, *_TIMES, *_OF_SENT)
-        return traffic | Measured.all_missing(of_logs, "there are no complete logs of both ends")
-    arrived = first_arrivals(received)
+    traffic = _packet_loss(flow, publisher_packets, subscriber_packets) | _traffic(flow, publisher_packets)
+    if publisher_log is None or subscriber_log is None:
+        log_columns = (*_COUNTS, *_TIMES, *_OF_SENT)
+        return traffic | Measured.all_missing(log_columns, "there are no complete logs of both ends")
+    arrivals = first_arrivals(subscriber_log)
     clocks = None
-    if sender is not None and receiver is not None:
-        clocks = clocks_between(sender, receiver, flow.sender_address, flow.receiver_address)
-    counts = _counts(sent, arrived, len(received.samples))
-    return traffic | counts | _times(arrived, clocks, flow.deadline_s, len(sent.samples))
+    if publisher_packets is not None and subscriber_packets is not None:
+        clocks = clocks_between(publisher_packets, subscriber_packets, flow.sender_address, flow.receiver_address)
+    counts = _counts(publisher_log, arrivals, len(subscriber_log.samples))
+    return traffic | counts | _times(arrivals, clocks, flow.deadline_s, len(publisher_log.samples))
 
 
 def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
@@ -219,7 +219,7 @@ def withheld_reasons(measured: Measured, reason: str) -> dict[str, str]:
 
     Args:
         measured: Columns measured without the captures.
-        reason: Why the captures are not used; empty if they are.
+        reason: The reason why the captures are not used; empty if they are used.
     """
     if not reason:
         return {}
@@ -232,7 +232,7 @@ def withheld_mark(reason: str) -> Measured:
     """Return the column that marks a topic that was measured without its captures.
 
     Args:
-        reason: Why the captures are not used; empty if they are.
+        reason: The reason why the captures are not used; empty if they are used.
     """
     return Measured.from_optional({"topic_capture_withheld": reason or None}, "nothing is withheld")
 
@@ -243,46 +243,46 @@ def first_arrivals(log: TopicLog) -> TopicSamples:
     return log.samples.where(np.sort(first))
 
 
-def _counts(sent: TopicLog, arrived: TopicSamples, arrivals: int) -> Measured:
-    was_sent = np.isin(arrived.sequence, sent.samples.sequence)
-    received_count, sent_count = int(was_sent.sum()), len(sent.samples)
+def _counts(publisher_log: TopicLog, arrivals: TopicSamples, arrival_count: int) -> Measured:
+    was_sent = np.isin(arrivals.sequence, publisher_log.samples.sequence)
+    received_count, sent_count = int(was_sent.sum()), len(publisher_log.samples)
     discovery_s = None
-    if sent.begun_ns is not None and sent.matched_ns is not None:
-        discovery_s = (sent.matched_ns - sent.begun_ns) / 1e9
+    if publisher_log.discovery_start_ns is not None and publisher_log.matched_ns is not None:
+        discovery_s = (publisher_log.matched_ns - publisher_log.discovery_start_ns) / 1e9
     values: dict[str, Value | None] = {
         "topic_sent": sent_count,
         "topic_received": received_count,
         "topic_loss": 1 - received_count / sent_count if sent_count else None,
-        "topic_repeated": arrivals - len(arrived),
-        "topic_refused": sent.refused,
-        "topic_skipped": sent.skipped,
-        "topic_discovered": sent.matched_ns is not None,
+        "topic_repeated": arrival_count - len(arrivals),
+        "topic_refused": publisher_log.refused,
+        "topic_skipped": publisher_log.skipped,
+        "topic_discovered": publisher_log.matched_ns is not None,
         "topic_discovery_s": discovery_s,
     }
     return Measured.from_optional(values, "the publisher discovered no subscription, so nothing was sent")
 
 
-def _times(arrived: TopicSamples, clocks: Clocks | None, deadline_s: float | None, sent: int) -> Measured:
-    """Return the columns of time; each sample has arrived once, in the order of `arrived`."""
-    transit_ns = arrived.at_ns - arrived.sent_ns
+def _times(arrivals: TopicSamples, clocks: Clocks | None, deadline_s: float | None, sent_count: int) -> Measured:
+    """Return the columns of times; each sample is once in `arrivals`, in the order of arrival."""
+    transit_ns = arrivals.at_ns - arrivals.sent_ns
     values: dict[str, Value | None] = {"topic_jitter_s": jitter_s(transit_ns)}
     if deadline_s is not None:
-        values["topic_deadline_misses"] = deadline_misses(arrived.at_ns, deadline_s)
-    if len(arrived):
+        values["topic_deadline_misses"] = deadline_misses(arrivals.at_ns, deadline_s)
+    if len(arrivals):
         variation_s = (transit_ns - transit_ns.min()) / 1e9
         values["topic_delay_variation_p95_s"] = float(np.percentile(variation_s, 95))
-    if len(arrived) and clocks is not None and math.isfinite(clocks.error_s(arrived.at_ns)):
-        values |= _clock_dependent_values(arrived, clocks, sent)
+    if len(arrivals) and clocks is not None and math.isfinite(clocks.error_s(arrivals.at_ns)):
+        values |= _clock_dependent_values(arrivals, clocks, sent_count)
     reason = (
         "too few samples arrived, there is no deadline, or the clock offset from the captures is not accurate enough"
     )
     return Measured.from_optional(values, reason) | Measured.all_missing((*_TIMES, *_OF_SENT), reason)
 
 
-def _clock_dependent_values(arrived: TopicSamples, clocks: Clocks, sent: int) -> dict[str, float]:
+def _clock_dependent_values(arrivals: TopicSamples, clocks: Clocks, sent_count: int) -> dict[str, float]:
     """Return delays and ages whose clock error is small enough."""
-    delay_s, error_s = clocks.delays_s(arrived.sent_ns, arrived.at_ns), clocks.error_s(arrived.at_ns)
-    mean_s, peak_s = age_s((arrived.at_ns - arrived.at_ns[0]) / 1e9, delay_s)
+    delay_s, error_s = clocks.delays_s(arrivals.sent_ns, arrivals.at_ns), clocks.error_s(arrivals.at_ns)
+    mean_s, peak_s = age_s((arrivals.at_ns - arrivals.at_ns[0]) / 1e9, delay_s)
     figures = {
         "topic_delay_median_s": float(np.median(delay_s)),
         "topic_delay_mean_s": float(delay_s.mean()),
@@ -290,11 +290,13 @@ def _clock_dependent_values(arrived: TopicSamples, clocks: Clocks, sent: int) ->
         "topic_delay_max_s": float(delay_s.max()),
         "topic_age_mean_s": mean_s,
         "topic_age_peak_s": peak_s,
-        "topic_delay_median_sent_s": quantile_of_sent(delay_s, sent, 0.5),
-        "topic_delay_p95_sent_s": quantile_of_sent(delay_s, sent, 0.95),
+        "topic_delay_median_sent_s": quantile_of_sent(delay_s, sent_count, 0.5),
+        "topic_delay_p95_sent_s": quantile_of_sent(delay_s, sent_count, 0.95),
     }
-    shown = {name: value for name, value in figures.items() if value is not None and error_s <= LARGEST_ERROR * value}
-    return {"topic_delay_error_s": error_s, **shown}
+    accurate_figures = {
+        name: value for name, value in figures.items() if value is not None and error_s <= LARGEST_ERROR * value
+    }
+    return {"topic_delay_error_s": error_s, **accurate_figures}
 
 
 def age_s(at_s: Floats, delay_s: Floats) -> tuple[float | None, float | None]:
@@ -327,12 +329,12 @@ def deadline_misses(at_ns: Ints, deadline_s: float) -> int:
     return int(np.maximum(np.ceil(gaps_s / deadline_s - 1e-9) - 1, 0).sum())
 
 
-def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
+def _traffic(flow: TopicTraffic, publisher_packets: Packets | None) -> Measured:
     """Return the counts of the topic's data and discovery packets in a capture."""
-    if sender is None:
+    if publisher_packets is None:
         return Measured.all_missing(_TRAFFIC, "there is no complete capture of the publisher")
     data, discovery = list(flow.data_ports), list(flow.discovery_ports)
-    packets = with_ports(sender)
+    packets = with_ports(publisher_packets)
     to_data, to_discovery = np.isin(packets.dport, data), np.isin(packets.dport, discovery)
     from_data, from_discovery = np.isin(packets.sport, data), np.isin(packets.sport, discovery)
     kinds = {
@@ -342,22 +344,24 @@ def _traffic(flow: TopicTraffic, sender: Packets | None) -> Measured:
     values: dict[str, Value | None] = {}
     for name, mask in kinds.items():
         values[f"topic_{name}_packets"] = int(mask.sum())
-        values[f"topic_{name}_bytes"] = int(sender.wire_bytes[mask].sum())
+        values[f"topic_{name}_bytes"] = int(publisher_packets.wire_bytes[mask].sum())
     return Measured.from_optional(values, "")
 
 
-def _packet_loss(flow: TopicTraffic, sender: Packets | None, receiver: Packets | None) -> Measured:
+def _packet_loss(
+    flow: TopicTraffic, publisher_packets: Packets | None, subscriber_packets: Packets | None
+) -> Measured:
     """Return the share of UDP data packets from publisher to subscriber that did not arrive."""
-    if sender is None or receiver is None:
+    if publisher_packets is None or subscriber_packets is None:
         return Measured.from_optional({"topic_packet_loss": None}, "there are no complete captures of both ends")
 
     def forward(packets: Packets) -> Packets:
         ends = packets.are_from(flow.sender_address) & packets.are_to(flow.receiver_address)
         return packets.where(ends & (packets.protocol == UDP))
 
-    sent = forward(sender)
+    sent_packets = forward(publisher_packets)
     # At the subscriber a first fragment, and with it the port, may be missing. The sender's capture has all ports.
-    of_data = np.isin(with_ports(sent).dport, list(flow.data_ports))
-    arrived = match(sent, forward(receiver)).arrived[of_data]
-    lost = 1 - float(arrived.mean()) if len(arrived) else None
-    return Measured.from_optional({"topic_packet_loss": lost}, "none of its data was sent over UDP")
+    is_data = np.isin(with_ports(sent_packets).dport, list(flow.data_ports))
+    has_arrived = match(sent_packets, forward(subscriber_packets)).arrived[is_data]
+    loss = 1 - float(has_arrived.mean()) if len(has_arrived) else None
+    return Measured.from_optional({"topic_packet_loss": loss}, "none of its data was sent over UDP")

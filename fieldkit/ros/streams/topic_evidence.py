@@ -44,7 +44,7 @@ def plan(step: StreamOptions) -> TopicPlan:
         # Zenoh passes samples to the callback without a queue.
         depth=None if step.over is MiddlewareName.ZENOH else depth,
         in_order=step.over in {MiddlewareName.DDS, MiddlewareName.ROS1},
-        on_ports=step.over is not MiddlewareName.ROS2,
+        uses_expected_ports=step.over is not MiddlewareName.ROS2,
     )
 
 
@@ -58,25 +58,25 @@ def problems(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog]) -> 
     """
     yield from topic_checks.check_times(logs, {role: view.attempt_window(role) for role in logs})
     if {step.sender, step.receiver} <= logs.keys():
-        sent, received = logs[step.sender], logs[step.receiver]
+        ends = logs[step.sender], logs[step.receiver]
         topic_plan = plan(step)
-        reasons = [*topic_checks.check_logs(topic_plan, sent, received), *read_checks.check_reads(received)]
+        reasons = [*topic_checks.check_logs(topic_plan, *ends), *read_checks.check_reads(ends[1])]
         yield from reasons
-        # The same cause would also lead to many contradictions with the captures.
+        # The same cause would also lead to contradictions with the captures.
         if not reasons:
-            yield from topic_captures.check_captures(topic_plan, sent, received, captured(step, view))
+            yield from topic_captures.check_captures(topic_plan, *ends, captured_topic(step, view))
 
 
-def captured(step: StreamOptions, view: View) -> CapturedTopic:
+def captured_topic(step: StreamOptions, view: View) -> CapturedTopic:
     """Return the samples of the topic in the captures of sender and receiver."""
-    sent, received = (_flow(step, view, role) for role in (step.sender, step.receiver))
-    complete = sent is not None and received is not None and topic_captures.is_complete(sent, received)
-    return CapturedTopic(sent, received, complete)
+    publisher, subscriber = (_flow(step, view, role) for role in (step.sender, step.receiver))
+    complete = publisher is not None and subscriber is not None and topic_captures.is_complete(publisher, subscriber)
+    return CapturedTopic(publisher, subscriber, complete)
 
 
-def dropped(step: StreamOptions, view: View) -> str:
-    """Return the reason why columns of captures are withheld; empty if the kernel dropped no packet."""
-    counts = {role: view.dropped(role) for role in (step.sender, step.receiver)}
+def dropped_reason(step: StreamOptions, view: View) -> str:
+    """Return the reason why columns that need captures are withheld; empty if the kernel dropped no packet."""
+    counts = {role: view.dropped_packets(role) for role in (step.sender, step.receiver)}
     return " and ".join(
         f"the capture of {role} lacks {format_count(count, 'packet')} that its kernel dropped"
         for role, count in counts.items()
@@ -103,16 +103,22 @@ def _flow(step: StreamOptions, view: View, role: Role) -> SampleFlow | None:
     )
 
 
-def checked(step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], measured: Measured) -> Measured:
+def without_contradicted_times(
+    step: StreamOptions, view: View, logs: Mapping[Role, TopicLog], measured: Measured
+) -> Measured:
     """Return the measurements without the times that the captures contradict."""
     if not {step.sender, step.receiver} <= logs.keys():
         return measured
-    sent, arrived = logs[step.sender], first_arrivals(logs[step.receiver])
-    reasons = topic_captures.withheld(
-        measured.values, arrived, captured(step, view), reliable=plan(step).reliable, deadline_s=step.qos.deadline
+    publisher_log, arrivals = logs[step.sender], first_arrivals(logs[step.receiver])
+    reasons = topic_captures.withheld_columns(
+        measured.values,
+        arrivals,
+        captured_topic(step, view),
+        reliable=plan(step).reliable,
+        deadline_s=step.qos.deadline,
     )
-    if sent.matched_ns is not None and len(sent.samples):
-        late_s = (int(sent.samples.sent_ns[0]) - sent.matched_ns - topic_checks.SETTLES_NS) / 1e9
+    if publisher_log.matched_ns is not None and len(publisher_log.samples):
+        late_s = (int(publisher_log.samples.sent_ns[0]) - publisher_log.matched_ns - topic_checks.SETTLING_NS) / 1e9
         if late_s > _LATE_S:
             reasons["topic_discovery_s"] = f"the first sample was sent {late_s:.3f} s too late after the discovery"
     return measured.without(reasons)

@@ -14,7 +14,7 @@ from fieldkit.ros.streams import topic_samples
 from fieldkit.steps.base import Step
 
 MAX_SAMPLES: Final = 1500
-"""Maximum number of samples of each kind in a panel; of more samples, every k-th is drawn."""
+"""Maximum number of samples of each kind in a panel; if there are more, every k-th sample is drawn."""
 _RECEIVED: Final = Style("green", "^", "none")
 _LOST: Final = Style("lost", "x", "none")
 
@@ -27,20 +27,20 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         for role, job in times.jobs
         if job == step.prefixed_name(verb)
     }
-    complete = [log for log in logs.values() if log]
-    if len(complete) != 2:
+    complete_logs = [log for log in logs.values() if log]
+    if len(complete_logs) != 2:
         return
     publisher, _ = logs
-    sent, received = (log.samples for log in complete)
-    if not len(sent.sequence):
+    sent_samples, received_samples = (log.samples for log in complete_logs)
+    if not len(sent_samples.sequence):
         return
-    is_lost = ~np.isin(sent.sequence, received.sequence)
-    lost_s = (sent.at_ns[is_lost] - times.clock_offset_ns[publisher] - zero_ns) / 1e9
-    took_ms = (
-        received.at_ns - received.sent_ns
+    is_lost = ~np.isin(sent_samples.sequence, received_samples.sequence)
+    lost_s = (sent_samples.at_ns[is_lost] - times.clock_offset_ns[publisher] - zero_ns) / 1e9
+    delay_ms = (
+        received_samples.at_ns - received_samples.sent_ns
     ) / 1e6  # measured with two clocks, so only differences are meaningful
-    excess_ms = took_ms - took_ms.min(initial=math.inf) if len(took_ms) else took_ms
-    received_s = (received.sent_ns - times.clock_offset_ns[publisher] - zero_ns) / 1e9
+    excess_ms = delay_ms - delay_ms.min(initial=math.inf) if len(delay_ms) else delay_ms
+    received_s = (received_samples.sent_ns - times.clock_offset_ns[publisher] - zero_ns) / 1e9
     kinds = (
         ("sample received", _RECEIVED, received_s, excess_ms),
         ("sample lost", _LOST, lost_s, np.zeros(len(lost_s))),
@@ -54,6 +54,9 @@ def panels(step: Step, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: 
         x_label=TIME_LABEL,
         y_label="[ms]",
         series=series,
-        words=f"{len(sent.sequence)} samples sent, {int(is_lost.sum())} lost, {len(received.sequence)} received",
+        words=(
+            f"{len(sent_samples.sequence)} samples sent, {int(is_lost.sum())} lost, "
+            f"{len(received_samples.sequence)} received"
+        ),
         top=None if len(excess_ms) else 1.0,
     )

@@ -1,12 +1,12 @@
 """Samples of topics, read from logs that the agent writes on a robot and from captures, by the heads of samples.
 
-Logs (`fieldkit.agent.messaging.records`) are fixed-size records after a magic. A log whose writer was killed ends
-with zeros, because the file grows by blocks.
+Logs (`fieldkit.agent.messaging.records`) are fixed-size records after a magic number. If the writer of a log was
+killed, the log ends with zeros, because the file grows by blocks.
 
 The agent starts each sample with the empty layout of `std_msgs/UInt8MultiArray` and the length of its data, followed
-by the head (`fieldkit.agent.messaging.stream`): magic, sequence number and time of sending. The head is visible if
-that part of the packet was captured. This is always the case if a sample starts a packet, but may not be if TCP or a
-middleware put it after another sample. An image has the same head in its first pixels.
+by the head (`fieldkit.agent.messaging.stream`): magic number, sequence number and time of sending. The head is in a
+capture if that part of the packet was captured. This is always true for the first sample of a packet, but TCP or a
+middleware may put further samples behind it. An image has the same head in its first pixels.
 """
 
 import struct
@@ -35,7 +35,7 @@ _RECORD: Final = np.dtype(
 RECORD_BYTES: Final = _RECORD.itemsize
 
 _KINDS: Final = range(1, 11)
-_SAMPLE, BEGUN, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN, READ, UNREADABLE = _KINDS
+_SAMPLE, DISCOVERY_STARTED, MATCHED, REFUSED, SKIPPED, FOREIGN, _END, _ORIGIN, READ, UNREADABLE = _KINDS
 PUBLISHER: Final = 1
 SUBSCRIBER: Final = 2
 _HAS_CHECKSUM: Final = 1
@@ -51,7 +51,7 @@ class TopicSamples(Table):
         sequence: Sequence number, from 0.
         size_bytes: Serialized size.
         sent_ns: Time of sending by the sender's clock, stored in the sample, nanoseconds since 1970 UTC.
-        at_ns: Time at which the middleware accepted it, or at which it arrived, by the clock of the log's robot.
+        at_ns: Time at which the middleware accepted the sample, or at which it arrived, by the clock of the robot.
     """
 
     sequence: Ints
@@ -86,23 +86,23 @@ class TopicLog:
 
     Attributes:
         samples: Samples that the middleware accepted, or that arrived.
-        begun_ns: Time at which the middleware started discovery; None if it is not recorded.
+        discovery_start_ns: Time at which the middleware started discovery; None if it is not recorded.
         matched_ns: Time at which the other end was discovered; None if it was not discovered.
         refused: Number of samples that the middleware did not accept.
-        skipped: Number of samples whose time passed while an earlier one was being written.
+        skipped: Number of samples that were not sent, because writing an earlier one took too long.
         foreign: Number of received messages that are not samples of the stream.
         is_complete: True if the log has its end record.
         kinds: Number of records of each kind.
         times_ns: Time of every record in the order of the log, by the writer's clock.
         numbers: Sequence number of each sample that was passed to the middleware or arrived, including refused ones.
-        end: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without origin records.
+        role: `PUBLISHER` or `SUBSCRIBER`; None in a log of a version without origin records.
         topic_sum: CRC-32 of the topic's name; None in a log of a version without origin records.
         reads: Reads of the newest sample by the subscriber's program.
         unreadable: Number of received frames of a camera whose pixels have no number and time.
     """
 
     samples: TopicSamples
-    begun_ns: int | None
+    discovery_start_ns: int | None
     matched_ns: int | None
     refused: int
     skipped: int
@@ -111,7 +111,7 @@ class TopicLog:
     kinds: Mapping[int, int] = field(default_factory=dict)
     times_ns: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     numbers: Ints = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    end: int | None = None
+    role: int | None = None
     topic_sum: int | None = None
     reads: SampleReads = field(default_factory=no_reads)
     unreadable: int = 0
@@ -140,13 +140,13 @@ def read_log(path: Path) -> TopicLog:
         raise EvidenceError(
             "does not have the number of samples in its end record", where=str(path), remedy="repeat the measurement"
         )
-    started, matched, origin = by_kind[BEGUN], by_kind[MATCHED], by_kind[_ORIGIN]
+    started, matched, origin = by_kind[DISCOVERY_STARTED], by_kind[MATCHED], by_kind[_ORIGIN]
     if len(ends) and not _is_intact(content, ends[0], required=len(origin) > 0):
         raise EvidenceError("was changed: its checksum is wrong", where=str(path), remedy="repeat the measurement")
     offered = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]
     return TopicLog(
         samples=TopicSamples(*(samples[name].astype(np.int64) for name in ("sequence", "size", "sent_ns", "at_ns"))),
-        begun_ns=int(started["at_ns"][0]) if len(started) else None,
+        discovery_start_ns=int(started["at_ns"][0]) if len(started) else None,
         matched_ns=int(matched["at_ns"][0]) if len(matched) else None,
         refused=len(by_kind[REFUSED]),
         skipped=int(by_kind[SKIPPED]["sequence"].sum()),
@@ -155,21 +155,21 @@ def read_log(path: Path) -> TopicLog:
         kinds={kind: len(records_of_kind) for kind, records_of_kind in by_kind.items()},
         times_ns=records["at_ns"].astype(np.int64),
         numbers=offered["sequence"].astype(np.int64),
-        end=int(origin["sequence"][0]) if len(origin) else None,
+        role=int(origin["sequence"][0]) if len(origin) else None,
         topic_sum=int(origin["size"][0]) if len(origin) else None,
         reads=SampleReads(*(by_kind[READ][name].astype(np.int64) for name in ("sequence", "sent_ns", "at_ns"))),
         unreadable=len(by_kind[UNREADABLE]),
     )
 
 
-def _is_intact(content: bytes | mmap, end: np.void, *, required: bool) -> bool:
+def _is_intact(content: bytes | mmap, end_record: np.void, *, required: bool) -> bool:
     """Return True if the checksum in the end record is correct, or missing and not required."""
-    if end["sent_ns"] != _HAS_CHECKSUM:
+    if end_record["sent_ns"] != _HAS_CHECKSUM:
         return not required
-    record = end.tobytes()
+    record = end_record.tobytes()
     starts_at = content.rfind(record)
     without_checksum = record[:_SIZE_AT] + bytes(4) + record[_SIZE_AT + 4 :]
-    return zlib.crc32(without_checksum, zlib.crc32(memoryview(content)[:starts_at])) == int(end["size"])
+    return zlib.crc32(without_checksum, zlib.crc32(memoryview(content)[:starts_at])) == int(end_record["size"])
 
 
 _WORD_BYTES: Final = 8
@@ -203,20 +203,20 @@ def find_bytes(path: Path, pattern: bytes) -> Occurrences:
     data = reading.mapped(path)
     integers = Integers(data)
     reader = frame_reader(data)
-    parts, packets = [_no_occurrences()], 0
+    parts, packet_count = [_no_occurrences()], 0
     for chunk in reader(data, where=str(path), chunk_bytes=CHUNK_BYTES) if reader else ():
         ip = ip_headers(integers, chunk.frames, network(integers, chunk.frames))
         frames = chunk.frames.where(ip.frame)
         matches = _positions(data, frames, pattern)
         row = np.searchsorted(frames.start, matches, side="right") - 1
         ends = frames.start[row] + frames.captured_bytes[row]
-        inside = (matches >= ip.payload_at[row]) & (matches + len(pattern) + 2 * _WORD_BYTES <= ends)
-        inside &= ip.fragment_offset[row] == 0
-        matches, row = matches[inside], row[inside]
+        is_inside = (matches >= ip.payload_at[row]) & (matches + len(pattern) + 2 * _WORD_BYTES <= ends)
+        is_inside &= ip.fragment_offset[row] == 0
+        matches, row = matches[is_inside], row[is_inside]
         little, after = integers.with_order(LITTLE), matches + len(pattern)
         numbers = (little.u64(after + at).astype(np.int64) for at in (0, _WORD_BYTES))
-        parts.append(Occurrences(packets + row, matches - ip.payload_at[row], *numbers))
-        packets += len(frames)
+        parts.append(Occurrences(packet_count + row, matches - ip.payload_at[row], *numbers))
+        packet_count += len(frames)
     return Occurrences.concatenated(parts)
 
 
@@ -303,15 +303,12 @@ class SampleFlow:
 
 
 def find_heads(path: Path, size_bytes: int, width: int = 0) -> Occurrences:
-    """Return the heads of samples in a capture.
+    """Return the heads of samples in a capture; raises the errors of `find_bytes`.
 
     Args:
         path: The capture.
         size_bytes: Data bytes of a sample.
         width: Pixels per row of images; 0 if the samples are not images.
-
-    Raises:
-        EvidenceError: As for `find_bytes`.
     """
     return find_bytes(path, _before_head(size_bytes, width) + MAGIC)
 

@@ -33,57 +33,59 @@ def require_steady_clocks(flow: TopicTraffic, sender: Packets | None, receiver: 
         raise EvidenceError(delay.UNSTEADY)
 
 
-def delivery(sent: TopicLog | None, received: TopicLog | None, expected: FlowSchedule) -> Delivery:
+def delivery(publisher_log: TopicLog | None, subscriber_log: TopicLog | None, schedule: FlowSchedule) -> Delivery:
     """Return the deliveries of a topic.
 
     Args:
-        sent: Log of the publisher; None if it is incomplete.
-        received: Log of the subscriber; None if it is incomplete.
-        expected: Known properties of the stream.
+        publisher_log: Log of the publisher; None if it is incomplete.
+        subscriber_log: Log of the subscriber; None if it is incomplete.
+        schedule: Interval and duration of the stream.
 
     Raises:
         EvidenceError: The deliveries cannot be determined from the logs.
     """
-    if sent is None or received is None:
+    if publisher_log is None or subscriber_log is None:
         raise EvidenceError("there are no complete logs of both ends")
-    samples = sent.samples
+    samples = publisher_log.samples
     if not len(samples):
         raise EvidenceError("nothing was sent")
-    _, sent_index, received_index = np.intersect1d(samples.sequence, received.samples.sequence, return_indices=True)
-    at_ns = received.samples.at_ns[np.sort(received_index)]
+    _, sent_index, received_index = np.intersect1d(
+        samples.sequence, subscriber_log.samples.sequence, return_indices=True
+    )
+    at_ns = subscriber_log.samples.at_ns[np.sort(received_index)]
     if (np.diff(at_ns) < -deliveries.REORDERING_NS).any():
         raise EvidenceError("a sample is earlier than the one before it: a clock was set back")
-    pairs = StampPairs(samples.sent_ns[sent_index], received.samples.at_ns[received_index])
+    pairs = StampPairs(samples.sent_ns[sent_index], subscriber_log.samples.at_ns[received_index])
     first_ns, last_ns = int(samples.sent_ns.min()), int(samples.sent_ns.max())
-    return deliveries.stream_delivery(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, expected)
+    return deliveries.stream_delivery(np.sort(at_ns), (first_ns, first_ns, last_ns), pairs, schedule)
 
 
 def measure(
     flow: TopicTraffic,
     logs: tuple[TopicLog | None, TopicLog | None],
-    captured: tuple[Packets | None, Packets | None],
-    expected: FlowSchedule,
+    captures: tuple[Packets | None, Packets | None],
+    schedule: FlowSchedule,
 ) -> Measured:
     """Return the columns of the stalls of a topic.
 
     Args:
         flow: Identifies its packets.
         logs: Logs of publisher and subscriber as for `delivery`.
-        captured: Packets that their robots captured; None without a complete capture.
-        expected: Known properties of the stream.
+        captures: Packets that their robots captured; None without a complete capture.
+        schedule: Interval and duration of the stream.
     """
-    return stalls.measure("topic", lambda: read_deliveries(flow, logs, captured, expected))
+    return stalls.measure("topic", lambda: read_deliveries(flow, logs, captures, schedule))
 
 
 def read_deliveries(
     flow: TopicTraffic,
     logs: tuple[TopicLog | None, TopicLog | None],
-    captured: tuple[Packets | None, Packets | None],
-    expected: FlowSchedule,
+    captures: tuple[Packets | None, Packets | None],
+    schedule: FlowSchedule,
 ) -> list[Delivery]:
     """Return the deliveries of a topic.
 
-    Arguments as for `measure`; raises as `delivery` and `require_steady_clocks`.
+    The arguments are those of `measure`; the errors are those of `delivery` and `require_steady_clocks`.
     """
-    require_steady_clocks(flow, *captured)
-    return [delivery(*logs, expected)]
+    require_steady_clocks(flow, *captures)
+    return [delivery(*logs, schedule)]

@@ -9,7 +9,7 @@ from fieldkit.core import plugins
 from fieldkit.core.errors import ConfigurationError
 
 _PACKAGE: Final = "fieldkit"
-_OWN: Final = MappingProxyType(
+_BUILTIN_CLASSES: Final = MappingProxyType(
     {
         "capture": "CaptureStep",
         "transfer": "TransferStep",
@@ -29,15 +29,17 @@ _OWN: Final = MappingProxyType(
 this order."""
 
 
-def builtin() -> frozenset[str]:
+def builtin_names() -> frozenset[str]:
     """Return the names of the built-in kinds."""
-    return frozenset(_OWN)
+    return frozenset(_BUILTIN_CLASSES)
 
 
-def shipped() -> frozenset[str]:
+def shipped_names() -> frozenset[str]:
     """Return the names of the kinds that ship with fieldkit: built-in kinds, and kinds of its own entry points."""
     points = plugins.entry_points(plugins.STEPS)
-    return builtin() | {point.name for point in points if point.dist is not None and point.dist.name == _PACKAGE}
+    return builtin_names() | {
+        point.name for point in points if point.dist is not None and point.dist.name == _PACKAGE
+    }
 
 
 def find() -> Mapping[str, EntryPoint]:
@@ -46,7 +48,9 @@ def find() -> Mapping[str, EntryPoint]:
     Raises:
         ConfigurationError: The name of an entry point is already used.
     """
-    points = {kind: EntryPoint(kind, f"{__name__}.{kind}:{name}", plugins.STEPS) for kind, name in _OWN.items()}
+    points = {
+        kind: EntryPoint(kind, f"{__name__}.{kind}:{name}", plugins.STEPS) for kind, name in _BUILTIN_CLASSES.items()
+    }
     for point in plugins.entry_points(plugins.STEPS):
         if point.name in points:
             raise ConfigurationError(

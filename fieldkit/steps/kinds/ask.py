@@ -28,17 +28,17 @@ from fieldkit.steps.view import View
 _MAX_LETTERS: Final = 31
 
 
-def _can_be_chosen(word: str) -> str:
-    """Return a word after a check: a choice is not a number, a position in the list, or an answer for *unknown*."""
-    fits = 0 < len(word) <= _MAX_LETTERS and word.isprintable() and word == word.strip()
-    if not fits or word.isdigit() or word in {UNKNOWN, *MISSING}:
+def _checked_choice(word: str) -> str:
+    """Return a word after a check: a choice must not be a number or the answer that means *unknown*."""
+    has_valid_form = 0 < len(word) <= _MAX_LETTERS and word.isprintable() and word == word.strip()
+    if not has_valid_form or word.isdigit() or word in {UNKNOWN, *MISSING}:
         raise schema.validation_error(
             f"{word[:40]!r} cannot be a choice: write words of at most {_MAX_LETTERS} characters"
         )
     return word
 
 
-_Word = Annotated[str, AfterValidator(_can_be_chosen)]
+_Word = Annotated[str, AfterValidator(_checked_choice)]
 
 
 class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
@@ -80,8 +80,8 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         if self.choices and len(set(self.choices)) < len(self.choices):
             raise schema.validation_error("a choice is listed twice", "choices")
         if self.usual and self._full_question.read(self.usual) is None:
-            permitted = replace(self._full_question, usual="").answer_hint
-            raise schema.validation_error(f"usual is {self.usual!r}; permitted answers: {permitted}", "usual")
+            answers = replace(self._full_question, usual="").answer_hint
+            raise schema.validation_error(f"usual is {self.usual!r}; permitted answers: {answers}", "usual")
         return self
 
     @property
@@ -111,7 +111,7 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
             (scene.laptop_folder / self._file).write_text(f"{answer}\n", encoding="utf-8")
 
     def _earlier_answer(self, scene: Scene) -> str | None:
-        """Return the answer in an earlier attempt of the trial; None in the first attempt."""
+        """Return the answer in an earlier attempt of the trial; None if there is no earlier answer."""
         for path in sorted(scene.laptop_folder.parent.glob(f"*/{self._file}")) if scene.laptop_folder else ():
             with suppress(EvidenceError):
                 return _read(path, self._full_question)
@@ -158,14 +158,14 @@ class AskStep(Step, DescribesActions, AsksOperator, WritesOnLaptop, Summarizes):
         answer = view.evidence.read_or_none(_read, self._file, self._full_question)
         text = answer if answer != UNKNOWN else None
         value: Value | None = text if text is None or self.choices else float(text)
-        return Measured.from_optional({self.column: value}, "the operator did not know")
+        return Measured.from_optional({self.column: value}, "the operator answered: unknown")
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if self.column in values:
             value = values[self.column]
-            shown = value if isinstance(value, str) else f"{value:g}{f' {self.unit}' if self.unit else ''}"
-            yield f"{self.column} {shown}"
+            value_text = value if isinstance(value, str) else f"{value:g}{f' {self.unit}' if self.unit else ''}"
+            yield f"{self.column} {value_text}"
 
     @override
     def may_prompt(self) -> bool:

@@ -64,7 +64,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     """Runs tcpdump on each robot. It starts before the steps in `during` and ends after them.
 
     The filter accepts the ports of the steps inside, ICMP, and every later IP fragment between the robots of these
-    steps (a port filter matches first fragments only). The columns on losses and delays of a transfer are empty
+    steps (a port filter matches only first fragments). The columns on losses and delays of a transfer are empty
     unless the transfer is inside a capture on both of its robots. With a `ping` inside, after the transfer, the
     captures give the offset between the two clocks, which [one-way delay](method-delay.md#one-way-delay) needs: a UDP
     transfer has no answer, and the offset needs packets in both directions. Writes `ROLE.pcap` and
@@ -114,10 +114,13 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         for step in self._leaves():
             if isinstance(step, OverLink) and step.over != self.over:
-                used, captured = (
+                step_link, capture_link = (
                     f"link {link}" if link else "the radio under test" for link in (step.over, self.over)
                 )
-                return f"a {step.kind_name()} uses {used}, but the capture around it is on {captured}; see `over`"
+                return (
+                    f"a {step.kind_name()} uses {step_link}, but the capture around it is on {capture_link}; "
+                    "see `over`"
+                )
         return None
 
     @override
@@ -181,9 +184,9 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
             f"src host {scene.link(role, self.over).address} and dst host {group}" for group, role in sorted(groups)
         ]
         ports = dict.fromkeys(port for port in (*(flow.port for flow in flows), self.port) if port is not None)
-        kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
-        among = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
-        return f"{among} and ({kinds})"
+        packet_kinds = " or ".join((*(f"port {port}" for port in ports), "icmp", "ip[6:2] & 0x1fff != 0"))
+        host_filter = hosts[0] if len(hosts) == 1 else f"({' or '.join(f'({pair})' for pair in hosts)})"
+        return f"{host_filter} and ({packet_kinds})"
 
     @override
     def needs(self, scene: Scene) -> Iterator[Need]:
@@ -218,10 +221,10 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         captures = [self._planned(scene, role) for role in self.robots]
         first, *others = (entry.step for entry in self.during)
-        prepared: list[Callable[[Announce], None]] = []
+        first_actions: list[Callable[[Announce], None]] = []
 
         def prepare() -> None:
-            prepared.append(base.prepare(first, scene, testbed))
+            first_actions.append(base.prepare(first, scene, testbed))
 
         starts: list[Callable[[], None]] = [
             partial(jobs.start, testbed.shells[capture.role], capture.job) for capture in captures
@@ -232,12 +235,12 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
         try:
             for calls in rounds:
                 run_parallel(lambda call: call(), calls)
-            for carry_out in prepared:
-                carry_out(announce)
+            for run_first in first_actions:
+                run_first(announce)
             for step in others:
                 step.run(scene, testbed, announce)
         except FieldkitError:
-            # The captures are kept with the failed attempt. The first error is the reason of the failure.
+            # The captures are kept with the failed attempt. The first error is the cause of the failure.
             with suppress(FieldkitError):
                 self._stop(scene, testbed, captures)
             raise
@@ -282,7 +285,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
                 role_columns = [column for column in self.columns if column.name.startswith(f"{role}_")]
                 measured |= Measured.all_missing(role_columns, f"the {role} does not capture")
                 continue
-            capture = view.evidence.whole_capture(self._file(role))
+            capture = view.evidence.undamaged_capture(self._file(role))
             log = view.evidence.read_or_none(tcpdump_log.read, self._log(role))
             values = {
                 f"{role}_captured": capture.frames if capture else None,
@@ -309,17 +312,17 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
         yield "tcpdump ended without its counters"
         return
     if needs_all and (log.dropped_by_kernel or log.dropped_by_interface):
-        yield f"dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
+        yield f"its kernel dropped {log.dropped_by_kernel} packets, its interface {log.dropped_by_interface}"
     # The filter may have matched more packets than were written: see `CaptureLog.received_by_filter`.
     if log.received_by_filter is not None and log.received_by_filter < log.captured:
-        yield f"{log.received_by_filter} packets matched, {log.captured} were written"
+        yield f"{log.received_by_filter} packets matched, but {log.captured} were written"
     if capture.damage is not None:
         yield capture.damage
     elif capture.frames != log.captured:
-        yield f"the file has {capture.frames} packets, tcpdump counted {log.captured}"
+        yield f"the file has {capture.frames} packets, but tcpdump counted {log.captured}"
     else:
-        if altered := altered_packets.header_problem(capture.packets):
-            yield altered
+        if problem := altered_packets.header_problem(capture.packets):
+            yield problem
         yield from _time_problems(role, capture, view)
 
 
@@ -343,7 +346,7 @@ def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
 
 
 def _judge(profile: RobotProfile, answer: CommandResult) -> tuple[Verdict, str, str]:
-    """Return verdict, detail and remedy on the permission of a robot's user to capture."""
+    """Return verdict, detail and remedy for the permission of a robot's user to capture."""
     names = profile.tools
     if answer.ok:
         return Verdict.OK, "by sudo -n" if names.capture_right == "sudo" else "permission of the user", ""

@@ -1,4 +1,4 @@
-"""Cause a fault of a robot, and measure from outside the time for which the robot does not answer."""
+"""Cause a fault of a robot, and measure the time for which the robot does not answer."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -29,7 +29,7 @@ from fieldkit.remote import jobs
 from fieldkit.steps import across, clocks
 from fieldkit.steps.base import StepEntry
 from fieldkit.steps.capabilities import AsksOperator, DescribesActions, Restarts, Summarizes
-from fieldkit.steps.kinds.observer import RECOVERED_S, Observer, observed_from
+from fieldkit.steps.kinds.observer import RECOVERED_S, Observer, observer_role
 from fieldkit.steps.nest import Nest, end_inside
 from fieldkit.steps.scene import Announce, Planned, Scene
 from fieldkit.steps.view import View
@@ -53,12 +53,13 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     asked to cause it; with `--yes` no operator is asked, and the attempts are void.
 
     - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
-    - `out-of-range`: no other robot receives the robot for `for`. If it is the relay, no robot receives any other.
+    - `out-of-range`: no other robot receives packets of the robot for `for`. If it is the relay, no robot receives
+      packets of any other.
     - `reboot`: every process ends at the same moment, data in memory is lost, and the robot boots.
     - `kill`: every process named `process` ends at the same moment.
 
-    An observer records when the robot answers. It starts before the fault, and ends when the robot has answered for a
-    second again. It sends a ping every 100 ms from the other end of the pair (200 ms if an old iputils requires it),
+    An observer records when the robot answers. It starts before the fault, and ends when the robot has answered again
+    for a second. It sends a ping every 100 ms from the other end of the pair (200 ms if an old iputils requires it),
     or for `kill` polls the robot's processes. Writes `fault-KIND-ping.txt` or `fault-kill-watch.txt`,
     `fault-KIND.txt` (duration of the cause and its interval) and `fault-KIND-times.txt` (its start and end, see
     [recovery](method-delay.md#recovery)).
@@ -71,8 +72,8 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             for the others.
         link: Link that is down, by its name in [the profile](links.md); only for `link-down`. Without it, the radio
             under test.
-        after: How long the steps inside run before the fault.
-        limit: Maximum time until the robot answers again after the cause is over.
+        after: Time for which the steps inside run before the fault.
+        limit: Maximum time between the end of the cause and the recovery of the robot.
         during: Steps during which the fault occurs.
     """
 
@@ -104,7 +105,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     during: tuple[StepEntry, ...] = ()
 
     @schema.model_validator(mode="after")
-    def _fits_its_kind(self) -> "FaultStep":
+    def _has_the_keys_of_its_kind(self) -> "FaultStep":
         for key, is_given, is_required in (
             ("for", self.lasts is not None, self.kind in _LASTING),
             ("process", self.process is not None, self.kind is FaultKind.KILL),
@@ -117,7 +118,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @property
     def cause(self) -> model.Fault:
-        """The fault, as passed to the testbed."""
+        """The fault in the form for the testbed."""
         return model.Fault(self.kind, self.robot, self.lasts or 0.0, self.process or "", self.link)
 
     @override
@@ -128,10 +129,11 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @override
     def dry_run_notes(self, scene: Scene) -> Iterator[str]:
-        lasts = f" for {self.lasts:g} s" if self.lasts else ""
-        what = f" of the process {self.process}" if self.process else ""
-        over = f" of link {self.link}" if self.link else ""
-        yield f"{self.kind}{what}{over} of {scene.robot(self.robot).name}{lasts}, after {self.after:g} s"
+        duration_text = f" for {self.lasts:g} s" if self.lasts else ""
+        process_text = f" of the process {self.process}" if self.process else ""
+        link_text = f" of link {self.link}" if self.link else ""
+        target = f"{process_text}{link_text} of {scene.robot(self.robot).name}"
+        yield f"{self.kind}{target}{duration_text}, after {self.after:g} s"
 
     def _observer(self, scene: Scene) -> Observer:
         return Observer(scene, self.cause, self.prefix)
@@ -149,22 +151,22 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         announce(f"watch {scene.robot(self.robot).name}", None)
         jobs.start(shell, watch.job)
         clock_offsets = {} if scene.laptop_folder is None else self._clocks(testbed)
-        inner = replace(scene, halt=scene.halt.child())
+        inner_scene = replace(scene, halt=scene.halt.child())
         pool = ThreadPoolExecutor(max_workers=1)
-        steps = pool.submit(self._run_inside, inner, testbed, announce)
+        steps = pool.submit(self._run_inside, inner_scene, testbed, announce)
         try:
-            self._lead_in(steps)
+            self._run_before_fault(steps)
             announce(f"{self.kind} of {scene.robot(self.robot).name}", self.lasts)
-            asked_ns = time.time_ns()
-            lasted_s = testbed.inject(self.cause)
-            self._note_times(scene, asked_ns, lasted_s, clock_offsets)
+            request_ns = time.time_ns()
+            duration_s = testbed.inject(self.cause)
+            self._record_times(scene, request_ns, duration_s, clock_offsets)
             announce("recovery", None)
-            recovery = observer.await_recovery("unknown" if lasted_s is None else f"{lasted_s:.3f}", self.limit)
+            recovery = observer.await_recovery("unknown" if duration_s is None else f"{duration_s:.3f}", self.limit)
             jobs.run(shell, recovery.job)  # `measure` evaluates whether the robot recovered
             jobs.stop(shell, watch.job)
             self._wait_for_steps(steps, scene, testbed)
         except Exception as error:
-            inner.halt.set()
+            inner_scene.halt.set()
             with suppress(FieldkitError):
                 end_inside(self, scene, testbed)
             wait([steps])
@@ -173,7 +175,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
                 raise mistake from error
             raise
         finally:
-            inner.halt.set()
+            inner_scene.halt.set()
             pool.shutdown(wait=False)  # after Ctrl-C the signal handler stops the jobs for which the steps wait
 
     def _clocks(self, testbed: Testbed) -> dict[Role, Offset]:
@@ -195,16 +197,16 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             if clock_offset is not None
         }
 
-    def _note_times(
-        self, scene: Scene, asked_ns: int, lasted_s: float | None, clock_offsets: Mapping[Role, Offset]
+    def _record_times(
+        self, scene: Scene, request_ns: int, duration_s: float | None, clock_offsets: Mapping[Role, Offset]
     ) -> None:
-        """Record the times of the fault by the laptop's clock, when its cause is over."""
+        """Record the times of the fault by the laptop's clock; called when the cause has ended."""
         if scene.laptop_folder is None:
             return
         now_ns = time.time_ns()
-        # A lasting fault started `lasted_s` ago; a reboot or a kill lasts from the request until now.
-        began_ns = now_ns - round(1e9 * lasted_s) if lasted_s else asked_ns
-        times = FaultTimes(began_ns, None if lasted_s is None else now_ns, clock_offsets)
+        # A fault with a duration started `duration_s` ago; a reboot or a kill lasts from the request until now.
+        start_ns = now_ns - round(1e9 * duration_s) if duration_s else request_ns
+        times = FaultTimes(start_ns, None if duration_s is None else now_ns, clock_offsets)
         path = scene.laptop_folder / self.prefixed_name(recoveries.fault_times_file(self.kind))
         path.write_text(recoveries.fault_times_text(times), encoding="ascii")
 
@@ -219,8 +221,8 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             if not scene.halt.is_set:
                 entry.step.run(scene, testbed, announce)
 
-    def _lead_in(self, steps: "Future[None]") -> None:
-        """Let the steps inside run before the fault. An error in this time is not due to the fault and is raised."""
+    def _run_before_fault(self, steps: "Future[None]") -> None:
+        """Run the steps inside before the fault. An error in this time is not caused by the fault and is raised."""
         from concurrent.futures import wait  # noqa: PLC0415 (as above)
 
         until = Deadline.after(self.after)
@@ -229,7 +231,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
             time.sleep(until.remaining_s)
 
     def _wait_for_steps(self, steps: "Future[None]", scene: Scene, testbed: Testbed) -> None:
-        """Wait for the steps inside; if the fault made them fail, stop their jobs."""
+        """Wait for the steps inside; if they failed because of the fault, stop their jobs."""
         try:
             steps.result()
         except (RobotError, LinkError) as error:
@@ -239,7 +241,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @override
     def roles(self) -> frozenset[Role]:
-        return frozenset({self.robot, observed_from(self.cause)}) | self.roles_inside()
+        return frozenset({self.robot, observer_role(self.cause)}) | self.roles_inside()
 
     @override
     def may_prompt(self) -> bool:
@@ -269,7 +271,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of this kind of fault, and of the recoveries of the flows inside."""
-        return (*outage_columns.declared(self.kind), *across.declared(self))
+        return (*outage_columns.fault_columns(self.kind), *across.recovery_columns(self))
 
     @override
     def measure(self, view: View) -> Measured:
@@ -280,8 +282,8 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         outage_s, recovered = (values.get(fault_column_name(self.kind, what)) for what in ("outage_s", "recovered"))
         if recovered is not None:
-            gone = f"gone for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not come back"
-            yield f"{self.kind}: {gone}"
+            result = f"no answer for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not recover"
+            yield f"{self.kind}: {result}"
 
     @override
     def expected_s(self, protocol: Protocol) -> float:

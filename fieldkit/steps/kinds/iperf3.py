@@ -48,13 +48,13 @@ _STALLS: Final = stalls.declare_columns("iperf3", "iperf3", 67)
 class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraffic, Summarizes):
     """Measures with iperf3. Both robots need iperf3 3.1 or later: `sudo apt-get install iperf3`.
 
-    The server ends with the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
+    The server exits after the test. Writes `ROLE-iperf3.json`, the reports of both ends second by second. Inside a
     `capture`, figures of the same packets are also computed from the captures: [columns](method-loss.md#iperf3),
     [stalls](method-delay.md#stalls-of-a-flow).
 
     Attributes:
-        duration: How long it sends, in whole seconds; 10 s without `size`.
-        size: How much it sends, `10MB`, instead of `duration`.
+        duration: Duration of the test in whole seconds; 10 s without `size`.
+        size: Amount of data to send, `10MB`, instead of `duration`.
         reverse: Whether the server sends and the client receives.
         limit: A test that takes longer is stopped, and the repeat is void. With `along` it is added to the duration.
     """
@@ -107,8 +107,8 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        until = ("-t", f"{self._duration_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
-        client = self.client(scene, *until, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
+        end_options = ("-t", f"{self._duration_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
+        client = self.client(scene, *end_options, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
         yield self._planned(scene, self.receiver, "server", self.server("-i", "1", "--json"))
         yield self._planned(scene, self.sender, "client", client)
 
@@ -151,9 +151,11 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             jobs.stop(server_shell, server.job)
         for planned, exit_code in ((client, code), (server, server_code)):
             if exit_code != 0:
-                how = "did not exit" if exit_code == jobs.STILL_RUNNING else f"ended with exit code {exit_code}"
+                ending_text = (
+                    "did not exit" if exit_code == jobs.STILL_RUNNING else f"ended with exit code {exit_code}"
+                )
                 raise RobotError(
-                    f"{planned.job.name} {how}",
+                    f"{planned.job.name} {ending_text}",
                     where=scene.robot(planned.role).name,
                     remedy=f"see {planned.job.stdout} and {planned.job.log} of this repeat",
                 )
@@ -211,19 +213,19 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
             else:
                 tests[role] = test
                 reasons = iperf3_checks.check_one_end(test, sends=role == self.source)
-                yield from (f"{file}: {why}" for why in reasons)
-                if why := iperf3_checks.date_problem(test, view.attempt_window(role)):
-                    yield f"{file}: {why}"
+                yield from (f"{file}: {reason}" for reason in reasons)
+                if reason := iperf3_checks.date_problem(test, view.attempt_window(role)):
+                    yield f"{file}: {reason}"
         if len(tests) > 1:
             yield from self._contradictions(view, tests)
 
     def _contradictions(self, view: View, tests: Mapping[Role, IperfTest]) -> Iterator[str]:
         """Yield the contradictions between both JSON reports, the procedure, captures and interface counters."""
-        protocol = self.carried_by(view.scene.protocol)
+        protocol = self.transport_protocol(view.scene.protocol)
         duration_s = self._duration_s if self.size is None else None
         settings = IperfSettings(protocol, self.streams, self.payload_bytes, self.reverse, duration_s)
         yield from iperf3_checks.compare_ends(tests[self.sender], tests[self.receiver], settings)
-        sent, received = tests[self.source], tests[self.destination]
+        source_test, destination_test = tests[self.source], tests[self.destination]
         source_capture, destination_capture = (view.capture(role) for role in (self.source, self.destination))
         if source_capture is not None and destination_capture is not None:
             load_evidence = LoadEvidence(
@@ -234,33 +236,34 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
                 sender_counters=view.evidence.counters(self.source),
                 receiver_counters=view.evidence.counters(self.destination),
             )
-            yield from load_checks.find(self._flow(view, sent, received), sent, received, load_evidence)
+            flow = self._flow(view, source_test, destination_test)
+            yield from load_checks.find_contradictions(flow, source_test, destination_test, load_evidence)
         interface = view.scene.link(self.destination, self.over).interface
         interface_bytes = view.evidence.interface_bytes(self.destination, interface)
-        payload_bytes = sum(interval.payload_bytes for interval in received.intervals)
+        payload_bytes = sum(interval.payload_bytes for interval in destination_test.intervals)
         if interface_bytes is not None and payload_bytes > interface_bytes:
-            what = f"iperf3 received {payload_bytes} bytes, but the interface of the {self.destination} only"
-            yield f"{what} {interface_bytes} in the whole attempt"
+            received_text = f"iperf3 received {payload_bytes} bytes, but the interface of the {self.destination}"
+            yield f"{received_text} only {interface_bytes} in the whole attempt"
 
-    def _flow(self, view: View, sent: IperfTest | None, received: IperfTest | None) -> LoadFlow:
+    def _flow(self, view: View, source_test: IperfTest | None, destination_test: IperfTest | None) -> LoadFlow:
         return LoadFlow(
-            protocol=self.carried_by(view.scene.protocol),
+            protocol=self.transport_protocol(view.scene.protocol),
             source_address=view.scene.link(self.source, self.over).address,
             destination_address=view.scene.link(self.destination, self.over).address,
-            ports=sent.ports if sent else (),
+            ports=source_test.ports if source_test else (),
             payload_bytes=self.payload_bytes,
-            window_s=received.window_s if received else (0.0, 0.0),
+            window_s=destination_test.window_s if destination_test else (0.0, 0.0),
         )
 
     @override
     def measure(self, view: View) -> Measured:
-        protocol = self.carried_by(view.scene.protocol)
-        sent, received = (self._report(view, role) for role in (self.source, self.destination))
-        flow = self._flow(view, sent, received)
+        protocol = self.transport_protocol(view.scene.protocol)
+        source_test, destination_test = (self._report(view, role) for role in (self.source, self.destination))
+        flow = self._flow(view, source_test, destination_test)
         packets = self._packets(view)
         data = self._data_streams(view)
         return (
-            iperf3.measure(protocol, sent, received)
+            iperf3.measure(protocol, source_test, destination_test)
             | iperf3_load.measure_totals(flow, *packets)
             | iperf3_load.measure_jitter(data, *packets)
             | iperf3_load.measure_stalls("iperf3", data, *packets)
@@ -276,16 +279,16 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
         return source.packets if source else None, destination.packets if destination else None
 
     def _data_streams(self, view: View) -> LoadStreams:
-        sent, received = (self._report(view, role) for role in (self.source, self.destination))
-        swapped = tuple((remote, local) for local, remote in received.ports) if received else ()
-        ports = sent.ports if sent else swapped
+        source_test, destination_test = (self._report(view, role) for role in (self.source, self.destination))
+        swapped_ports = tuple((remote, local) for local, remote in destination_test.ports) if destination_test else ()
+        ports = source_test.ports if source_test else swapped_ports
         job = self.prefixed_name(f"iperf3-{'client' if self.reverse else 'server'}")
         return self.data_streams(
             view.scene,
             reverse=self.reverse,
             ports=ports,
-            lasts_s=self._duration_s if self.size is None else None,
-            until_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
+            duration_s=self._duration_s if self.size is None else None,
+            receiver_end_ns=robot_clock.job_end_ns(view.evidence, self.destination, job),
         )
 
     def _report(self, view: View, role: Role) -> IperfTest | None:

@@ -12,7 +12,7 @@ from fieldkit.steps.scene import BY_EXIT_OR_LIMIT, BY_FIELDKIT, Planned, Scene
 from fieldkit.steps.variants import PingTool, Tool
 
 RECOVERED_S: Final = 1.0
-"""A robot has recovered when it has given as many answers as it normally gives in this time."""
+"""A robot has recovered when it has sent as many answers as it normally sends in this time."""
 
 _INTERVAL_S: Final = 0.1
 
@@ -32,7 +32,7 @@ _WAIT_FOR_RECOVERY: Final = (
 )
 
 
-def observed_from(fault: Fault) -> Role:
+def observer_role(fault: Fault) -> Role:
     """Return the role of the observing robot: the other end of the pair, or the robot itself for `kill`."""
     if fault.kind is FaultKind.KILL:
         return fault.role
@@ -41,7 +41,7 @@ def observed_from(fault: Fault) -> Role:
 
 @dataclass(frozen=True)
 class Observer:
-    """Records when a robot answers: pings it from the other end, or polls its process on the robot itself.
+    """Records when a robot answers, by pings from the other end, or by polls of its process on the robot itself.
 
     Attributes:
         scene: The attempt.
@@ -56,7 +56,7 @@ class Observer:
     @property
     def role(self) -> Role:
         """Role of the observing robot."""
-        return observed_from(self.fault)
+        return observer_role(self.fault)
 
     def watch(self, limit_s: float) -> Planned:
         """Return the job that observes until it is stopped; it is ready when the robot has answered."""
@@ -66,9 +66,11 @@ class Observer:
         else:
             link = self.fault.link
             # Another link of a robot also answers for the address of this link, unless the interface is given.
-            bound = ("-I", self.scene.link(self.role, link).interface) if self.scene.robot(self.role).links else ()
+            interface_options = (
+                ("-I", self.scene.link(self.role, link).interface) if self.scene.robot(self.role).links else ()
+            )
             address = self.scene.link(self.fault.role, link).address
-            argv = ping.command_line(self.scene, self.role, (*bound, "-i", interval), address)
+            argv = ping.command_line(self.scene, self.role, (*interface_options, "-i", interval), address)
         job = Job(
             folder=self.scene.folder,
             name=step_prefixed(self.name, f"fault-{self.fault.kind}"),
@@ -119,5 +121,5 @@ class Observer:
     def _interval_s(self) -> float:
         """Time between two requests; old iputils allow less than 200 ms only for root."""
         tools = self.scene.tools(self.role)
-        slow = not self._is_kill and tools.ping is PingTool.IPUTILS_OLD and not tools.root
-        return ping.OLD_INTERVAL_S if slow else _INTERVAL_S
+        is_slow = not self._is_kill and tools.ping is PingTool.IPUTILS_OLD and not tools.root
+        return ping.OLD_INTERVAL_S if is_slow else _INTERVAL_S

@@ -42,8 +42,8 @@ Payload = Annotated[Int, Field(ge=0, le=65507)]
 def command_line(scene: Scene, role: Role, options: Iterable[str], address: str) -> tuple[str, ...]:
     """Return the ping command of a robot, with output that can be parsed: addresses, time stamps, in English."""
     # busybox has no time stamps and never resolves names.
-    stamps = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
-    return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamps, *options, address)
+    stamp_options = () if scene.tools(role).ping is PingTool.BUSYBOX else ("-n", "-D")
+    return ("env", "LC_ALL=C", scene.robot(role).profile.tools.ping, *stamp_options, *options, address)
 
 
 class Payloads(Strict):
@@ -60,7 +60,7 @@ class Payloads(Strict):
     @schema.model_validator(mode="before")
     @classmethod
     def _expand_number(cls, data: object) -> object:
-        """Accept a single number for both."""
+        """Accept a single number for both protocols."""
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
@@ -181,12 +181,13 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             yield f"{self._file} is missing"
             return
         if result.transmitted is None:
-            yield f"{self._file}: ping was stopped early, its summary is missing"
+            yield f"{self._file}: ping was stopped early; its summary is missing"
         elif result.transmitted < self.count:
             yield f"{self._file}: ping sent {result.transmitted} of {self.count} requests"
         payload_bytes, window = self.payload_of(view.scene.protocol), view.attempt_window(self.sender)
         yield from (
-            f"{self._file}: {why}" for why in ping_checks.check_output(result, self.count, payload_bytes, window)
+            f"{self._file}: {reason}"
+            for reason in ping_checks.check_output(result, self.count, payload_bytes, window)
         )
         if result.received is not None and result.received != len(result.answers):
             yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
@@ -194,17 +195,25 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
         if 0.0 in result.rtt_s:
             yield f"{self._file} has a round-trip time of 0: the clock was set back while ping waited"
         roles = (self.sender, self.receiver)
-        uncaptured = [why for role in roles if view.captured(role) for why in self._uncaptured(result, role, view)]
-        yield from uncaptured or self._contradictions(result, view)
+        missing_packets = [
+            reason
+            for role in roles
+            if view.has_captures(role)
+            for reason in self._packets_missing_in_capture(result, role, view)
+        ]
+        yield from missing_packets or self._contradictions(result, view)
         # If the captures lack packets of this ping, the origin of other packets cannot be determined.
-        if not uncaptured and view.captured(*roles) and (earlier := self._earlier_packets(view)):
-            what = f"{format_count(earlier, 'packet')} of a ping that sent no request in this attempt arrived"
-            yield f"packets of an earlier attempt were still in transit: {what}"
+        if not missing_packets and view.has_captures(*roles) and (earlier_count := self._earlier_packets(view)):
+            packets_text = format_count(earlier_count, "packet")
+            yield (
+                f"packets of an earlier attempt were still in transit: {packets_text} of a ping that sent no request "
+                "in this attempt arrived"
+            )
 
     def _contradictions(self, result: Ping, view: View) -> Iterator[str]:
         """Yield the contradictions with each capture.
 
-        If several pings ran, the one with the fewest contradictions is assumed to be this one.
+        If several pings ran, the ping with the fewest contradictions is assumed to be this one.
         """
         source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
         for role in (self.sender, self.receiver):
@@ -217,13 +226,13 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
                 list(ping_checks.compare_with_capture(result, candidate, self.interval, role, is_requester=on_sender))
                 for candidate in candidates
             ]
-            yield from (f"{self._file}: {why}" for why in min(reasons, key=len, default=[]))
+            yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
 
-    def _uncaptured(self, result: Ping, role: Role, view: View) -> Iterator[str]:
+    def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
 
         The capture may contain other pings, with other identifiers or sizes. The number of packets is compared with
-        the identifier that has the most packets, so that the check holds for any of them.
+        the identifier that has the most packets, so that the check is valid for any of them.
         """
         capture = view.capture(role)
         if capture is None:
@@ -235,31 +244,34 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             (len(result.replies), "answer", _max_count(echoes.icmp(destination, source))),
             (len(result.answers), "answered request", _max_count(echoes.icmp(source, destination))),
         )
-        for printed, what, captured in counts:
-            if printed > captured:
-                yield f"{self._file} has {format_count(printed, what)}, but the {role}'s capture has only {captured}"
+        for printed_count, kind, captured_count in counts:
+            if printed_count > captured_count:
+                printed_text = format_count(printed_count, kind)
+                yield f"{self._file} has {printed_text}, but the {role}'s capture has only {captured_count}"
                 return
 
     def _earlier_packets(self, view: View) -> int:
         """Return the number of received packets of pings that sent no request during the captures.
 
-        Packets of another ping of this attempt do not count, since its requests were captured. Fragments without
+        Packets of another ping of this attempt do not count, because its requests were captured. Fragments without
         their first fragment count only if they belong to requests, because the captures end after the ping.
         """
         sender, receiver = (view.capture(role) for role in (self.sender, self.receiver))
         if sender is None or receiver is None:
             return 0
         source, destination = (view.scene.link(role, self.over).address for role in (self.sender, self.receiver))
-        sent, received = (capture.packets.icmp(source, destination) for capture in (sender, receiver))
-        returned = sender.packets.icmp(destination, source)
-        is_request = (received.echo != NO_ECHO) & (received.echo < ECHO_REPLY)
-        was_sent = np.isin(received.echo, sent.echo)
-        earlier = int((is_request & ~was_sent).sum())
-        earlier += int(((returned.echo >= ECHO_REPLY) & ~np.isin(returned.echo - ECHO_REPLY, sent.echo)).sum())
+        requests, arrivals = (capture.packets.icmp(source, destination) for capture in (sender, receiver))
+        replies = sender.packets.icmp(destination, source)
+        is_request = (arrivals.echo != NO_ECHO) & (arrivals.echo < ECHO_REPLY)
+        was_sent = np.isin(arrivals.echo, requests.echo)
+        earlier_count = int((is_request & ~was_sent).sum())
+        is_earlier_reply = (replies.echo >= ECHO_REPLY) & ~np.isin(replies.echo - ECHO_REPLY, requests.echo)
+        earlier_count += int(is_earlier_reply.sum())
         # Fragments are identified by their IP ids, unless a router has changed these.
-        if np.isin(received.ip_id[is_request & was_sent], sent.ip_id).all():
-            earlier += int(((received.fragment_offset > 0) & ~np.isin(received.ip_id, sent.ip_id)).sum())
-        return earlier
+        if np.isin(arrivals.ip_id[is_request & was_sent], requests.ip_id).all():
+            is_earlier_fragment = (arrivals.fragment_offset > 0) & ~np.isin(arrivals.ip_id, requests.ip_id)
+            earlier_count += int(is_earlier_fragment.sum())
+        return earlier_count
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
@@ -272,7 +284,7 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
     @override
     def measure(self, view: View) -> Measured:
         result = view.evidence.read_or_none(ping.read, self._file)
-        replied_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
+        reply_times_ns = [at_ns for reply in result.answers if (at_ns := reply.at_utc_ns)] if result else []
         ends = self.sender, self.receiver
         gap = Measured()
         if self.gap:
@@ -282,7 +294,7 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
         return (
             ping.measure(result)
             | gap
-            | position_columns.measure(view.evidence, ping.MOTION_COLUMNS, ends, replied_ns)
+            | position_columns.measure(view.evidence, ping.MOTION_COLUMNS, ends, reply_times_ns)
         )
 
     @override

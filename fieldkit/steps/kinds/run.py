@@ -30,15 +30,15 @@ _SHELL_OPERATORS: Final = frozenset({"|", "||", "&", "&&", ";", "<", ">", ">>", 
 _Word = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 
 
-def _is_path(text: str) -> str:
-    if why := program_output.path_error(text):
-        raise schema.validation_error(f"{text!r} is not a valid JMESPath: {why}")
+def _checked_path(text: str) -> str:
+    if reason := program_output.path_error(text):
+        raise schema.validation_error(f"{text!r} is not a valid JMESPath: {reason}")
     return text
 
 
-def _is_expression(text: str) -> str:
-    if why := program_output.expression_error(text):
-        raise schema.validation_error(f"{text!r} is not a regular expression (RE2) with one group: {why}")
+def _checked_expression(text: str) -> str:
+    if reason := program_output.expression_error(text):
+        raise schema.validation_error(f"{text!r} is not a regular expression (RE2) with one group: {reason}")
     return text
 
 
@@ -70,8 +70,8 @@ class PrintedColumn(Strict):
         ),
     ]
     meaning: Annotated[str, Field(max_length=300)] = ""
-    path: Annotated[str, AfterValidator(_is_path)] | None = Field(default=None, alias="json")
-    expression: Annotated[str, AfterValidator(_is_expression)] | None = Field(default=None, alias="regex")
+    path: Annotated[str, AfterValidator(_checked_path)] | None = Field(default=None, alias="json")
+    expression: Annotated[str, AfterValidator(_checked_expression)] | None = Field(default=None, alias="regex")
     optional: Bool = False
     label: Annotated[str, Field(max_length=40)] = ""
 
@@ -85,7 +85,7 @@ class PrintedColumn(Strict):
     def column(self) -> Column:
         """The column as it is declared."""
         source = f"at {self.path} in the JSON output" if self.path else "by a regular expression in the output"
-        column = Column(self.name, self.unit, self.meaning or f"Found {source} of a program.")
+        column = Column(self.name, self.unit, self.meaning or f"Value {source} of a program.")
         kind = {bool: Kind.FLAG, str: Kind.WORDS}.get(column.type, Kind.MEDIAN)
         return replace(column, figure=Figure(self.label or self.name, kind))
 
@@ -114,7 +114,7 @@ class Bounds(Strict):
     max: Number | Int | None = None
 
     def problem(self, value: Value) -> str | None:
-        """Return the reason why a value is out of bounds; None if it is within."""
+        """Return the reason why a value is out of bounds; None if it is within bounds."""
         if isinstance(value, str):
             return None
         if self.min is not None and value < self.min:
@@ -123,7 +123,7 @@ class Bounds(Strict):
 
 
 class Expected(Strict):
-    """Conditions on exit code and values. If one of them is not met, the repeat is void.
+    """Conditions for exit code and values. If one of them is not met, the repeat is void.
 
     Attributes:
         code: Permitted exit codes, 0 to 125.
@@ -155,7 +155,7 @@ class RunStep(Step, UsesSpace, Summarizes):
             to the folder of the procedure or, if it does not exist there, of the lab; links must not point outside.
             `{put}` is its path on the robot. In `trial.yaml` it is a mapping with the keys below; in a procedure it
             is a path.
-        takes: Approximate duration, for the estimate of the time left.
+        takes: Approximate duration, for the estimate of the remaining time.
         limit: A program that runs longer is stopped, and the repeat is void.
         output: File for its standard output.
         prints: Approximate size of the output, for the estimate of disk space.
@@ -198,20 +198,20 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     def _check_variables(self) -> None:
         for index, word in enumerate(self.words):
-            if why := arguments.problem(word, has_program=self.put is not None):
-                raise schema.validation_error(why, *(("argv", index) if self.argv else ("command",)))
+            if reason := arguments.problem(word, has_program=self.put is not None):
+                raise schema.validation_error(reason, *(("argv", index) if self.argv else ("command",)))
         program = self.words[0]
         if arguments.depends_on_repeat(program):
-            why = f"the name of the program must not depend on a variable, but {program} does; use an argument"
-            raise schema.validation_error(why, "argv" if self.argv else "command")
+            reason = f"the name of the program must not depend on a variable, but {program} does; use an argument"
+            raise schema.validation_error(reason, "argv" if self.argv else "command")
         if self.put is None:
             return
         if not any(arguments.PUT in arguments.names(word) for word in self.words):
-            why = f"the command does not run {self.put.name}: write {{put}} in the command for its path"
-            raise schema.validation_error(why, "put")
+            reason = f"the command does not run {self.put.name}: write {{put}} in the command for its path"
+            raise schema.validation_error(reason, "put")
         if program == f"{{{arguments.PUT}}}" and not self.put.executable:
-            why = f"{self.put.file} is not executable: chmod +x it, or name its interpreter: python3 {{put}}"
-            raise schema.validation_error(why, "put")
+            reason = f"{self.put.file} is not executable: chmod +x it, or name its interpreter: python3 {{put}}"
+            raise schema.validation_error(reason, "put")
 
     def _check_roles(self) -> None:
         try:
@@ -287,7 +287,7 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     cross_checks = (
         CrossCheck(
-            "what a program of the lab prints",
+            "output of a program of the lab",
             ("*",),
             "the step's output file",
             (),
@@ -298,8 +298,8 @@ class RunStep(Step, UsesSpace, Summarizes):
 
     @override
     def roles(self) -> frozenset[Role]:
-        named = {Role(role) for word in self.words for role in arguments.roles(word)}
-        return frozenset({self.robot}) | named
+        argument_roles = {Role(role) for word in self.words for role in arguments.roles(word)}
+        return frozenset({self.robot}) | argument_roles
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
@@ -349,8 +349,8 @@ class RunStep(Step, UsesSpace, Summarizes):
                 yield f"{self._output}: no {column.name}: {measured.missing[column.name]}"
             elif column.name in measured.values and (bounds := self.expect.values.get(column.name)):
                 value = measured.values[column.name]
-                if why := bounds.problem(value):
-                    yield f"{self._output}: {column.name} is {value}, {why}"
+                if reason := bounds.problem(value):
+                    yield f"{self._output}: {column.name} is {value}, {reason}"
 
     @override
     def measure(self, view: View) -> Measured:
@@ -367,6 +367,6 @@ class RunStep(Step, UsesSpace, Summarizes):
         for column in self.figures:
             if column.name in values:
                 value = values[column.name]
-                shown = f"{value:.4g}" if isinstance(value, float) else cell(value)
+                value_text = f"{value:.4g}" if isinstance(value, float) else cell(value)
                 unit = "" if column.unit in {"text", "bool", "count", "hash"} else f" {column.unit}"
-                yield f"{column.label or column.name} {shown}{unit}"
+                yield f"{column.label or column.name} {value_text}{unit}"

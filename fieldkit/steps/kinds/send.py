@@ -36,7 +36,7 @@ _COPY: Final = f'{_ABSOLUTE_PATH}exec cp -- "$1" "$2"'
 _COUNT: Final = f'{_ABSOLUTE_PATH}exec wc -c <"$1"'
 _SIZE: Final = re.compile(r"[0-9]{1,15}")
 
-_MADE_BYTES_PER_S: Final = 1e6
+_CREATED_BYTES_PER_S: Final = 1e6
 """Rate at which a small robot generates or copies bytes; busybox awk generates 1.5 MB/s on a laptop of 2026."""
 
 _SIZE_FACTOR: Final = 2.0
@@ -67,7 +67,7 @@ class SendStep(TransferStep):
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         return None
 
-    def _sent(self, scene: Scene) -> RecordedFile:  # noqa: ARG002 (no step records it)
+    def _file_to_send(self, scene: Scene) -> RecordedFile:  # noqa: ARG002 (no step records it)
         return RecordedFile(self.sender, self.prefixed_name(FILE), self.size)
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:  # noqa: ARG002 (there is no recorder)
@@ -75,12 +75,12 @@ class SendStep(TransferStep):
 
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
-        yield self._make_job(scene)
+        yield self._creation_job(scene)
         yield from super().jobs(scene)
 
-    def _make_job(self, scene: Scene) -> Planned:
-        """Return the job that writes the sent file into the attempt's folder, from which it is also fetched."""
-        sent_file = self._sent(scene).name
+    def _creation_job(self, scene: Scene) -> Planned:
+        """Return the job that creates the file to send in the attempt's folder, from which it is also fetched."""
+        sent_file = self._file_to_send(scene).name
         if self.file is None:
             argv = ("awk", "-v", f"seed={self.seed}", "-v", f"bytes={self.size:.0f}", _GENERATE)
         else:
@@ -89,7 +89,7 @@ class SendStep(TransferStep):
             folder=scene.folder,
             name=self.prefixed_name("make"),
             argv=argv,
-            limit_s=30.0 + self.size / _MADE_BYTES_PER_S,
+            limit_s=30.0 + self.size / _CREATED_BYTES_PER_S,
             log=self._log,
             stdout=sent_file if self.file is None else None,
         )
@@ -110,7 +110,7 @@ class SendStep(TransferStep):
             yield Need(self.sender, f"file {self.file}", ("sh", "-c", _COUNT, "sh", self._path, "-"), self._judge)
 
     def _judge(self, answer: CommandResult) -> tuple[Verdict, str, str]:
-        """Return verdict, detail and remedy on the existence and the size of the file."""
+        """Return verdict, detail and remedy for the existence and the size of the file."""
         if not answer.ok or not _SIZE.fullmatch(answer.text.strip()):
             remedy = f"scp {quote((self.file or '',))} to it, or correct file: in the procedure"
             return Verdict.FAIL, answer.text, remedy
@@ -129,10 +129,10 @@ class SendStep(TransferStep):
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """Create the file to send and start the listener; return the function that sends the file."""
-        make = self._make_job(scene)
-        if (code := jobs.run(testbed.shells[self.sender], make.job)) != 0:
-            why = f"{make.program} ended with exit code {code}"
-            raise scene.failure(make, f"the file to send could not be created: {why}")
+        creation = self._creation_job(scene)
+        if (code := jobs.run(testbed.shells[self.sender], creation.job)) != 0:
+            reason = f"{creation.program} ended with exit code {code}"
+            raise scene.failure(creation, f"the file to send could not be created: {reason}")
         return super().prepare(scene, testbed)
 
     @override
@@ -146,7 +146,7 @@ class SendStep(TransferStep):
     @override
     def check(self, view: View) -> Iterator[str]:
         """Yield a reason if the sent file is missing or has a wrong size, and the reasons of a transfer."""
-        sent_file = self._sent(view.scene).name
+        sent_file = self._file_to_send(view.scene).name
         size_bytes = view.evidence.read_or_none(reading.size, sent_file)
         if size_bytes is None:
             yield f"{sent_file} is missing"
@@ -156,4 +156,4 @@ class SendStep(TransferStep):
 
     @override
     def expected_s(self, protocol: Protocol) -> float:
-        return super().expected_s(protocol) + self.size * (8 / GOOD_BIT_S + 1 / _MADE_BYTES_PER_S)
+        return super().expected_s(protocol) + self.size * (8 / GOOD_BIT_S + 1 / _CREATED_BYTES_PER_S)

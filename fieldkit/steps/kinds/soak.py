@@ -24,7 +24,7 @@ from fieldkit.steps.scene import BY_EXIT, BY_FIELDKIT, Announce, Flow, Listening
 from fieldkit.steps.view import View
 
 LIMIT_S: Final = 900.0
-"""Time limit of the load beyond the limits of the steps inside."""
+"""Time limit of the load in addition to the limits of the steps inside."""
 
 _FOREVER_S: Final = 86_400
 """Maximum duration that iperf3 accepts."""
@@ -32,7 +32,7 @@ _FOREVER_S: Final = 86_400
 _STALLS: Final = stalls.declare_columns("soak", "the load", 69)
 
 # Prints "flows" when 10 kB have been sent by interface $1, and executes the command after it. iperf3 itself reports
-# its packets only after a second, and old versions do not report at all while their output is a file.
+# its packets only after a second, and old versions report nothing until they exit if their output is a file.
 _FLOWS: Final = (
     'sent() { awk -v i="$1" \'{ sub(":", " ") } $1 == i { print $10 }\' /proc/net/dev; }; '
     '(from=$(sent "$1"); until [ "$(sent "$1")" -gt $((from + 10000)) ]; do sleep 0.1; done; echo flows >&2) & '
@@ -95,7 +95,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
             for entry in self.during:
                 entry.step.run(scene, testbed, announce)
         except FieldkitError:
-            # The first error is the reason of the failure; a job that was never started cannot be stopped.
+            # The first error is the cause of the failure; a job that was never started cannot be stopped.
             for planned in (client, server):
                 with suppress(FieldkitError):
                     jobs.stop(testbed.shells[planned.role], planned.job)
@@ -117,7 +117,7 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
     @override
     def output_columns(self) -> tuple[Column, ...]:
         """Return the columns of stalls, and of the recoveries from faults inside."""
-        return (*_STALLS, *across.declared(self))
+        return (*_STALLS, *across.recovery_columns(self))
 
     @override
     def measure(self, view: View) -> Measured:
@@ -130,10 +130,10 @@ class SoakStep(LoadOptions, Nest, Listens, SendsTraffic):
 
     def deliveries(self, view: View) -> Sequence[Delivery]:
         """Return the deliveries of each stream; see `SendsFlow.deliveries`."""
-        sent, received = (view.capture(role) for role in (self.sender, self.receiver))
+        source, destination = (view.capture(role) for role in (self.sender, self.receiver))
         load = self.data_streams(view.scene)
         return iperf3_load.read_deliveries(
-            load, sent.packets if sent else None, received.packets if received else None
+            load, source.packets if source else None, destination.packets if destination else None
         )
 
     @override

@@ -29,10 +29,10 @@ MAX_PARALLEL: Final = 8
 class TogetherStep(Nest, Prepares, DescribesActions):
     """Runs its steps at the same time: all listeners are up before the first step begins.
 
-    It ends when the last of them ends. If one fails, all others are stopped, also a `wait`. For a sequence inside it,
-    use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`, `move`,
-    `ask`, `wait` with `until`) must contain or precede it. If SSH uses the radio under test, the commands of one step
-    affect the measurement of another.
+    It ends when the last of them ends. If one fails, all others are stopped, including a `wait`. For a sequence
+    inside it, use a step that has `during`, for example a `capture`. A step that may prompt the operator (`fault`,
+    `move`, `ask`, `wait` with `until`) must contain or precede it. If SSH uses the radio under test, the commands of
+    one step affect the measurement of another.
 
     Attributes:
         during: Two steps or more; at most 8 run at the same time.
@@ -45,8 +45,8 @@ class TogetherStep(Nest, Prepares, DescribesActions):
     @schema.model_validator(mode="after")
     def _can_run_in_parallel(self) -> "TogetherStep":
         if (count := _max_parallel(self)) > MAX_PARALLEL:
-            why = f"{count} steps at the same time are more than {MAX_PARALLEL}: remove some"
-            raise schema.validation_error(why, "during")
+            reason = f"{count} steps at the same time are more than {MAX_PARALLEL}: remove some"
+            raise schema.validation_error(reason, "during")
         for kind, location in _operator_steps(self):
             raise schema.validation_error(
                 f"{kind} may prompt the operator, so no step may run at the same time", *location
@@ -64,13 +64,13 @@ class TogetherStep(Nest, Prepares, DescribesActions):
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
-        inner = replace(scene, halt=scene.halt.child())
-        prepared = self._run_all(
-            [partial(base.prepare, entry.step, inner, testbed) for entry in self.during], inner, testbed
+        inner_scene = replace(scene, halt=scene.halt.child())
+        actions = self._run_all(
+            [partial(base.prepare, entry.step, inner_scene, testbed) for entry in self.during], inner_scene, testbed
         )
 
         def carry_out(announce: Announce) -> None:
-            self._run_all([partial(work, announce) for work in prepared], inner, testbed)
+            self._run_all([partial(action, announce) for action in actions], inner_scene, testbed)
 
         return carry_out
 
@@ -79,7 +79,7 @@ class TogetherStep(Nest, Prepares, DescribesActions):
         self.prepare(scene, testbed)(announce)
 
     def _run_all(self, calls: list[Callable[[], T]], scene: Scene, testbed: Testbed) -> list[T]:
-        """Make all calls at the same time; if one fails, stop the jobs for which the others wait."""
+        """Make all calls at the same time; if one of them fails, stop the jobs for which the others wait."""
 
         def end() -> None:
             scene.halt.set()
@@ -111,7 +111,7 @@ def _operator_steps(nest: Nest) -> Iterator[tuple[str, schema.Location]]:
         if isinstance(entry.step, AsksOperator) and entry.step.may_prompt():
             yield entry.kind, location
         if isinstance(entry.step, Nest):
-            yield from ((kind, (*location, *inside)) for kind, inside in _operator_steps(entry.step))
+            yield from ((kind, (*location, *inner_location)) for kind, inner_location in _operator_steps(entry.step))
 
 
 def _max_parallel(step: Step) -> int:

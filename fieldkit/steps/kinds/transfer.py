@@ -70,10 +70,8 @@ BagName = Annotated[
 _LISTEN: Final = "listen"
 _SEND: Final = "send"
 MAX_LATE_SHARE: Final = 0.1
-"""Maximum waiting time of a listener for its sender, as a share of the listener's limit.
-
-It applies if the listener was stopped at its limit.
-"""
+"""Maximum time between the start of a listener and the start of its sender, as a share of the listener's limit. It
+applies if the listener was stopped at its limit."""
 
 _TRADITIONAL: Final = "sudo apt-get install netcat-traditional, and netcat: nc.traditional in its profile"
 
@@ -105,7 +103,7 @@ class TransferStep(
             key, the only recording on the sender is sent.
         into: The file written by the receiver.
         port: Port that the receiver listens on.
-        idle: A UDP listener ends after this time without a datagram; at least `1s`, rounded up to whole seconds.
+        idle: A UDP listener exits after this time without a datagram; at least `1s`, rounded up to whole seconds.
         limit: A transfer that takes longer is stopped, and the data received until then is measured.
     """
 
@@ -140,12 +138,12 @@ class TransferStep(
             return f"{what}, but no recording of that name is made on {self.sender} before it"
         return None
 
-    def _sent(self, scene: Scene) -> RecordedFile:
+    def _file_to_send(self, scene: Scene) -> RecordedFile:
         """Return the recording to send.
 
-        If none has the name, return the first one, because `refusals` reports this error.
+        If no recording has the name, the first one is returned, because `refusals` reports this error.
         """
-        recordings = scene.recorded[self.sender]
+        recordings = scene.recordings[self.sender]
         return next((file for file in recordings if self.file in {file.name, file.alias}), recordings[0])
 
     @override
@@ -184,7 +182,7 @@ class TransferStep(
                 argv=netcat.send(sender_variant, sender, scene.protocol, address, self.port),
                 limit_s=self.limit,
                 log=self._logs[1],
-                stdin=self._sent(scene).name,
+                stdin=self._file_to_send(scene).name,
             ),
             program=sender,
             tool=Tool.NETCAT,
@@ -210,8 +208,11 @@ class TransferStep(
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
         """Yield a reason if no recording has the name of the file to send."""
-        recordings = [file.name for file in scene.recorded[self.sender]]
-        if self.file is not None and self.file not in {self._sent(scene).name, self._sent(scene).alias}:
+        recordings = [file.name for file in scene.recordings[self.sender]]
+        if self.file is not None and self.file not in {
+            self._file_to_send(scene).name,
+            self._file_to_send(scene).alias,
+        }:
             what = f"it cannot send {self.file}: its recorder writes {', '.join(recordings)}"
             leave_out = "leave out file: in the transfer, or " if len(recordings) == 1 else ""
             yield Refusal(self.sender, what, f"{leave_out}write file: {recordings[0]}")
@@ -220,20 +221,20 @@ class TransferStep(
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:
         """Start the listener; return the function that sends the file."""
         listen, _ = self._netcats(scene)
-        started_s = time.monotonic()
-        listening = jobs.serve(testbed.shells[self.receiver], listen.job)
-        return partial(self._send, scene, testbed, listening, started_s)
+        start_s = time.monotonic()
+        pending_listener = jobs.serve(testbed.shells[self.receiver], listen.job)
+        return partial(self._send, scene, testbed, pending_listener, start_s)
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         self.prepare(scene, testbed)(announce)
 
-    def _send(self, scene: Scene, testbed: Testbed, listening: Pending, started_s: float, announce: Announce) -> None:
-        """Send the file to a listener that was started at `started_s` of the monotonic clock.
+    def _send(self, scene: Scene, testbed: Testbed, listener: Pending, start_s: float, announce: Announce) -> None:
+        """Send the file to a listener that was started at `start_s` of the monotonic clock.
 
-        During the transfer no data crosses the control connections: both commands have been accepted before, the
-        receiver reports only the exit of its listener, and the sender is queried afterwards. A control connection
-        over the same radio that is lost meanwhile is restored after the transfer or at the limit.
+        During the transfer no data crosses the control connections: both commands were accepted before, the receiver
+        reports only the exit of its listener, and the sender is queried afterwards. If a control connection over the
+        same radio is lost, it is restored after the transfer or at the limit.
         """
         oracle = testbed.oracle
         flow = (self.sender, self.receiver, scene.protocol, self.port)
@@ -243,17 +244,17 @@ class TransferStep(
         with ExitStack() as silence_contexts:
             for role in (self.receiver, self.sender):
                 silence_contexts.enter_context(testbed.shells[role].silence(self.limit))
-            sending = jobs.begin(testbed.shells[self.sender], send.job)
-            waited_s = time.monotonic() - started_s
+            pending_sender = jobs.begin(testbed.shells[self.sender], send.job)
+            waited_s = time.monotonic() - start_s
             if scene.protocol is Protocol.UDP and waited_s >= self.idle:
                 raise self._late_start(waited_s, f"the listener exits after {self.idle:g} s of silence", scene)
             # This time exceeds the time in which the robot stops the listener at its limit, so the listener ends
             # before the step.
-            code = listening.end(self.limit + 2 * jobs.REPLY_S)
+            code = listener.end(self.limit + 2 * jobs.REPLY_S)
         if scene.protocol is Protocol.TCP and code != 0 and waited_s > MAX_LATE_SHARE * self.limit:
             raise self._late_start(waited_s, f"the listener was stopped after {self.limit:g} s", scene)
         # A sender runs longer than its listener only if the transfer was interrupted; its limit has then also passed.
-        sending.end(jobs.REPLY_S)
+        pending_sender.end(jobs.REPLY_S)
         if oracle is not None and before is not None and scene.laptop_folder is not None:
             after = oracle.delays(*flow, link=self.over)
             (scene.laptop_folder / self.prefixed_name(oracle_delays.AIR_DELAY_FILE)).write_text(
@@ -263,14 +264,14 @@ class TransferStep(
     def _late_start(self, waited_s: float, listener: str, scene: Scene) -> RobotError:
         """Return the error if a sender started so late that the radio is not the cause of its loss."""
         return RobotError(
-            f"sending started up to {waited_s:.1f} s after listening, but {listener}",
+            f"the sender started up to {waited_s:.1f} s after the listener, but {listener}",
             where=scene.robot(self.sender).name,
             remedy="check the control link, or increase `idle` or `limit` in the procedure",
         )
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        """Return the resource, which a `send` also uses."""
+        """Return the resource of transfers, which a `send` also uses."""
         return ("a transfer",)
 
     @override
@@ -303,7 +304,7 @@ class TransferStep(
         return self._size_bytes(scene) if role == self.receiver else 0.0
 
     def _size_bytes(self, scene: Scene) -> float:
-        return self._sent(scene).size_bytes
+        return self._file_to_send(scene).size_bytes
 
     @override
     def transfer(self, scene: Scene, within: Sequence[EnclosingStep]) -> Transfer:
@@ -314,7 +315,7 @@ class TransferStep(
             sender_address=scene.link(self.sender, self.over).address,
             receiver_address=scene.link(self.receiver, self.over).address,
             port=self.port,
-            sent_file=self._sent(scene).name,
+            sent_file=self._file_to_send(scene).name,
             received_file=self._into,
             captures=(capture_around(within, self.sender), capture_around(within, self.receiver)),
             name=self.prefix,
@@ -325,19 +326,23 @@ class TransferStep(
         """Yield a reason for a missing file, a netcat that was stopped by a signal, and each contradiction."""
         transfer = self.transfer(view.scene, view.within)
         endings = [self._ending(view, role, job) for role, job in self._jobs]
-        listened, sent = (ending if ending and ending.cause is Cause.EXITED else None for ending in endings)
+        listener_exit, sender_exit = (
+            ending if ending and ending.cause is Cause.EXITED else None for ending in endings
+        )
         if not view.evidence.has(self._into):
             yield f"{self._into} is missing"
-        elif why := transfer_measures.incomparability_reason(view.evidence, transfer):
-            yield why
+        elif reason := transfer_measures.incomparability_reason(view.evidence, transfer):
+            yield reason
         else:
-            finished = listened is not None and listened.code == 0
-            was_stopped = endings[0] is not None and listened is None
-            yield from transfer_checks.find(view.evidence, transfer, finished=finished, cut=was_stopped)
+            finished = listener_exit is not None and listener_exit.code == 0
+            was_stopped = endings[0] is not None and listener_exit is None
+            yield from transfer_checks.find_contradictions(
+                view.evidence, transfer, finished=finished, was_stopped=was_stopped
+            )
         texts = [view.evidence.read_or_none(reading.text, log) for log in self._logs]
-        if listened is not None and netcat.listener_failed(listened.code, texts[0]):
+        if listener_exit is not None and netcat.listener_failed(listener_exit.code, texts[0]):
             yield f"{self._logs[0]}: netcat was terminated by a signal, or could not write {self._into}"
-        if sent is not None and netcat.sender_was_killed(sent.code, texts[1]):
+        if sender_exit is not None and netcat.sender_was_killed(sender_exit.code, texts[1]):
             yield f"{self._logs[1]}: netcat was terminated by a signal"
 
     @property
@@ -345,7 +350,7 @@ class TransferStep(
         return (self.receiver, self.prefixed_name(_LISTEN)), (self.sender, self.prefixed_name(_SEND))
 
     def _ending(self, view: View, role: Role, job: str) -> Ending | None:
-        """Return the recorded termination of a netcat, or None if the robot recorded none."""
+        """Return the recorded termination of a netcat, or None if there is no record."""
         after = view.evidence.read_or_none(host.state, host.after_file(role))
         return (after.endings or {}).get(job) if after else None
 
@@ -374,7 +379,7 @@ class TransferStep(
         )
 
     def _shares_port(self, view: View) -> bool:
-        """Return True if another flow in the same capture uses its port, also in the reverse direction."""
+        """Return True if another flow in the same capture uses its port, in either direction."""
         captures = (step for step in reversed(view.within) if isinstance(step, Nest) and step.captures())
         flows = next((list(flows_inside(nest, view.scene)) for nest in captures), [])
         return sum(flow.port == self.port for flow in flows) > 1
@@ -391,7 +396,7 @@ class TransferStep(
             if name in values:
                 yield f"{layer} loss {100 * float(values[name]):.1f} %"
         if values.get("ip_packets_doubtful"):
-            yield f"{values['ip_packets_doubtful']} packets look alike"
+            yield f"{values['ip_packets_doubtful']} ambiguous packets"
         if "tcp_retransmitted_segments" in values:
             yield f"{values['tcp_retransmitted_segments']} retransmitted"
 

@@ -16,13 +16,13 @@ from fieldkit.steps.scene import Announce, Planned, Scene
 
 
 class WaitStep(AlongStep, DescribesActions, AsksOperator):
-    """Waits for a time, or until the operator has done something and pressed Enter.
+    """Waits for a time, or until the operator has carried out an action and pressed Enter.
 
     With `--yes` no operator is asked.
 
     Attributes:
-        duration: How long to wait. Exactly one of `duration`, `until` and `along` is given.
-        until: What the operator must do, in the imperative: `open the door`.
+        duration: Duration of the wait. Exactly one of `duration`, `until` and `along` must be set.
+        until: Action of the operator, in the imperative: `open the door`.
     """
 
     needs_complete_capture: ClassVar[bool] = False
@@ -63,7 +63,7 @@ class WaitStep(AlongStep, DescribesActions, AsksOperator):
 
     @override
     def exclusive_resources(self) -> tuple[str, ...]:
-        """Return no resources: a repeat may have any number of waits."""
+        """Return no resources, because a repeat may have any number of waits."""
         return ()
 
     @override

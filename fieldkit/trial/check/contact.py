@@ -1,4 +1,4 @@
-"""Log in on a robot and read its clock."""
+"""Log in on a robot and check its clock."""
 
 from typing import Final
 
@@ -11,21 +11,24 @@ from fieldkit.trial.check.report import Report
 CONTACT_S: Final = 15.0
 WARN_S: Final = 1.0
 WRONG_CLOCK_S: Final = 1800.0
-"""Offset from which a clock is set incorrectly and has not only drifted, for example because of a wrong time zone or
-because the board has no battery."""
+"""From this offset on, the clock is considered to be set incorrectly, not only to drift. Typical causes are a wrong
+time zone and a board without a battery."""
 
 
 def log_in(shell: Shell) -> None:
     """Log in on a robot.
 
     Raises:
-        FieldkitError: It cannot be reached, has another host key, or refuses the login.
+        FieldkitError: The robot cannot be reached, has another host key, or refuses the login.
     """
     shell.run(("true",), deadline=Deadline.after(CONTACT_S))
 
 
 def judge(shell: Shell, report: Report) -> Offset | None:
-    """Report that the robot answers. Return the offset of its clock; None if it sent no time. Raises as `log_in`."""
+    """Report that the robot can be reached, and return the offset of its clock.
+
+    The offset is None if the robot sent no time. Raises as `log_in`.
+    """
     log_in(shell)
     exchanges = clocks.exchanges(shell, CONTACT_S)
     fastest_s = min((exchange.response_ns - exchange.request_ns for exchange in exchanges), default=0) / 1e9
@@ -34,7 +37,7 @@ def judge(shell: Shell, report: Report) -> Offset | None:
 
 
 def judge_clock(clock_offset: Offset | None, ssh_destination: str, report: Report) -> None:
-    """Add the offset of a robot's clock.
+    """Report the offset of a robot's clock.
 
     Args:
         clock_offset: The offset; None if the robot reported no time.
@@ -45,14 +48,16 @@ def judge_clock(clock_offset: Offset | None, ssh_destination: str, report: Repor
         report.warn("clock", "date prints no time", "date -u +%s.%N")
         return
     magnitude_s = abs(clock_offset.offset_s)
-    detail = f"{clock_offset.offset_s:+.3f} s against the laptop, \N{PLUS-MINUS SIGN} {clock_offset.error_s:.3f} s"
+    detail = (
+        f"{clock_offset.offset_s:+.3f} s relative to the laptop, \N{PLUS-MINUS SIGN} {clock_offset.error_s:.3f} s"
+    )
     if magnitude_s - clock_offset.error_s <= WARN_S:
         report.ok("clock", detail)
         return
     if magnitude_s >= WRONG_CLOCK_S:
-        ahead = "ahead" if clock_offset.offset_s > 0 else "behind"
-        detail = f"{magnitude_s / 3600:.1f} hours {ahead}: {detail}"
+        direction = "ahead" if clock_offset.offset_s > 0 else "behind"
+        detail = f"{magnitude_s / 3600:.1f} hours {direction}: {detail}"
     command = "date -u -s @$(date +%s)"
     has_sudo = report.user_tools is None or report.user_tools.root or "sudo" in report.user_tools.programs
-    on_robot = f"sudo {command}" if has_sudo else f"\"su -c '{command}'\""
-    report.warn("clock", detail, f"ssh -t {ssh_destination} {on_robot}   # on the laptop")
+    robot_command = f"sudo {command}" if has_sudo else f"\"su -c '{command}'\""
+    report.warn("clock", detail, f"ssh -t {ssh_destination} {robot_command}   # on the laptop")

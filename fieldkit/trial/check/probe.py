@@ -1,4 +1,4 @@
-"""Run one script that reads the state of a robot in a single round trip."""
+"""Read the state of a robot with one script, in a single round trip."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,8 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check import tools
 
-# The other commands have 20 s in total; one of them can hang, for example df on a dead network drive.
+# All commands except the detection of tools have 20 s in total. A command can hang, for example df on a network drive
+# that cannot be reached.
 PROBE_S: Final = 20.0 + tools.PROBE_S
 
 _SCRIPT: Final = resources.files("fieldkit.trial.check").joinpath("probe.sh").read_text(encoding="ascii")
@@ -28,12 +29,12 @@ def run_probe(shell: Shell, interface: str, commands: Mapping[str, Sequence[str]
 
     Args:
         shell: The robot.
-        interface: Its interface under test.
-        commands: Further commands by the name of their section.
+        interface: Interface under test.
+        commands: Further commands, by the names of their sections.
 
     Raises:
         LinkError: The robot did not answer within `PROBE_S`.
-        RobotError: Its output exceeds the limit of a probe.
+        RobotError: The output exceeds the limit of a probe.
     """
     completed = shell.run(
         ("sh", "-s", interface),

@@ -1,16 +1,16 @@
-# State of a robot, read in one round trip. Run by `sh -s INTERFACE`, with further calls of `section` appended for
-# the needs of a plan. It only reads. The section of a missing tool has code 127.
+# Prints the state of a robot in one round trip, and changes nothing. It is run with `sh -s INTERFACE`; calls of
+# `section` for the needs of a plan are appended. The section of a missing tool has the code 127.
 interface=$1
 export LC_ALL=C
 
 section() { # NAME COMMAND...
     name=$1
     shift
-    said=$("$@" 2>&1 </dev/null)
-    printf '==> %s: %s <==\n%s\n' "$name" "$?" "$said"
+    output=$("$@" 2>&1 </dev/null)
+    printf '==> %s: %s <==\n%s\n' "$name" "$?" "$output"
 }
 
-admin() ( # a session without a terminal often lacks the folders where iw and ethtool are
+admin() ( # in a session without a terminal, PATH often lacks the folders of iw and ethtool
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin
     "$@"
 )
@@ -20,13 +20,13 @@ system() (
     uname -srm
 )
 
-have() { # prints those of the given programs that exist
+have() { # prints the names of the given programs that exist
     for program in "$@"; do
         admin command -v "$program" >/dev/null && echo "$program"
     done
 }
 
-batteries() { # of the robot itself; the battery of a mouse has the scope Device
+batteries() { # prints the robot's batteries; the battery of a connected device, such as a mouse, has the scope Device
     for supply in /sys/class/power_supply/*; do
         read -r scope 2>/dev/null <"$supply/scope" || scope=System
         [ "$scope" != Device ] && read -r percent 2>/dev/null <"$supply/capacity" && echo "${supply##*/} $percent"

@@ -1,4 +1,4 @@
-"""Checks of a robot's radio interface by the probe: address, SSH, offloads, access point, signal, power save."""
+"""Checks of a robot's radio interface with the output of the probe: address, SSH, offloads, Wi-Fi and power save."""
 
 import re
 from collections.abc import Mapping
@@ -12,17 +12,17 @@ from fieldkit.trial.check.probe import MISSING_SECTION, Sections
 from fieldkit.trial.check.report import Report
 
 MARGIN_DB: Final = 10
-"""Margin above the profile's sensitivity below which a signal is reported as weak."""
+"""A signal is reported as weak if it is less than this above the sensitivity in the profile."""
 
 _FLAGS: Final = re.compile(r"^[0-9]+: \S+ <(?P<flags>[A-Z0-9_,-]*)>", re.MULTILINE)
-# `[ \t]` instead of `\s`, which also matches line breaks and would backtrack over empty lines.
+# Uses `[ \t]` instead of `\s`, which also matches line breaks and would backtrack over empty lines.
 _ADDRESS: Final = re.compile(r"^[ \t]+inet (?P<address>[0-9.]{7,15}/[0-9]{1,2})\b", re.MULTILINE)
 _OFFLOADS: Final = {
     "GSO": "generic-segmentation-offload",
     "TSO": "tcp-segmentation-offload",
     "GRO": "generic-receive-offload",
 }
-# The output of iw 5.19, as its link.c, interface.c and station.c print it.
+# The lines of iw 5.19 (link.c, interface.c and station.c).
 _FACTS: Final = {
     "type": r"^[ \t]*type (.{1,30})$",
     "channel": r"^[ \t]*channel ([0-9]{1,3}) \(",
@@ -35,7 +35,7 @@ _POWER_SAVE: Final = re.compile(r"^Power save: (on|off)$", re.MULTILINE)
 
 
 def judge(robot: Robot, sections: Sections, report: Report) -> None:
-    """Report the findings on the interface under test."""
+    """Report findings about the interface under test."""
     interface = robot.profile.radio.interface
     _judge_interface(robot, sections, report)
     _judge_control(robot, sections, report)
@@ -83,24 +83,24 @@ def _judge_interface(robot: Robot, sections: Sections, report: Report) -> None:
 
 
 def is_missing(sections: Sections) -> bool:
-    """Return True if the robot has no interface of the profile's name."""
+    """Return True if the robot has no interface with the name in its profile."""
     section = sections.get("interface", MISSING_SECTION)
     return section.code != CommandResult.MISSING and _FLAGS.search(section.text) is None
 
 
 def _judge_control(robot: Robot, sections: Sections, report: Report) -> None:
-    # The client's address and port, then the robot's address and port, as the SSH server reports the connection.
+    # The SSH server reports the client's address and port, then the robot's address and port.
     words = sections.get("control", MISSING_SECTION).text.split()
     if len(words) != 4:
         report.ok("control", "the SSH server does not report the addresses of the connection")
     elif words[2] != robot.address:
-        report.ok("control", f"SSH does not use the radio under test: it arrives at {words[2]}")
+        report.ok("control", f"SSH does not use the radio under test: it connects to {words[2]}")
     elif robot.control is Control.RADIO:
         report.ok("control", "SSH shares the radio under test, as the site file states")
     else:
         report.warn(
             "control",
-            "SSH shares the radio under test, and the site file does not say control: radio",
+            "SSH shares the radio under test, but the site file does not contain control: radio",
             "write control: radio in the site file, or give host another network",
         )
 
@@ -109,11 +109,11 @@ def _judge_offloads(sections: Sections, report: Report) -> None:
     section = sections.get("offloads", MISSING_SECTION)
     states = {name: re.search(rf"^{long}: (on|off)", section.text, re.MULTILINE) for name, long in _OFFLOADS.items()}
     offloads = [f"{name} {state[1]}" for name, state in states.items() if state]
-    report.ok("offloads", ", ".join(offloads) or "not known: ethtool is not installed")
+    report.ok("offloads", ", ".join(offloads) or "unknown: ethtool is not installed")
 
 
 def facts(sections: Sections) -> Mapping[str, str]:
-    """Return the values that `iw info` and `iw link` printed, by the names in `_FACTS`."""
+    """Return the values in the output of `iw info` and `iw link`, by the names in `_FACTS`."""
     text = "\n".join(sections.get(name, MISSING_SECTION).text for name in ("wifi-info", "wifi-link"))
     matches = {name: re.search(pattern, text, re.MULTILINE) for name, pattern in _FACTS.items()}
     return {name: match[1] for name, match in matches.items() if match}
@@ -141,13 +141,13 @@ def _judge_wifi(robot: Robot, sections: Sections, report: Report) -> None:
         report.warn(
             "Wi-Fi",
             f"{', '.join(words)}: weaker than {weak_dbm:g} dBm",
-            f"iw dev {interface} link   # is the robot too far away?",
+            f"iw dev {interface} link   # the robot may be too far away",
         )
     elif robot.profile.radio.access_point and wifi_facts.get("type") == "managed":
         report.warn(
             "Wi-Fi",
-            f"{', '.join(words)}: a station, but by its profile the robot runs an access point",
-            f"start its access point, or correct it: {locations.copy_profile_command(robot.profile.name)}",
+            f"{', '.join(words)}: a station, but according to its profile the robot runs an access point",
+            f"start its access point, or correct the profile: {locations.copy_profile_command(robot.profile.name)}",
         )
     else:
         report.ok("Wi-Fi", ", ".join(words))
@@ -159,7 +159,7 @@ def _judge_power_save(interface: str, sections: Sections, report: Report) -> Non
     section = sections.get("wifi-power-save", MISSING_SECTION)
     state = _POWER_SAVE.search(section.text)
     if state is None:
-        report.ok("power save", f"not known: {section.text}")
+        report.ok("power save", f"unknown: {section.text}")
     elif state[1] == "on":
         report.warn("power save", "on: delays become long and vary", f"sudo iw dev {interface} set power_save off")
     else:

@@ -1,4 +1,4 @@
-"""Findings of one robot; all text from a robot is made printable here."""
+"""Findings about one robot. Text from a robot is made printable here."""
 
 import re
 from dataclasses import dataclass
@@ -9,16 +9,16 @@ from fieldkit.core.model import Verdict
 from fieldkit.remote.command import printable
 
 LAPTOP: Final = "laptop"
-"""Name under which findings on the machine that runs fieldkit are reported."""
+"""Name under which findings about the machine that runs fieldkit are reported."""
 
 
 @dataclass(frozen=True)
 class UserTools:
-    """Permissions and programs with which a robot's user can fix problems.
+    """Permissions and programs that a robot's user has to fix problems.
 
     Attributes:
-        root: Whether the user is root.
-        programs: The available programs that remedies can use.
+        root: True if the user is root.
+        programs: Available programs that remedies can use.
     """
 
     root: bool
@@ -26,10 +26,10 @@ class UserTools:
 
 
 class Report:
-    """Findings on one robot, in order.
+    """Findings about one robot, in order.
 
     Args:
-        robot: Its name.
+        robot: Name of the robot.
 
     Attributes:
         user_tools: Tools of the robot's user; None while unknown, and for the laptop.
@@ -41,7 +41,7 @@ class Report:
         self.user_tools: UserTools | None = None
 
     def ok(self, check: str, detail: str) -> None:
-        """Add a passed check, or a value for the record."""
+        """Add a passed check or an observed value."""
         self.add(check, Verdict.OK, detail, "")
 
     def warn(self, check: str, detail: str, remedy: str) -> None:
@@ -53,7 +53,7 @@ class Report:
         self.add(check, Verdict.FAIL, detail, remedy)
 
     def add(self, check: str, status: Verdict, detail: str, remedy: str) -> None:
-        """Add a check with its verdict; the remedy is empty if it passed."""
+        """Add a check with its verdict. The remedy is empty if the check passed."""
         check, detail, remedy = (printable(text.encode()) for text in (check, detail, self._adapted_remedy(remedy)))
         self.findings.append(Finding(self.robot, check, status, detail or "no answer", remedy))
 

@@ -1,4 +1,4 @@
-"""Checks of a robot's programs by the probe: programs that steps start, and other requirements of steps."""
+"""Checks of a robot's programs with the output of the probe: programs that steps start, other needs of steps."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -47,23 +47,23 @@ _AGENT_S: Final = 30.0
 
 
 @dataclass(frozen=True)
-class Probed:
-    """Result of the probe of a robot, for the checks after it.
+class ProbeResult:
+    """Result of the probe of a robot. Later checks use it.
 
     Attributes:
-        sections: Outputs of the commands of the probe.
-        variants: The robot's tools.
+        sections: Outputs of the probe's commands.
+        variants: Variants of the robot's tools.
     """
 
     sections: Sections
     variants: Variants
 
     def has_program(self, program: str, needs: Sequence[Need]) -> bool:
-        """Return True if the robot has a program of a step, and everything that this program requires.
+        """Return True if the robot has a program that a step starts, and fulfils all needs of this program.
 
         Args:
             program: The program.
-            needs: The needs of steps on the robot.
+            needs: Needs of the steps on this robot.
         """
         names = (_section(program), *(need.name for need in needs if need.missing_program == program))
         return all(self.sections.get(name, MISSING_SECTION).ok for name in names)
@@ -72,31 +72,33 @@ class Probed:
 def commands(plan: Plan, role: Role) -> dict[str, Sequence[str]]:
     """Return the commands that the probe must run on the robot in `role`, by section name."""
     profile = plan.cast[role].profile
-    by_section: dict[str, Sequence[str]] = {}
+    commands_by_section: dict[str, Sequence[str]] = {}
     for program, setup in _programs(plan, role):
-        by_section[_section(program)] = with_environment(("sh", "-c", 'command -v "$1"', "sh", program), setup=setup)
+        commands_by_section[_section(program)] = with_environment(
+            ("sh", "-c", 'command -v "$1"', "sh", program), setup=setup
+        )
     for need in needs_of(plan, role):
-        by_section[need.name] = need.argv
-    by_section[_TOOLS] = tools.probe(profile, _tools(plan, role))
-    return by_section
+        commands_by_section[need.name] = need.argv
+    commands_by_section[_TOOLS] = tools.probe(profile, _tools(plan, role))
+    return commands_by_section
 
 
 def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variants:
-    """Report the findings on the programs.
+    """Report findings about the programs.
 
     Returns:
-        The variants of the robot's tools; the expected ones if that check failed.
+        The variants of the robot's tools, or the expected variants if this check failed.
     """
     profile = plan.cast[role].profile
     programs = dict.fromkeys(program for program, _ in _programs(plan, role))
-    remedies = {planned.program: planned.remedy for planned in _planned(plan, role)}
+    remedies = {job.program: job.remedy for job in _planned_jobs(plan, role)}
     present = [program for program in programs if sections.get(_section(program), MISSING_SECTION).ok]
     report.ok("programs", ", ".join(present) or "none found")
     needs = needs_of(plan, role)
-    # If a ROS setup file is missing, its recorder is not found either. Only the setup file is then reported.
-    explained = {need.missing_program for need in needs if not sections.get(need.name, MISSING_SECTION).ok}
+    # If a ROS setup file is missing, the recorder is not found either. Only the setup file is then reported.
+    explained_programs = {need.missing_program for need in needs if not sections.get(need.name, MISSING_SECTION).ok}
     for program in programs:
-        if program not in present and program not in explained:
+        if program not in present and program not in explained_programs:
             package = _PACKAGES.get(Path(program).name)
             profile_remedy = remedies.get(program) or (
                 f"correct its name in profile {profile.name}: {locations.copy_profile_command(profile.name)}"
@@ -104,7 +106,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
             report.fail(program, "not found", f"sudo apt-get install {package}" if package else profile_remedy)
     interface = profile.radio.interface if radio.is_missing(sections) else None
     for need in needs:
-        # A need that uses a missing interface is skipped: the missing interface is reported separately.
+        # A need that uses a missing interface is skipped, because the missing interface is reported separately.
         if (not need.required_program or need.required_program in present) and interface not in need.argv:
             report.add(need.name, *need.judge(sections.get(need.name, MISSING_SECTION)))
     if len(present) < len(programs):
@@ -113,7 +115,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> Variant
 
 
 def check_agent(plan: Plan, role: Role, sections: Sections, shell: Shell, report: Report) -> None:
-    """Report the agent's findings on requirements of steps; the agent is installed if its Python interpreter exists.
+    """Report the agent's findings about needs of steps. The agent is installed if its Python interpreter exists.
 
     Raises:
         LinkError: The robot did not answer.
@@ -134,7 +136,7 @@ def _section(program: str) -> str:
 
 
 def _tools(plan: Plan, role: Role) -> set[Tool]:
-    return {planned.tool for planned in _planned(plan, role) if planned.tool is not None}
+    return {job.tool for job in _planned_jobs(plan, role) if job.tool is not None}
 
 
 def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -> Variants:
@@ -143,7 +145,7 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
     except RobotError as error:
         report.fail(_TOOLS, error.what, error.remedy)
         return variants.expected(profile)
-    # For netcat, the variant is shown: some variants print no version, and the formats of the others differ.
+    # For netcat, the variant is reported: some variants print no version, and the formats of the others differ.
     words = [
         f"{detected.netcat} netcat" if tool is Tool.NETCAT else version for tool, version in detected.versions.items()
     ]
@@ -155,10 +157,10 @@ def _judge_tools(profile: RobotProfile, result: CommandResult, report: Report) -
 def _programs(plan: Plan, role: Role) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Yield each program that a step or fieldkit starts, with the setup files that must be sourced first."""
     yield from ((program, ()) for program in BASE_PROGRAMS)
-    yield from dict.fromkeys((planned.program, planned.setup) for planned in _planned(plan, role))
+    yield from dict.fromkeys((job.program, job.setup) for job in _planned_jobs(plan, role))
 
 
-def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
+def _planned_jobs(plan: Plan, role: Role) -> Iterator[Planned]:
     """Yield the jobs of steps and of the session on a robot."""
     for scene in plan.scenes():
         yield from (job for job in plan.jobs(scene) if job.role is role)
@@ -166,7 +168,13 @@ def _planned(plan: Plan, role: Role) -> Iterator[Planned]:
 
 
 def needs_of(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:
-    """Return the needs of steps on the robot that the probe checks, or that the agent checks, without duplicates."""
+    """Return the needs of steps on a robot, without duplicates.
+
+    Args:
+        plan: The trial.
+        role: Role of the robot.
+        by_agent: True for the needs that the agent checks, False for those that the probe checks.
+    """
     scene = plan.scenes()[0]
     steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, HasNeeds))
     needs = (need for step in steps for need in step.needs(scene) if need.role is role)

@@ -1,4 +1,4 @@
-"""Checks of a robot's system by the probe: kernel, disk, ports, battery."""
+"""Checks of a robot's system with the output of the probe: kernel, disk, ports, battery."""
 
 import re
 from pathlib import Path
@@ -17,7 +17,8 @@ from fieldkit.trial.plan import Plan
 MIN_BATTERY_PERCENT: Final = 20
 LONG_FETCH_S: Final = 60.0
 
-# File system, blocks of 1024 bytes, used, available (POSIX, df -P); long names do not wrap lines with -P.
+# Columns of `df -P` (POSIX): file system, blocks of 1024 bytes, used, available. With -P, long names do not wrap
+# lines.
 _DF: Final = re.compile(r"^\S.*\s[0-9]+\s+[0-9]+\s+(?P<free_kib>[0-9]{1,15})\s+[0-9]+%\s", re.MULTILINE)
 _BATTERY: Final = re.compile(r"^(?P<name>\S{1,60}) (?P<percent>[0-9]{1,3})$", re.MULTILINE)
 
@@ -29,7 +30,7 @@ def user_tools(sections: Sections) -> UserTools:
 
 
 def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
-    """Report the findings on kernel, disk, ports and battery."""
+    """Report findings about kernel, disk, ports and battery."""
     report.ok("system", sections.get("system", MISSING_SECTION).text)
     _judge_disk(plan, role, sections, report)
     scene = plan.scenes()[0]
@@ -42,24 +43,27 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
 
 
 def judge_laptop(plan: Plan, out: Path, report: Report) -> None:
-    """Report whether the disk of `out` has space for the trial, and whether fetching its evidence takes long."""
+    """Report the free space for the trial on the disk of `out`, and a warning if fetching the evidence takes long."""
     judge_disk_space(plan, files.free_bytes(out), files.nearest_existing(out), report)
     if (fetch_s := size.fetch_s(plan)) > LONG_FETCH_S:
         rate = size.FETCHED_BYTES_PER_S
         evidence, duration = format_bytes(rate * fetch_s), format_duration(fetch_s)
         report.warn(
             "fetch",
-            f"an attempt leaves about {evidence}: {duration} to fetch at {format_bytes(rate)}/s",
+            f"an attempt leaves about {evidence}, which takes {duration} to fetch at {format_bytes(rate)}/s",
             "record less (--record, fewer topics), or fetch over a cable: control: separate",
         )
 
 
 def judge_disk_space(plan: Plan, free: int, folder: Path, report: Report) -> None:
-    """Report whether the laptop has space: a failure without space for one attempt, a warning for the whole trial.
+    """Report the free space on the laptop.
+
+    The check fails if the space is not sufficient for one attempt. It gives a warning if the space is not sufficient
+    for the whole trial.
 
     Args:
         plan: The trial.
-        free: Bytes free in `folder`.
+        free: Free bytes in `folder`.
         folder: Folder of the trial.
         report: Receives the finding.
     """
@@ -84,19 +88,21 @@ def _judge_disk(plan: Plan, role: Role, sections: Sections, report: Report) -> N
     detail = f"{format_bytes(free)} free, {format_bytes(needed)} needed"
     if free < needed:
         report.fail(
-            "disk", detail, "du -sh ~/.fieldkit/* ~/*.bag   # evidence that was not fetched, old bags: delete"
+            "disk", detail, "du -sh ~/.fieldkit/* ~/*.bag   # delete old bags, and evidence that was not fetched"
         )
     else:
         report.ok("disk", detail)
 
 
 def _judge_port(port: int, sections: Sections, report: Report) -> None:
-    """Report whether a program listens on `port`; the second column of /proc/net/tcp is `ADDRESS:PORT` in hex."""
+    """Report if a program listens on `port`. The second column of /proc/net/tcp is `ADDRESS:PORT` in hexadecimal."""
     columns = map(str.split, sections.get("listeners", MISSING_SECTION).text.splitlines())
     if any(len(words) > 1 and words[1].endswith(f":{port:04X}") for words in columns):
         tool = "netstat" if report.user_tools and "ss" not in report.user_tools.programs else "ss"
         report.fail(
-            f"port {port}", "a program listens on it", f"sudo {tool} -lntup | grep :{port}   # shows it; stop it"
+            f"port {port}",
+            "a program listens on it",
+            f"sudo {tool} -lntup | grep :{port}   # find this program and stop it",
         )
     else:
         report.ok(f"port {port}", "free")

@@ -1,4 +1,4 @@
-"""Check of a robot's telemetry sources: each is queried once; an entry point of `fieldkit.checks`."""
+"""Check of a robot's telemetry sources, each of which is queried once; an entry point of `fieldkit.checks`."""
 
 import os
 
@@ -9,12 +9,12 @@ from fieldkit.core.model import Role
 from fieldkit.remote.script import CALL, REPLY_S
 from fieldkit.remote.shell import Shell
 from fieldkit.trial.check.report import Report
-from fieldkit.trial.check.software import Probed
+from fieldkit.trial.check.software import ProbeResult
 from fieldkit.trial.plan import Plan
 
 
-def check_sources(plan: Plan, role: Role, shell: Shell, probed: Probed, report: Report) -> None:  # noqa: ARG001
-    """Report the values that each telemetry source of a robot gives, or the reason why it gives none.
+def check_sources(plan: Plan, role: Role, shell: Shell, probe_result: ProbeResult, report: Report) -> None:  # noqa: ARG001
+    """Report the values of each telemetry source of a robot, or the reason why a source gives no value.
 
     Raises:
         LinkError: The robot did not answer.
@@ -30,13 +30,13 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probed: Probed, report: 
         if source.at == "laptop":
             output = laptop_telemetry.query_once(source, os.environ)
         else:
-            address, tested, _, *rest = source.poll_words(profile.radio.interface)
-            words = (*CALL, "poll", "/", "-", address, tested, laptop_telemetry.ONCE, *rest)
+            address, interface, _, *options = source.poll_words(profile.radio.interface)
+            words = (*CALL, "poll", "/", "-", address, interface, laptop_telemetry.ONCE, *options)
             output = shell.run(words, deadline=Deadline.after(source.limit + REPLY_S), check=False).stdout
         readings = source_readings.parse(output, source)
         if readings.values:
-            known = ", ".join(f"{quantity} {cell(value)}" for quantity, value in readings.values[0].items())
-            report.ok(f"telemetry {name}", known)
+            values_text = ", ".join(f"{quantity} {cell(value)}" for quantity, value in readings.values[0].items())
+            report.ok(f"telemetry {name}", values_text)
         else:
             reason = readings.reason or "the query did not end"
             report.warn(f"telemetry {name}", f"no value: {reason}", _remedy(source.kind))
@@ -44,5 +44,5 @@ def check_sources(plan: Plan, role: Role, shell: Shell, probed: Probed, report: 
 
 def _remedy(kind: str) -> str:
     if kind == "modemmanager":
-        return "enable the extended signal: sudo mmcli -m any --signal-setup=2; without root it needs a polkit rule"
-    return "run its command by hand: fieldkit trial ... --dry-run shows it"
+        return "enable extended signal reports: sudo mmcli -m any --signal-setup=2; without root, add a polkit rule"
+    return "run the command of the source; this prints it: fieldkit trial ... --dry-run"

@@ -1,4 +1,4 @@
-"""Check of the time sources of robots: what sets each clock, and whether this agrees with the measured offsets."""
+"""Check of the robots' time sources: the program that sets each clock, and contradictions with measured offsets."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from fieldkit.trial.check.report import Report
 CHECK: Final = "time source"
 
 SNAPSHOT_S: Final = 15.0
-"""Timeout of a snapshot. Its sources end after 2 s; the rest is for a slow connection."""
+"""Timeout of a snapshot. Its sources need at most 2 s; the remaining time is for a slow connection."""
 
 _NO_PROGRAM: Final = "no program of the robot reports that it sets the clock"
 _INSTALL: Final = "sudo apt-get install chrony   # then add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf"
@@ -26,7 +26,7 @@ _REMEDIES: Final[Mapping[str, str]] = {
     "chronyd does not run": "sudo systemctl enable --now chrony",
     "chrony": "chronyc -n sources   # add a line `server ADDRESS iburst` to /etc/chrony/chrony.conf, restart chrony",
     "systemd-timesyncd": "sudo timedatectl set-ntp true   # and set NTP=ADDRESS in /etc/systemd/timesyncd.conf",
-    "ptp4l": "sudo pmc -u -b 0 'GET PORT_DATA_SET'   # does its network have a PTP master?",
+    "ptp4l": "sudo pmc -u -b 0 'GET PORT_DATA_SET'   # its network needs a PTP master",
 }
 """Remedy by problem, or by program."""
 
@@ -37,7 +37,7 @@ class RobotTime:
 
     Attributes:
         offset: Offset from the laptop's clock; None if the robot sent no time.
-        reports: Reports of its programs.
+        reports: Reports of the robot's programs.
     """
 
     offset: Offset | None
@@ -45,7 +45,7 @@ class RobotTime:
 
 
 def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
-    """Return the reports of a robot's programs on its clock; the job script must be installed.
+    """Return the reports of a robot's programs about its clock. The job script must be installed.
 
     Raises:
         LinkError: The robot did not answer.
@@ -56,7 +56,7 @@ def read_reports(shell: Shell) -> tuple[ClockReport, ...]:
 
 
 def read(shell: Shell) -> RobotTime:
-    """Log in on a robot, and return its clock; raises as `read_reports`."""
+    """Log in on a robot and return the state of its clock; raises as `read_reports`."""
     jobs.install(shell, Deadline.after(contact.CONTACT_S))
     exchanges = clock_exchanges.exchanges(shell, contact.CONTACT_S)
     return RobotTime(offset(exchanges) if exchanges else None, read_reports(shell))
@@ -66,9 +66,9 @@ def judge(reports: Sequence[ClockReport], report: Report, *, all_robots: bool = 
     """Add a finding for each program that sets a robot's clock.
 
     Args:
-        reports: Reports of its programs.
+        reports: Reports of the robot's programs.
         report: Receives the findings.
-        all_robots: Whether to add a finding for a robot without such a program.
+        all_robots: True to add a finding for a robot without such a program.
     """
     for clock_report in reports:
         if clock_report.problem:
@@ -86,7 +86,7 @@ def contradictions(times: Mapping[str, RobotTime]) -> Iterator[str]:
     """Yield a sentence for each pair of robots whose measured offset contradicts the reports of their programs.
 
     Args:
-        times: Clock by name of the robot.
+        times: Clocks by the names of the robots.
     """
     for (first, first_time), (second, second_time) in combinations(times.items(), 2):
         if first_time.offset is None or second_time.offset is None:
@@ -95,6 +95,6 @@ def contradictions(times: Mapping[str, RobotTime]) -> Iterator[str]:
             second_time.offset.offset_s - first_time.offset.offset_s,
             second_time.offset.error_s + first_time.offset.error_s,
         )
-        reports = clock_states.chosen(first_time.reports), clock_states.chosen(second_time.reports)
+        reports = clock_states.choose_report(first_time.reports), clock_states.choose_report(second_time.reports)
         if sentence := clock_states.contradiction((first, second), reports, measured):
             yield sentence

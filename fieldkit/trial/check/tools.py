@@ -13,9 +13,9 @@ from fieldkit.remote.command import printable, quote, with_environment
 from fieldkit.steps.variants import Netcat, PingTool, Recorder, Tool, Variants, expected
 
 PROBE_S: Final = 40.0
-"""Maximum duration of `probe`: each tool has 6 s, and Python on a small computer needs 3 s to start ros2."""
+"""Maximum duration of `probe`. Each tool has 6 s; on a small computer, Python needs 3 s to start ros2."""
 
-# POSIX sh: dash, bash, busybox ash. Standard input is empty, and a tool that does not exit is killed.
+# Runs in POSIX sh: dash, bash, busybox ash. Standard input is empty, and a tool that does not exit is killed.
 _PROBE_FUNCTION: Final = r"""run_tool() {
     printf '==> %s <==\n' "$1"
     shift
@@ -52,7 +52,7 @@ _STORAGES: Final = re.compile(r"-s \{(?P<ids>[a-z0-9_,\s]+)\}")
 
 
 def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...]:
-    """Return a read-only command that prints the output of each of `tools` for `parse`."""
+    """Return a command that prints the output of each tool for `parse`, and changes nothing on the robot."""
     names = profile.tools
     ros = profile.ros
     commands_by_tool: dict[Tool, tuple[tuple[str, tuple[str, ...]], ...]] = {
@@ -83,7 +83,7 @@ def probe(profile: RobotProfile, tools: Iterable[Tool] = Tool) -> tuple[str, ...
 
 
 def parse(output: bytes, profile: RobotProfile) -> Variants:
-    """Return the variants in the output of `probe`; tools that were not probed get the expected variant.
+    """Return the variants of tools, from the output of `probe`. A tool that was not probed has the expected variant.
 
     Raises:
         RobotError: A tool is missing, is of an unknown kind, or lacks a permission that it needs.
@@ -105,8 +105,8 @@ def parse(output: bytes, profile: RobotProfile) -> Variants:
     if _ECHO in outputs:
         _require_ping(outputs[_ECHO][0], profile.tools.ping, variants.ping)
     if Tool.CAPTURE in outputs:
-        immediate, versions[Tool.CAPTURE] = _capture(*outputs[Tool.CAPTURE], profile.tools.capture)
-        variants = replace(variants, immediate_mode=immediate)
+        has_immediate_mode, versions[Tool.CAPTURE] = _capture(*outputs[Tool.CAPTURE], profile.tools.capture)
+        variants = replace(variants, immediate_mode=has_immediate_mode)
     if Tool.RECORDER in outputs:
         variants = replace(variants, recorder=_recorder(*outputs[Tool.RECORDER], profile))
     return replace(variants, versions=MappingProxyType(versions))
@@ -125,7 +125,7 @@ def _sections(output: bytes) -> Iterator[tuple[str, tuple[str, int]]]:
 
 
 def _record_command(profile: RobotProfile) -> tuple[str, ...]:
-    """Return the record command without its options; empty for a program that may not support `--help`."""
+    """Return the record command without its options, or an empty tuple if the program may not support `--help`."""
     words = profile.ros.command.record if profile.ros else ("",)
     verbs = {"rosbag": ("record",), "ros2": ("bag", "record")}
     verb = verbs.get(PurePosixPath(words[0]).name)
@@ -136,16 +136,18 @@ def _netcat(text: str, code: int, program: str) -> tuple[Netcat, str]:
     for kind, pattern in _NETCATS:
         if match := pattern.search(text):
             return kind, printable(match[0].encode())
-    raise _unknown(text, code, program, "sudo apt-get install netcat-traditional, and netcat: nc.traditional in")
+    raise _unknown_tool_error(
+        text, code, program, "sudo apt-get install netcat-traditional, and netcat: nc.traditional in"
+    )
 
 
 def _ping(text: str, code: int, program: str) -> tuple[PingTool, str]:
     if match := _IPUTILS.search(text):
-        new = int(match["date"]) >= _NEW_IPUTILS
-        return PingTool.IPUTILS if new else PingTool.IPUTILS_OLD, printable(match[0].encode())
+        is_new = int(match["date"]) >= _NEW_IPUTILS
+        return PingTool.IPUTILS if is_new else PingTool.IPUTILS_OLD, printable(match[0].encode())
     if match := _BUSYBOX.search(text):
         return PingTool.BUSYBOX, printable(match[0].encode())
-    raise _unknown(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
+    raise _unknown_tool_error(text, code, program, "sudo apt-get install iputils-ping, and ping: ping in")
 
 
 def _require_ping(text: str, program: str, kind: PingTool) -> None:
@@ -161,7 +163,7 @@ def _require_ping(text: str, program: str, kind: PingTool) -> None:
 def _capture(text: str, code: int, program: str) -> tuple[bool, str]:
     if match := _TCPDUMP.search(text):
         return "--immediate-mode" in text, printable(match[0].encode())
-    raise _unknown(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
+    raise _unknown_tool_error(text, code, program, "sudo apt-get install tcpdump, and capture: tcpdump in")
 
 
 def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
@@ -184,22 +186,23 @@ def _recorder(text: str, code: int, profile: RobotProfile) -> Recorder:
         if default
         else Recorder.SQLITE3.removeprefix("ros2-")
     )
-    offered = _STORAGES.search(text)  # ROS 2 Foxy and older do not list the storages
+    offered_storages = _STORAGES.search(text)  # ROS 2 Foxy and older do not list the storages
     kinds = {"sqlite3": Recorder.SQLITE3, "mcap": Recorder.MCAP}
-    if offered and storage not in re.split(r"[,\s]+", offered["ids"]):
+    if offered_storages and storage not in re.split(r"[,\s]+", offered_storages["ids"]):
         return Recorder.NONE
     return kinds.get(storage, Recorder.NONE)
 
 
 def _timeout_error(command: str) -> RobotError:
     return RobotError(
-        f"{command} did not exit in time", remedy=f"is the robot busy? try again; on it: uptime; time {command}"
+        f"{command} did not exit in time",
+        remedy=f"the robot may be busy: try again, or run on it: uptime; time {command}",
     )
 
 
-def _unknown(text: str, code: int, program: str, remedy: str) -> RobotError:
+def _unknown_tool_error(text: str, code: int, program: str, remedy: str) -> RobotError:
     if code == _KILLED:
         return _timeout_error(program)
-    what = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
+    problem = f"there is no {program}" if code in _MISSING else f"{program} is of an unknown kind"
     excerpt = printable(text.encode(), limit=100)
-    return RobotError(f"{what}: {excerpt}" if excerpt else what, remedy=f"{remedy} its profile")
+    return RobotError(f"{problem}: {excerpt}" if excerpt else problem, remedy=f"{remedy} its profile")

@@ -92,10 +92,10 @@ class Attempts:
             if reasons:
                 self._robots.check_alive()  # fails immediately if a process that the robots need has exited
             else:
-                self._ledger.measured(started)
+                self._ledger.record_measured(started)
                 self._reached = Status.MEASURED
             self._sink(PhaseStarted("collect evidence", str(repeat)))
-            reasons += self._robots.fetch(remote, partial, clean=not reasons)
+            reasons += self._robots.fetch(remote, partial, ended_normally=not reasons)
             verdict = self._judge(started, partial)
             for note in verdict.notes:
                 self._sink(Note(f"{repeat}: {note}"))
@@ -109,7 +109,7 @@ class Attempts:
                 self._robots.check_alive()
                 self._robots.require_locks()  # an attempt aborted by another user is not counted
         invalid = Status.FAILED if has_failed or self._ledger.is_last(repeat) else Status.VOID
-        reasons = [*hosts.without_effects(reasons), *notes]
+        reasons = [*hosts.drop_effects_of_reboots(reasons), *notes]
         ended = replace(started, status=invalid if reasons else Status.VALID, reason="; ".join(reasons))
         self._ledger.commit(partial, ended, verdict.measured)
         if has_failed:
@@ -127,7 +127,7 @@ class Attempts:
         committed = store.unjournalled_attempt(self._folder, interrupted_attempt.folders)
         evidence_folder = committed or store.reopen_attempt(self._folder, interrupted_attempt.repeat)
         # Partial evidence of an interrupted attempt is stored like the evidence of any void attempt.
-        missing = [] if committed else self._robots.fetch(remote, evidence_folder, clean=was_measured)
+        missing = [] if committed else self._robots.fetch(remote, evidence_folder, ended_normally=was_measured)
         verdict = self._judge(interrupted_attempt, evidence_folder)
         if not committed:
             step_errors.store(verdict.step_errors, evidence_folder)
@@ -177,7 +177,7 @@ class Attempts:
                 self._robots.end_jobs(started.remote(self._plan.trial))
             if isinstance(error, OSError):
                 raise  # nothing more can be written; resume continues from the started attempt
-            is_fetched_later = self._reached is Status.MEASURED and not self._robots.transient
+            is_fetched_later = self._reached is Status.MEASURED and not self._robots.is_transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
                 raise  # the attempt is intact: resume fetches the rest of it
             reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)

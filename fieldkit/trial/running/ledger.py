@@ -58,10 +58,11 @@ class Ledger:
         if not entries:
             now = time.time_ns()
             planned = (
-                JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in plan.order()
+                JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED)
+                for repeat in plan.repeats_in_order()
             )
             journal.append(folder, *planned)
-        ended = journal.ended(entries)
+        ended = journal.ended_attempts(entries)
         for attempt in ended:
             self._rename(attempt)
         self.differences = dict(self._manifest_differences(ended))
@@ -73,13 +74,13 @@ class Ledger:
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
             is_known = number < len(unchanged) and not attempt.reopened  # a reopened attempt changes its row
-            row = {} if is_known else rows.measured(plan, attempt, AttemptEvidence(evidence))
+            row = {} if is_known else rows.measure_row(plan, attempt, AttemptEvidence(evidence))
             self._add_line(attempt, unchanged[number] if is_known else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)
-        self.ended = tuple(ended)
+        self.ended_attempts = tuple(ended)
         """The attempts that ended in earlier runs, in order."""
-        self.interrupted = tuple(journal.interrupted(entries))
+        self.interrupted_attempts = tuple(journal.interrupted_attempts(entries))
         """Attempts during which fieldkit was killed; they must be completed first."""
 
     @property
@@ -97,7 +98,7 @@ class Ledger:
         return repeat in self._finished
 
     @property
-    def done(self) -> int:
+    def finished_count(self) -> int:
         """Number of repeats that are over."""
         return len(self._finished)
 
@@ -117,7 +118,7 @@ class Ledger:
             self._manifest.write()
         return started
 
-    def measured(self, attempt: Attempt) -> None:
+    def record_measured(self, attempt: Attempt) -> None:
         """Record that the steps of an attempt are done and its evidence is on the robots; errors as for `begin`."""
         self._append(attempt, time.time_ns(), Status.MEASURED)
 
@@ -170,7 +171,7 @@ class Ledger:
         self._in_table = len(self._lines)
 
     def _table(self) -> str:
-        return rows.head(self._plan.table) + "".join(self._lines)
+        return rows.header(self._plan.table) + "".join(self._lines)
 
     def _manifest_differences(self, ended: list[Attempt]) -> Iterator[tuple[str, str]]:
         if not (self._folder / store.MANIFEST_FILE).exists():
@@ -190,7 +191,7 @@ class Ledger:
             return []
         text = files.read(self._folder / store.TRIAL_CSV).decode()
         head, *lines = text.splitlines(keepends=True)[:line_count]
-        return lines if head == rows.head(self._plan.table) and len(lines) <= ended else []
+        return lines if head == rows.header(self._plan.table) and len(lines) <= ended else []
 
     def _require_evidence(self, attempts: list[Attempt]) -> None:
         """Raise an error if evidence that must be measured again has changed."""

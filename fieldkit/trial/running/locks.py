@@ -113,7 +113,7 @@ class LockState:
     left_s: float
 
 
-def holder(shell: Shell) -> LockState | None:
+def read_lock(shell: Shell) -> LockState | None:
     """Return the lock of a robot that has the job script, or None if it is not locked.
 
     Raises:

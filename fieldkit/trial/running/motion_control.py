@@ -76,7 +76,7 @@ class _NoMotion:
 
 def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
     """Call `MotionSupport.require_one_place` if robots move in one of the trials."""
-    if any(plan.procedure.moved() for plan in plans):
+    if any(plan.procedure.moved_roles() for plan in plans):
         _control().require_one_place(plans, backend, operator)
 
 
@@ -84,7 +84,9 @@ def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
     """Return the permission of a trial; raises as `MotionSupport.permission`."""
     # Even if this trial has no moves, a fault in another trial of its campaign may have stopped a robot.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
-    return _control().permission(plan, testbed, folder) if plan.procedure.moved() or has_journal else _NoMotion()
+    return (
+        _control().permission(plan, testbed, folder) if plan.procedure.moved_roles() or has_journal else _NoMotion()
+    )
 
 
 def _control() -> MotionSupport:

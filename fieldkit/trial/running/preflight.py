@@ -21,14 +21,14 @@ from fieldkit.steps.variants import Variants
 from fieldkit.trial import session_jobs, store
 from fieldkit.trial.check import contact, probe, radio, software, system
 from fieldkit.trial.check.report import LAPTOP, Report
-from fieldkit.trial.check.software import Probed
+from fieldkit.trial.check.software import ProbeResult
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.locks import LockState
 
 JOBS_S: Final = 10.0
 
-RobotCheck = Callable[[Plan, Role, Shell, Probed, Report], None]
+RobotCheck = Callable[[Plan, Role, Shell, ProbeResult, Report], None]
 """A check that a package adds to `fieldkit check`, after all others. It adds its findings to the report, and raises
 `LinkError` if the robot did not answer, `RobotError` if it could not be checked."""
 
@@ -60,7 +60,7 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
 
 
 @dataclass(frozen=True)
-class Checked:
+class CheckResult:
     """Result of a check.
 
     Attributes:
@@ -74,7 +74,7 @@ class Checked:
 
 def check(
     plan: Plan, shells: Shells, out: Path, *, all_checks: bool, fleet_checks: Sequence[FleetCheck] = ()
-) -> Checked:
+) -> CheckResult:
     """Check every robot of the cast and this machine, and install the job script on each robot.
 
     Args:
@@ -101,7 +101,7 @@ def check(
     elif fleet_checks:  # their packets would disturb the radio of the other user
         laptop.warn("network", "not checked, because a robot is locked", HELD_REMEDY)
     system.judge_laptop(plan, out, laptop)
-    return Checked(_all_findings([*reports.values(), laptop]), variants_by_role)
+    return CheckResult(_all_findings([*reports.values(), laptop]), variants_by_role)
 
 
 def check_before_trial(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
@@ -159,7 +159,7 @@ def _check(
         stage = "jobs"
         jobs.install(shell, Deadline.after(JOBS_S))
         # A trial has locked its robots already. A recording would disturb jobs of another user.
-        if all_checks and not _judge_lock(locks.holder(shell), report):
+        if all_checks and not _judge_lock(locks.read_lock(shell), report):
             return False
         _judge_jobs(plan, jobs.list_running(shell, Deadline.after(JOBS_S)), report)
         stage = "agent"
@@ -173,7 +173,7 @@ def _check(
         for point in plugins.entry_points(plugins.CHECKS):
             stage = point.name
             robot_check: RobotCheck = plugins.load(point)
-            robot_check(plan, role, shell, Probed(sections, variants_by_role[role]), report)
+            robot_check(plan, role, shell, ProbeResult(sections, variants_by_role[role]), report)
     except FieldkitError as error:
         report.fail(stage, error.what, error.remedy)
     return True

@@ -12,6 +12,7 @@ from fieldkit.core.prompts import Operator
 from fieldkit.trial import journal, step_packages
 from fieldkit.trial.hashes import code_hash
 from fieldkit.trial.plan import Plan, simulators_text
+from fieldkit.trial.running import radio_settings
 from fieldkit.trial.running.opening import opened
 from fieldkit.trial.running.runner import Outcome, converting_write_errors, place, run_repeats
 from fieldkit.trial.running.stop import Stop
@@ -84,6 +85,7 @@ def continue_trial(
         FieldkitError: As for `begin`.
     """
     plan = resumable(folder)
+    radio_settings.require_unchanged(plan, testbed.shells)
     with journal.locked(folder), converting_write_errors(folder):
         if failed and not journal.reopen_failed(folder, plan) and report_resume:
             sink(Note("no repeat of this trial failed"))
@@ -166,7 +168,7 @@ def require_cast(plan: Plan, cast: Cast) -> None:
     """
     for role, robot in plan.cast.items():
         current = cast.get(role)
-        is_moved = role in plan.procedure.moved()
+        is_moved = role in plan.procedure.moved_roles()
         if current and is_moved and robot.abilities - current.abilities:
             options = " ".join(map(permissions.option, permissions.repeated(permissions.installed())))
             raise ConfigurationError(
@@ -185,7 +187,7 @@ def require_cast(plan: Plan, cast: Cast) -> None:
 
 def _step_code_changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
     """Yield a sentence for each kind of step whose code differs from the plan although the version is equal."""
-    for kind, current in step_packages.of_kinds(planned).items():
+    for kind, current in step_packages.packages_of_kinds(planned).items():
         frozen = planned[kind]
         if (frozen.package, frozen.version) == (
             current.package,

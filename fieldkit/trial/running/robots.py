@@ -49,13 +49,13 @@ class Robots:
         self._plan = plan
         self._testbed = testbed
         self._sink = sink
-        self.transient = isinstance(testbed, Transient)
+        self.is_transient = isinstance(testbed, Transient)
         """Whether the robots and their files are removed at the end of this run of fieldkit."""
         self._roles = sorted(plan.procedure.roles())
         protocol = plan.procedure.protocols[0]
-        self._owners = FileOwners.of(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
+        self._owners = FileOwners.of_procedure(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
         self._is_fetch_cancelled = False
-        self.unfetched = UnfetchedEvidence(plan, self._roles, transient=self.transient)
+        self.unfetched = UnfetchedEvidence(plan, self._roles, transient=self.is_transient)
         """Evidence that was not fetched and stays on the robots."""
         self._boots: dict[Role, str] = {}
 
@@ -159,16 +159,16 @@ class Robots:
                     self.close_connections()
 
         watching = Thread(target=watch, name="testbed", daemon=True)
-        if self.transient:
+        if self.is_transient:
             watching.start()
         try:
             yield
         finally:
             ended.set()
-            if self.transient:
+            if self.is_transient:
                 watching.join()
 
-    def fetch(self, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def fetch(self, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         """Fetch an attempt's evidence; if it did not end normally, its jobs are ended first.
 
         Evidence that was not fetched stays on its robot, and `ROLE-unfetched.txt` records it.
@@ -176,20 +176,20 @@ class Robots:
         Args:
             remote: The attempt's folder on each robot.
             into: The local folder.
-            clean: Whether the attempt ended normally.
+            ended_normally: True if the attempt ended normally.
 
         Returns:
             The problems, one sentence each.
         """
         self._is_fetch_cancelled = False
-        problems = self._run_on_all(lambda role: self._collect(role, remote, into, clean=clean))
+        problems = self._run_on_all(lambda role: self._collect(role, remote, into, ended_normally=ended_normally))
         failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
         for role, reason, is_there in failed:
             if is_there:
                 self.unfetched.mark(role, remote, into, reason)
         return [reason for _, reason, _ in failed]
 
-    def _collect(self, role: Role, remote: str, into: Path, *, clean: bool) -> tuple[str, bool] | None:
+    def _collect(self, role: Role, remote: str, into: Path, *, ended_normally: bool) -> tuple[str, bool] | None:
         """Fetch the evidence of one robot; return the problem and whether the robot still has it, or None."""
         shell, attempt = self.shells[role], remote.rpartition("/")[2]
 
@@ -200,7 +200,7 @@ class Robots:
         progress = FetchProgress(announce, lambda: self._is_fetch_cancelled)
         expected_bytes = size.evidence_bytes(self._plan, role)
         try:
-            if not clean:
+            if not ended_normally:
                 evidence.end_jobs(shell, remote)
             fetching.fetch(
                 shell,
@@ -216,14 +216,14 @@ class Robots:
             return error.located, True
         except (RobotError, EvidenceError) as error:
             return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateJobError))
-        rebooted = None if clean else self._reboot_message(role)
+        rebooted = None if ended_normally else self._reboot_message(role)
         return (rebooted, False) if rebooted else None
 
     def _reboot_message(self, role: Role) -> str | None:
         """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
-        booted = self._boots.get(role) if role not in hosts.restarted(self._plan.procedure) else None
+        booted = self._boots.get(role) if role not in hosts.restarted_roles(self._plan.procedure) else None
         with suppress(FieldkitError):
-            if booted and hosts.rebooted(booted, evidence.boot_id(self.shells[role])):
+            if booted and hosts.has_rebooted(booted, evidence.boot_id(self.shells[role])):
                 return f"{self._plan.cast[role].name}: {hosts.REBOOTED}"
         return None
 

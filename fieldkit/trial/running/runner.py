@@ -29,7 +29,7 @@ from fieldkit.core.units import TimeEstimate
 from fieldkit.trial import estimates, journal, rows, store
 from fieldkit.trial.estimates import FinishedRepeat
 from fieldkit.trial.plan import Plan
-from fieldkit.trial.running import motion_control, preflight
+from fieldkit.trial.running import motion_control, preflight, radio_settings
 from fieldkit.trial.running.attempts import Attempts
 from fieldkit.trial.running.ledger import Ledger
 from fieldkit.trial.running.robots import Robots
@@ -72,18 +72,18 @@ class PlacementResult:
 
     Attributes:
         answer: The operator's answer: a note, or a request to skip the trial.
-        took_s: Duration in seconds.
+        duration_s: Duration in seconds.
     """
 
     answer: Answer
-    took_s: float
+    duration_s: float
 
 
 def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
     """Bring the robots to the places of a trial; errors as for `Testbed.place`."""
     started_s = time.monotonic()
     placement = PlacementResult(testbed.place(plan.placement), time.monotonic() - started_s)
-    sink(Placed(placement.answer.skip, placement.answer.note, placement.took_s))
+    sink(Placed(placement.answer.skip, placement.answer.note, placement.duration_s))
     return placement
 
 
@@ -108,6 +108,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
         RobotError: A preflight check failed.
         KeyboardInterrupt: A stop was requested.
     """
+    plan = plan.model_copy(update={"radios": radio_settings.read(plan, testbed.shells)})
     folder = store.create(out, plan)
     sink(Note(f"trial {folder}"))
     with journal.locked(folder), converting_write_errors(folder):
@@ -120,16 +121,16 @@ def run_repeats(
     """Run the remaining repeats of a trial whose journal is locked by this process."""
     ledger = Ledger(plan, folder, stop)
     robots = Robots(plan, testbed, sink)
-    for ended in ledger.ended:
+    for ended in ledger.ended_attempts:
         robots.unfetched.restore(ended, store.attempt_folder(folder, ended.folder))
-    repeats = list(plan.order())
+    repeats = list(plan.repeats_in_order())
     finished = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
         from fieldkit.trial.stored import verification  # noqa: PLC0415 (only a resumed trial has a manifest)
 
         sink(Note(f"the evidence has changed since it was stored: {verification.summarize(ledger.differences)}"))
     try:
-        sink(TrialStarted(str(folder), ledger.done, len(repeats)))
+        sink(TrialStarted(str(folder), ledger.finished_count, len(repeats)))
         robots.stop_leftover_jobs()
         sink(PhaseStarted("check"))
         variants = preflight.check_before_trial(plan, robots.shells, folder, sink)
@@ -144,7 +145,7 @@ def run_repeats(
             motions=stop.motions,
             origins=permission.origins,
         )
-        for interrupted in ledger.interrupted:
+        for interrupted in ledger.interrupted_attempts:
             attempts.recover(interrupted)
         for repeat in repeats:
             started_s = time.monotonic()
@@ -163,7 +164,7 @@ def run_repeats(
                     )
     except BaseException as error:
         if report_resume:
-            sink(TrialStopped(str(folder), ledger.done, len(repeats)))
+            sink(TrialStopped(str(folder), ledger.finished_count, len(repeats)))
         if isinstance(error, OSError):
             raise  # nothing more can be written
         _report_unfetched(robots, sink)
@@ -220,7 +221,9 @@ def _report_unfetched(robots: Robots, sink: Sink) -> None:
 def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], finished: Sequence[FinishedRepeat]) -> TimeEstimate:
     """Return the estimated duration of the remaining repeats."""
     counts = Counter(repeat.protocol for repeat in remaining)
-    return estimates.total(estimates.of_repeats(plan, protocol, counts[protocol], finished) for protocol in counts)
+    return estimates.total(
+        estimates.estimate_repeats(plan, protocol, counts[protocol], finished) for protocol in counts
+    )
 
 
 def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
@@ -231,7 +234,7 @@ def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, re
         status=attempt.status,
         reason=attempt.reason,
         summary=rows.describe(plan, row),
-        done=ledger.done,
+        done=ledger.finished_count,
         total=total,
         left_s=left.likely_s,
         remedy=remedy,

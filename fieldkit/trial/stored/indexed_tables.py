@@ -17,7 +17,7 @@ from fieldkit.core.executors import Workers
 from fieldkit.core.tasks import completed
 from fieldkit.trial import frozen
 from fieldkit.trial.plan import PLAN_FILE
-from fieldkit.trial.stored.tables import expected, frozen_columns, other_names
+from fieldkit.trial.stored.tables import expectation_texts, frozen_columns, other_names
 
 MIN_TABLES: Final = 100
 """Smallest number of tables for which an index is made; fewer tables are read faster without an index."""
@@ -132,7 +132,7 @@ def _facts(tables: Sequence[Path], workers: Workers, note: Note) -> dict[Path, T
     facts = {}
     for table, text in declarations.items():
         with suppress(FieldkitError, OSError):
-            facts[table] = TableFacts(names[table], text, expected(table))
+            facts[table] = TableFacts(names[table], text, expectation_texts(table))
     return facts
 
 

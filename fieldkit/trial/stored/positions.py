@@ -19,7 +19,7 @@ from fieldkit.measure.positions.samples import LOCAL, WGS84
 from fieldkit.trial import gates, journal, manifest, store
 from fieldkit.trial.plan import Plan
 from fieldkit.trial.stored import plans, verification
-from fieldkit.trial.stored.rebuild import Rebuilt, rebuild
+from fieldkit.trial.stored.rebuild import RebuildResult, rebuild
 
 MAX_BYTES: Final = 64 << 20
 """Maximum size of a position file: one day at 10 Hz as GPX."""
@@ -44,7 +44,7 @@ class AttemptPositions:
 
 def set_positions(
     folder: Path, sources: Mapping[Role, Path | PositionSource], *, offset_s: float, gap_s: float, heights: bool
-) -> Rebuilt:
+) -> RebuildResult:
     """Store positions of robots with a trial, replace positions that were added before, and rebuild its tables.
 
     Args:
@@ -170,7 +170,7 @@ def attempt_positions(folder: Path) -> Iterator[AttemptPositions]:
         EvidenceError: The journal is damaged.
     """
     plan = plans.read_plan(folder)
-    for attempt in journal.ended(journal.history(folder, plan)):
+    for attempt in journal.ended_attempts(journal.history(folder, plan)):
         if attempt.status is Status.VALID:
             evidence = AttemptEvidence(store.attempt_folder(folder, attempt.folder))
             measured = gates.judge(plan, attempt.repeat, evidence).measured

@@ -18,7 +18,7 @@ from fieldkit.trial.stored import plans, verification
 
 
 @dataclass(frozen=True)
-class Rebuilt:
+class RebuildResult:
     """Result of `rebuild`.
 
     Attributes:
@@ -34,7 +34,7 @@ class Rebuilt:
     has_manifest: bool
 
 
-def rebuild(folder: Path) -> Rebuilt:
+def rebuild(folder: Path) -> RebuildResult:
     """Write trial.csv and summary.csv of the trial in `folder` again.
 
     Raises:
@@ -63,10 +63,10 @@ def rebuild(folder: Path) -> Rebuilt:
             manifest.Manifest(folder).renew(names)
     changed = tuple(name for name in names if _content(folder / name) != before[name])
     expected = frozenset(expectation.quantity for expectation in plan.procedure.expectations)
-    return Rebuilt(cells=cells, changed=changed, expected=expected, has_manifest=has_manifest)
+    return RebuildResult(cells=cells, changed=changed, expected=expected, has_manifest=has_manifest)
 
 
-def measured(folder: Path, plan: Plan) -> list[Row]:
+def measure_rows(folder: Path, plan: Plan) -> list[Row]:
     """Return the rows of a trial's attempts, measured again from the evidence; nothing is written.
 
     Raises:
@@ -76,9 +76,9 @@ def measured(folder: Path, plan: Plan) -> list[Row]:
 
 
 def _rows(folder: Path, plan: Plan, entries: list[JournalEntry]) -> list[Row]:
-    attempts = journal.ended(entries)
+    attempts = journal.ended_attempts(entries)
     return [
-        rows.measured(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder)))
+        rows.measure_row(plan, attempt, AttemptEvidence(store.attempt_folder(folder, attempt.folder)))
         for attempt in attempts
     ]
 

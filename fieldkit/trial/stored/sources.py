@@ -101,7 +101,7 @@ class Sources:
         """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
         return tuple(self.sweep_columns)
 
-    def chosen(
+    def select(
         self, names: Collection[str], *, option: str = "--quantity"
     ) -> tuple[list[Quantity] | None, list[Column] | None]:
         """Return the quantities and the word columns of some names; both are None, meaning all, if no name is given.
@@ -136,7 +136,7 @@ class Sources:
         by_source: dict[str, list[Expectation]] = {}
         for table in self.tables:
             facts = self.indexed.facts(table)
-            for text in tables.expected(table) if facts is None else facts.expected:
+            for text in tables.expectation_texts(table) if facts is None else facts.expected:
                 try:
                     expectation = expectations.parse(text, self.quantities.values())
                 except ConfigurationError as error:  # the plan is of an earlier version, or was edited
@@ -225,7 +225,7 @@ def find(
         use_index: Whether to read many tables from an index; the result is the same.
 
     Raises:
-        ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_in`.
+        ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_columns`.
         EvidenceError: No trial has its table.
     """
     return find_each([paths], note, rebuild=rebuild, workers=workers, use_index=use_index)[0]
@@ -243,7 +243,7 @@ def find_each(
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
     all_tables = list(dict.fromkeys(table for run_tables in tables_by_run for table in run_tables))
     indexed = indexed_tables.find(all_tables, workers, note) if use_index and not rebuild else NO_INDEX
-    columns = tables.planned(all_tables) if rebuild else tables.declared_in(all_tables, indexed.facts)
+    columns = tables.planned_columns(all_tables) if rebuild else tables.declared_columns(all_tables, indexed.facts)
     indexed = indexed_tables.write(indexed, columns, note)
     return [
         Sources(_paths_text(paths), run_tables, columns, rebuild, note, workers, indexed=indexed)
@@ -370,7 +370,7 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
         )
     plan = plans.read_plan(folder)
     note_differences(folder, note)
-    return rows.to_csv(rebuild.measured(folder, plan), plan.table).encode()
+    return rows.to_csv(rebuild.measure_rows(folder, plan), plan.table).encode()
 
 
 def note_differences(folder: Path, note: Note) -> None:

@@ -12,7 +12,7 @@ from fieldkit.core import files
 from fieldkit.core.columns import Column, plain_name, with_step_name
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.trial import frozen, store
-from fieldkit.trial.columns import installed, trial_columns
+from fieldkit.trial.columns import installed_columns, trial_columns
 from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored import plans
 
@@ -20,11 +20,11 @@ Facts = Callable[[Path], TableFacts | None]
 """Returns the properties of a table that are known without reading it; None if they are unknown."""
 
 
-def unknown(_: Path) -> None:
+def no_facts(_: Path) -> None:
     """Return no properties."""
 
 
-def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column, ...]:
+def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[Column, ...]:
     """Return all columns of the tables: first the columns of every trial, then others in the order of the tables.
 
     A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
@@ -45,12 +45,12 @@ def declared_in(tables: Sequence[Path], facts: Facts = unknown) -> tuple[Column,
         for known_facts in [facts(table)]
         for columns in [frozen_columns(table) if known_facts is None else frozen.from_json(known_facts.declarations)]
     )
-    installed_columns = {column.name: column for column in installed()}
+    columns_by_name = {column.name: column for column in installed_columns()}
     other_names = dict.fromkeys(name for names in others.values() for name in names)
-    return trial_columns(planned_columns.get(name) or _by_name(name, installed_columns) for name in other_names)
+    return trial_columns(planned_columns.get(name) or _by_name(name, columns_by_name) for name in other_names)
 
 
-def planned(tables: Iterable[Path]) -> tuple[Column, ...]:
+def planned_columns(tables: Iterable[Path]) -> tuple[Column, ...]:
     """Return every column in the plans of tables; errors as for `declared_in`, or if a plan cannot be read."""
     plan_files = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
     everywhere = set(trial_columns())
@@ -112,7 +112,7 @@ def frozen_columns(table: Path) -> tuple[Column, ...]:
     return plans.read_columns(plan) if plan.exists() and not files.unexpected_type(plan) else ()
 
 
-def expected(table: Path) -> tuple[str, ...]:
+def expectation_texts(table: Path) -> tuple[str, ...]:
     """Return the expectations in the plan of a trial's table; a CSV file without its trial has none.
 
     Raises:

@@ -27,7 +27,7 @@ def add(parser: Parser) -> None:
     _add_satisfy(commands)
     _add_plot(commands)
     _add_replay(commands)
-    _conform(commands)
+    _add_conform(commands)
     _add_sdf(commands)
     _add_list(commands)
     _add_schema(commands)
@@ -56,7 +56,7 @@ def _add_run(commands: Commands) -> None:
         "--realtime",
         metavar="FACTOR",
         help="run at this number of simulated seconds per second, for example 1, one run after the other; a run that "
-        "cannot keep up has no results",
+        "is slower has no results",
     )
     parser.add_argument(
         "--late-bound",
@@ -104,9 +104,9 @@ def _add_sweep(commands: Commands) -> None:
         required=True,
         type=Path,
         metavar="FOLDER",
-        help="folder of the sweep: a new one, or to continue",
+        help="folder of the sweep: a new folder, or the folder of a sweep to continue",
     )
-    parser.add_argument("--again", action="store_true", help="also try runs again that failed three times")
+    parser.add_argument("--again", action="store_true", help="also repeat runs that have failed three times")
     add_workers(parser)
     add_json(parser)
     parser.set_defaults(run=f"{_PACKAGE}.sweep:run")
@@ -116,8 +116,8 @@ def _add_shootout(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "shootout",
         help="measure the error and the cost of each sync policy",
-        description="Run a scenario with every sync policy; report the error of each relative to the exact reference "
-        "with the same seed, and its cost.",
+        description="Run a scenario with every sync policy; report the error of each policy relative to the exact "
+        "reference with the same seed, and the cost of the policy.",
         epilog="example: fieldkit cosim shootout baylands --window 1ms,10ms,100ms --figure shootout.svg",
     )
     _add_scenario(parser)
@@ -135,7 +135,8 @@ def _add_shootout(commands: Commands) -> None:
     modes.add_argument(
         "--bound",
         action="store_true",
-        help="number of exchanges that keep the scenario's policy.bound, with error_bounded and with fixed windows",
+        help="number of exchanges needed to keep the scenario's policy.bound, with error_bounded and with fixed "
+        "windows",
     )
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
@@ -149,8 +150,8 @@ def _add_table(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "table",
         help="regenerate a table of the paper",
-        description="Run the simulations of a table of the paper, and print each of its numbers next to ours with "
-        "its interval and the result of the comparison.",
+        description="Run the simulations of a table of the paper. Print each number of the paper next to ours, with "
+        "the interval of our number and the result of the comparison.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
     parser.add_choice(
@@ -160,7 +161,7 @@ def _add_table(commands: Commands) -> None:
         help="1, 2 or 3: tables of its simulations; emane: its emulation; claims: its claims",
     )
     seeds = parser.add_mutually_exclusive_group()
-    _add_seed(seeds, "see --seeds")
+    _add_seed(seeds, "the seeds of --seeds")
     seeds.add_argument(
         "--seeds", type=repeats, default=20, metavar="N", help="run each row N times, with seeds 1 to N (default 20)"
     )
@@ -174,8 +175,8 @@ def _add_satisfy(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "satisfy",
         help="run the paper's satisfaction loop, and report its effect",
-        description="Run a scenario repeatedly, as the paper does, each time with the window that its rule "
-        "computed in the previous round, until the loss is accepted; report the error of each round relative to the "
+        description="Run a scenario repeatedly, as the paper does, until the loss is accepted. Each round uses the "
+        "window that the paper's rule computed in the previous round. Report the error of each round relative to the "
         "exact reference.",
         epilog="example: fieldkit cosim satisfy baylands --set agents.husky-2.along=60m --threshold 10%",
     )
@@ -187,13 +188,13 @@ def _add_satisfy(commands: Commands) -> None:
         "--policy",
         ("velocity_aware_raw", "velocity_aware"),
         default="velocity_aware_raw",
-        help="the rule: as the paper prints it (default), or corrected so that each window is positive",
+        help="the rule: as printed in the paper (default), or corrected so that each window is positive",
     )
     _add_window(parser, "window of the first round")
     parser.add_argument(
         "--rounds", type=repeats, default=20, metavar="N", help="largest number of rounds (default 20)"
     )
-    _add_seed(parser, "the scenario's first")
+    _add_seed(parser, "the first seed of the scenario")
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.satisfy:run")
 
@@ -220,12 +221,12 @@ def _add_replay(commands: Commands) -> None:
         description="Print the results of a recorded run; a recording that was changed or truncated is an error.",
     )
     _add_recording(parser)
-    parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write it as MCAP, for Foxglove")
+    parser.add_argument("--mcap", type=Path, metavar="FILE", help="also write the recording as MCAP, for Foxglove")
     _add_format(parser)
     parser.set_defaults(run=f"{_PACKAGE}.replay:run")
 
 
-def _conform(commands: Commands) -> None:
+def _add_conform(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "conform",
         help="check an external federate",
@@ -237,9 +238,11 @@ def _conform(commands: Commands) -> None:
         "federate",
         nargs="+",
         metavar="COMMAND",
-        help="its command, in one word or after --; or an address (fieldkit docs federates)",
+        help="command that starts the federate, as one word or after --; or its address (fieldkit docs federates)",
     )
-    parser.add_choice("--role", ("physics", "network"), help="its role (default: the first that it accepts)")
+    parser.add_choice(
+        "--role", ("physics", "network"), help="role of the federate (default: the first that it accepts)"
+    )
     parser.add_argument(
         "--scenario", default="convoy", metavar="SCENARIO", help="scenario that it receives (default convoy)"
     )
@@ -283,7 +286,7 @@ def _add_schema(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "schema",
         help="print the JSON schema of scenario files",
-        description="Print the JSON schema of scenario files, with which editors complete and check them.",
+        description="Print the JSON schema of scenario files. Editors use it to complete and check these files.",
     )
     parser.set_defaults(run=f"{_PACKAGE}.listing:print_schema")
 
@@ -306,7 +309,7 @@ def _add_changes(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="change a value of its file, for example agents.husky-2.along=40m; may be given more than once",
+        help="change a value of the scenario's file, for example agents.husky-2.along=40m; may be repeated",
     )
 
 
@@ -335,14 +338,14 @@ def _add_window(parser: Parser, meaning: str, **options: Any) -> None:  # noqa: 
     parser.add_argument("--window", **{"metavar": "TIME", "help": f"{meaning} (default: the scenario's)", **options})
 
 
-def _add_seed(parser: Any, default: str) -> None:  # noqa: ANN401 (a parser or a group of one)
+def _add_seed(parser: Any, default: str) -> None:  # noqa: ANN401 (a parser or a group of arguments)
     parser.add_argument("--seed", type=natural, metavar="N", help=f"seed of all random draws (default: {default})")
 
 
 def _add_seeds(parser: Parser) -> None:
     seeds = parser.add_mutually_exclusive_group()
-    _add_seed(seeds, "each of the scenario's")
-    seeds.add_argument("--seeds", type=repeats, metavar="N", help="run it N times, with seeds 1 to N")
+    _add_seed(seeds, "all seeds of the scenario")
+    seeds.add_argument("--seeds", type=repeats, metavar="N", help="run the scenario N times, with seeds 1 to N")
 
 
 def _add_format(parser: Parser) -> None:

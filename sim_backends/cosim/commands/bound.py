@@ -19,7 +19,7 @@ from sim_backends.cosim.run_record import Run
 from sim_backends.cosim.scenario.build import build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, fixed_cost, longest_for_all
+from sim_backends.cosim.studies.bounds import BoundCost, FixedCost, bound_cost, fixed_cost, longest_sufficient_window
 from sim_backends.cosim.studies.seeds import Task, run_many
 
 _COLUMNS: Final = (
@@ -29,7 +29,7 @@ _COLUMNS: Final = (
     SheetColumn("added_s", "added (ms)", "mean delay that error_bounded adds", 1e3),
     SheetColumn("all_window_s", "all (ms)", "longest fixed window that keeps the bound in all runs, by search", 1e3),
     SheetColumn("all_exchanges", "its exchanges", ""),
-    SheetColumn("all_factor", "factor", "its exchanges over those of error_bounded"),
+    SheetColumn("all_factor", "factor", "ratio of its exchanges to those of error_bounded"),
     SheetColumn("found_window_s", "own (ms)", "longest fixed window that keeps the bound in this run", 1e3),
     SheetColumn("found_exchanges", "its exchanges", ""),
     SheetColumn("found_factor", "factor", ""),
@@ -37,10 +37,10 @@ _COLUMNS: Final = (
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search for the fixed window that keeps the bound, for each seed; print its cost and the `error_bounded` cost.
+    """Search for the longest fixed window that keeps the bound; print its cost and that of `error_bounded`.
 
     Raises:
-        ConfigurationError: An option is given that applies to other modes only.
+        ConfigurationError: An option does not apply to this mode.
     """
     if arguments.figure is not None or arguments.policy or arguments.windows:
         raise ConfigurationError(
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         report = partial(progress_reporter(sink, "seeds"), "bound", len(seeds))
         report(0)
         costs = run_many(partial(_bound_cost, scenario), tasks, workers=workers, progress=report)
-        window_s, fixed_costs = longest_for_all(
+        window_s, fixed_costs = longest_sufficient_window(
             [cost.window_s for cost in costs],
             lambda fixed_s: run_many(partial(_fixed_cost, scenario, fixed_s), tasks, workers=workers),
             scenario.policy.bound,
@@ -127,7 +127,8 @@ def _summary(
     exchanges = sum(cost.exchanges for cost in costs)
     added_s = [cost.added_s for cost in costs if not math.isnan(cost.added_s)]
     text = (
-        f"error_bounded keeps {number_text(scenario.policy.bound * 1e3)} mm in {format_count(exchanges, 'exchange')}"
+        f"error_bounded keeps the bound of {number_text(scenario.policy.bound * 1e3)} mm with "
+        f"{format_count(exchanges, 'exchange')}"
     )
     if added_s:
         text += (
@@ -136,17 +137,18 @@ def _summary(
             f"{number_text(scenario.policy.longest * 500)} ms"
         )
     if not fixed_costs:
-        return f"{text}, and no fixed window keeps it"
+        return f"{text}, and no fixed window keeps the bound"
     fixed_exchanges = sum(cost.exchanges for cost in fixed_costs)
     run_exchanges = sum(cost.fixed_exchanges for cost in costs)
     text += (
-        f"; the fixed window that keeps it in {format_count(len(costs), 'run')}, {number_text(window_s * 1e3)} ms, "
-        f"needs {fixed_exchanges:,}, {number_text(fixed_exchanges / exchanges)} times as many"
+        f"; the fixed window that keeps the bound in {format_count(len(costs), 'run')}, "
+        f"{number_text(window_s * 1e3)} ms, needs {format_count(fixed_exchanges, 'exchange')}, "
+        f"{number_text(fixed_exchanges / exchanges)} times as many"
     )
     if len(costs) > 1:
         text += (
-            f"; the longest windows of the single runs need {run_exchanges:,}, "
-            f"{number_text(run_exchanges / exchanges)} times as many"
+            f"; the longest windows of the single runs need {format_count(run_exchanges, 'exchange')}, "
+            f"{number_text(run_exchanges / exchanges)} times as many as error_bounded"
         )
     if window_s == scenario.policy.longest:
         text += "; the fixed window is as long as policy.longest, which limits it"

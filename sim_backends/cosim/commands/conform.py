@@ -17,26 +17,29 @@ from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import CheckResult, run_checks
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import Hello
-from sim_backends.federates.named import named
+from sim_backends.federates.named import named_federate
 from sim_backends.federates.protocols import FederateError
 from sim_backends.federates.session import open_session
 from sim_backends.world.world import load_world
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run all checks of the federate's role, print the failures with request and answer; return 1 if one failed.
+    """Run all checks of the federate's role, and print each failure with its request and answer.
+
+    Returns:
+        1 if a check failed, otherwise 0.
 
     Raises:
         FieldkitError: The federate cannot be started or connected.
     """
-    where = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
+    endpoint = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
     deadline_s = settings.deadline_s(arguments.deadline)
     changes = settings.changes(arguments)
-    if _has_role(where, NETWORK):
+    if _is_federate_with_role(endpoint, NETWORK):
         changes |= {"traffic": _udp_traffic(load_scenario(arguments.scenario, changes))}
-    scenario = load_scenario(arguments.scenario, changes | _named_federate(where))
-    role, name = _role(where, scenario, arguments.role, deadline_s)
-    opener = partial(open_session, role, where, deadline_s=deadline_s)
+    scenario = load_scenario(arguments.scenario, changes | _named_federate(endpoint))
+    role, name = _role(endpoint, scenario, arguments.role, deadline_s)
+    opener = partial(open_session, role, endpoint, deadline_s=deadline_s)
     target = Target(opener, _hello(scenario, role), arguments.windows)
     results = []
     for result in run_checks(target):
@@ -56,34 +59,36 @@ def _hello(scenario: CosimScenario, role: int) -> Hello:
     return make_hello(scenario, world, bodies(scenario, world), scenario.seeds[0], role)
 
 
-def _role(where: str, scenario: CosimScenario, requested: str | None, deadline_s: float) -> tuple[int, str]:
+def _role(endpoint: str, scenario: CosimScenario, requested: str | None, deadline_s: float) -> tuple[int, str]:
     """Return the role of a federate, and its name for messages: the requested role, or the first that it accepts.
 
     Raises:
-        FieldkitError: It accepts none.
+        FieldkitError: The federate accepts no role.
     """
     roles = [role for role in (PHYSICS, NETWORK) if requested in {None, ROLES[role]}]
     if requested is None:
-        roles = [role for role in roles if _has_role(where, role)] or roles
+        roles = [role for role in roles if _is_federate_with_role(endpoint, role)] or roles
     for role in roles:
         try:
-            session, _, _ = open_session(role, where, _hello(scenario, role), deadline_s)
+            session, _, _ = open_session(role, endpoint, _hello(scenario, role), deadline_s)
         except FederateError:
             if role == roles[-1]:
                 raise
             continue
         session.close()
         return role, session.name
-    raise FieldkitError(f"{where} has no role")
+    raise FieldkitError(f"{endpoint} accepts no role")
 
 
-def _named_federate(where: str) -> dict[str, str]:
+def _named_federate(endpoint: str) -> dict[str, str]:
     """Return the change that makes a scenario use a named federate, so that its options are validated."""
-    return {f"{ROLES[role]}.federate": where for role in (PHYSICS, NETWORK) if _has_role(where, role)}
+    return {
+        f"{ROLES[role]}.federate": endpoint for role in (PHYSICS, NETWORK) if _is_federate_with_role(endpoint, role)
+    }
 
 
 def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
-    """Return the traffic with UDP instead of topics and ROS 1, which a network may not support."""
+    """Return the traffic with UDP instead of topics and ROS 1, because a network may not support these."""
     entries = [traffic.model_dump(mode="json", by_alias=True, exclude_none=True) for traffic in scenario.traffic]
     for entry in entries:
         if entry["protocol"] in {"topic", "ros1", "ros1-udp"}:
@@ -92,11 +97,11 @@ def _udp_traffic(scenario: CosimScenario) -> list[dict[str, Any]]:
     return entries
 
 
-def _has_role(where: str, role: int) -> bool:
+def _is_federate_with_role(endpoint: str, role: int) -> bool:
     """Return True if there is a federate with this name and this role."""
     try:
-        return named(where, role) is not None
-    except ConfigurationError:  # the other role, or its package cannot be loaded
+        return named_federate(endpoint, role) is not None
+    except ConfigurationError:  # the federate has the other role, or its package cannot be loaded
         return False
 
 

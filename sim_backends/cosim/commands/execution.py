@@ -29,10 +29,10 @@ from sim_backends.cosim.wall_time import DEADLINE_S
 
 
 @contextmanager
-def between_windows(coordinator: Coordinator) -> Iterator[None]:
-    """Let SIGINT raise `KeyboardInterrupt` as soon as no window is being hashed and recorded.
+def interrupt_between_windows(coordinator: Coordinator) -> Iterator[None]:
+    """Delay the `KeyboardInterrupt` of SIGINT while a window is being hashed and recorded.
 
-    Outside the main thread, or if SIGINT has another handler, nothing changes.
+    Outside the main thread, or if SIGINT has another handler, this context manager has no effect.
 
     Args:
         coordinator: The coordinator of the run.
@@ -66,7 +66,7 @@ def simulate(
     deadline_s: float | None = DEADLINE_S,
     pace: Pace | None = None,
 ) -> SeedResult:
-    """Return the result of a scenario with a seed, even if the run failed or was interrupted.
+    """Run a scenario with a seed, and return the result, also if the run failed or was interrupted.
 
     Args:
         scenario: The scenario.
@@ -79,9 +79,9 @@ def simulate(
     """
     recorder = None
     if folder is not None:
-        about = RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)
+        run_settings = RunSettings(schema.dump(scenario), policy, scenario.policy.parameters, seed)
         recorder = RunRecorder(
-            folder.recording(seed), about, agents=scenario.lifetimes, flows=captured_flows(scenario.traffic)
+            folder.recording(seed), run_settings, agents=scenario.lifetimes, flows=captured_flows(scenario.traffic)
         )
     samples = StateSamples(recorder) if has_followers(scenario) else None
     observer: WindowObserver | None = samples or recorder
@@ -93,11 +93,11 @@ def simulate(
         scenario, policy=policy, seed=seed, recorder=observer, deadline_s=deadline_s, captures=captures
     )
     agents = simulation.agents
-    starts = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
+    start_states = {name: absence.state for name, absence in agents.absent.items()} | dict(agents.states(0).items())
     ended_by: FieldkitError | KeyboardInterrupt | None = None
     lateness = None if pace is None else WindowLateness()
     try:
-        with simulation, publisher, recorder or nullcontext(), between_windows(simulation.coordinator):
+        with simulation, publisher, recorder or nullcontext(), interrupt_between_windows(simulation.coordinator):
             if pace is None or lateness is None:
                 simulation.run(progress=progress)
             else:
@@ -111,7 +111,7 @@ def simulate(
         simulation.coordinator.run,
         states,
         ended_by=ended_by,
-        starts=starts,
+        starts=start_states,
         lateness=lateness,
     )
     if folder is not None:
@@ -134,9 +134,9 @@ def simulate_all(
     pace: Pace | None = None,
     workers: Workers = ALL_PROCESSORS,
 ) -> tuple[list[SeedResult], bool]:
-    """Return the result of a scenario for each seed, and True if Ctrl-C interrupted them.
+    """Run a scenario with each seed; return the results, and True if Ctrl-C interrupted the runs.
 
-    If the runs are interrupted, the seeds whose runs have not finished are missing. The runs are parallel unless a
+    After an interrupt, there are no results for seeds whose runs had not finished. The runs are parallel unless a
     federate serves one run at a time.
 
     Args:
@@ -147,7 +147,7 @@ def simulate_all(
         sink: Receives progress reports.
         deadline_s: As for `build`.
         pace: As for `simulate`; the runs are then not parallel.
-        workers: Where the runs of several seeds are executed.
+        workers: The workers that execute the runs of several seeds.
     """
     if len(seeds) == 1:
         report = partial(progress_reporter(sink, "s"), "simulate", scenario.duration)
@@ -166,7 +166,7 @@ def simulate_all(
     report(0)
     results: dict[int, SeedResult] = {}
     tasks = [Task(policy, seed) for seed in seeds]
-    interrupted = False
+    is_interrupted = False
     try:
         # A federate with an address serves one run at a time, and parallel runs would delay each other.
         workers = (
@@ -178,12 +178,12 @@ def simulate_all(
         for number, result in as_completed_tasks(work, tasks, workers=workers):
             results[number] = result
             report(len(results))
-            if result.is_interrupted:  # with a single worker, the run itself catches Ctrl-C
-                interrupted = True
+            if result.is_interrupted:  # with a single worker, the run catches Ctrl-C
+                is_interrupted = True
                 break
     except KeyboardInterrupt:
-        interrupted = True
-    return [results[number] for number in sorted(results)], interrupted
+        is_interrupted = True
+    return [results[number] for number in sorted(results)], is_interrupted
 
 
 def _simulate(

@@ -25,9 +25,9 @@ def flow_rows(
     number: int,
     result: SeedResult,
     *,
-    without: Collection[str] = (),
+    excluded_flows: Collection[str] = (),
 ) -> Iterator[dict[str, Value]]:
-    """Yield a row for each flow of a run; values that are not known are missing.
+    """Yield a row for each flow of a run; unknown values are omitted.
 
     Args:
         trial: Name of the folder of all runs.
@@ -35,12 +35,12 @@ def flow_rows(
         policy: The sync policy, as text.
         number: Number of the run, from 1.
         result: The result of the run.
-        without: Names of flows that get no row.
+        excluded_flows: Names of flows for which no row is yielded.
     """
     for flow in result.flows:
-        if flow.name not in without:
-            measured = {name: value for name, value in _measured(flow).items() if not _is_missing(value)}
-            yield _identity(trial, scenario, policy, result, flow) | {"repeat": number} | measured
+        if flow.name not in excluded_flows:
+            values = {name: value for name, value in _measured_columns(flow).items() if not _is_missing(value)}
+            yield _identity(trial, scenario, policy, result, flow) | {"repeat": number} | values
 
 
 def _identity(
@@ -58,8 +58,8 @@ def _identity(
         "distance": f"{distance_m:g}m",
         "protocol": flow.protocol,
         "attempt": 1,
-        "status": "failed" if result.stopped else "valid",
-        "reason": result.stopped,
+        "status": "failed" if result.stop_reason else "valid",
+        "reason": result.stop_reason,
         "seed": result.seed,
         "sender": flow.source,
         "receiver": flow.destination,
@@ -70,16 +70,20 @@ def _identity(
 
 def scenario_hashes(scenario: CosimScenario) -> dict[str, Value]:
     """Return the columns with the hashes of the agents and of the procedure of a scenario."""
-    dumped = scenario.model_dump(mode="json", by_alias=True)
-    procedure = {key: value for key, value in dumped.items() if key not in _NOT_PROCEDURE}
-    return {"profiles_sha256": _digest(dumped["agents"]), "procedure_sha256": _digest(procedure)}
+    scenario_data = scenario.model_dump(mode="json", by_alias=True)
+    procedure = {key: value for key, value in scenario_data.items() if key not in _NOT_PROCEDURE}
+    return {"profiles_sha256": _digest(scenario_data["agents"]), "procedure_sha256": _digest(procedure)}
 
 
-def _measured(flow: FlowResult) -> dict[str, Value]:
+def _measured_columns(flow: FlowResult) -> dict[str, Value]:
     delay_s = flow.delay_s
     datagrams: dict[str, Value] = {}
     if flow.protocol == "udp":
-        datagrams = {"datagrams_sent": flow.sent, "datagrams_received": flow.arrived, "datagram_loss": flow.loss}
+        datagrams = {
+            "datagrams_sent": flow.sent_packets,
+            "datagrams_received": flow.arrived_packets,
+            "datagram_loss": flow.loss,
+        }
     return (
         datagrams
         | _ping_columns(flow)
@@ -96,22 +100,22 @@ def _measured(flow: FlowResult) -> dict[str, Value]:
             "delay_variation_p95_s": delay_s.p95 - delay_s.minimum,
             "jitter_s": flow.jitter_s,
             "delay_s": delay_s.mean,
-            "delay_packets": flow.arrived,
+            "delay_packets": flow.arrived_packets,
         }
         | motion_columns("transfer", flow)
     )
 
 
 def _ping_columns(flow: FlowResult) -> dict[str, Value]:
-    """Return the columns of a ping; payload sizes are comparable, as UDP and ICMP have headers of 8 bytes."""
+    """Return the columns of a ping; payload sizes are comparable, because UDP and ICMP have headers of 8 bytes."""
     trips = flow.round_trips
     if trips is None:
         return {}
     return {
-        "rtt_sent": trips.sent,
-        "rtt_received": trips.answered,
-        "rtt_loss": 1 - trips.answered / trips.sent if trips.sent else math.nan,
-        "rtt_payload_bytes": flow.sent_bytes // flow.sent if flow.sent else math.nan,
+        "rtt_sent": trips.request_count,
+        "rtt_received": trips.reply_count,
+        "rtt_loss": 1 - trips.reply_count / trips.request_count if trips.request_count else math.nan,
+        "rtt_payload_bytes": flow.sent_bytes // flow.sent_packets if flow.sent_packets else math.nan,
         "rtt_min_s": trips.network_s.minimum,
         "rtt_median_s": trips.network_s.median,
         "rtt_mean_s": trips.network_s.mean,

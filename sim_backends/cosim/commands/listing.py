@@ -22,28 +22,28 @@ _POLICY: Final = (SheetColumn("policy", "policy", ""), SheetColumn("summary", "w
 
 def list_all(arguments: argparse.Namespace) -> int:
     """Print each scenario, each simulator and each sync policy in one line."""
-    scenarios = []
+    scenario_rows = []
     for name, path in scenario_files().items():
         try:
-            scenarios.append((name, load_scenario(path).summary))
+            scenario_rows.append((name, load_scenario(path).summary))
         except FieldkitError as error:
             show_note(f"{error.located}: this scenario is omitted")
-    listed = []
+    policy_rows = []
     for name in policies():
         try:
-            listed.append((name, _summary(policies()[name])))
+            policy_rows.append((name, _summary(policies()[name])))
         except FieldkitError as error:
             show_note(f"{error.located}: this sync policy is omitted")
-    named = simulators()
+    simulator_rows = simulators()
     if arguments.format == "table":
-        table([column.head for column in _SCENARIO], scenarios)
-        table([column.head for column in _SIMULATOR], named)
-        table([column.head for column in _POLICY], listed)
+        table([column.head for column in _SCENARIO], scenario_rows)
+        table([column.head for column in _SIMULATOR], simulator_rows)
+        table([column.head for column in _POLICY], policy_rows)
         return 0
     sheets = {
-        "scenarios": Sheet(_SCENARIO, scenarios, [SheetPart("scenarios", ("scenario", "summary"))]),
-        "simulators": Sheet(_SIMULATOR, named, [SheetPart("simulators", ("simulator", "role", "summary"))]),
-        "policies": Sheet(_POLICY, listed, [SheetPart("sync policies", ("policy", "summary"))]),
+        "scenarios": Sheet(_SCENARIO, scenario_rows, [SheetPart("scenarios", ("scenario", "summary"))]),
+        "simulators": Sheet(_SIMULATOR, simulator_rows, [SheetPart("simulators", ("simulator", "role", "summary"))]),
+        "policies": Sheet(_POLICY, policy_rows, [SheetPart("sync policies", ("policy", "summary"))]),
     }
     show_all(sheets, arguments.format)
     return 0
@@ -55,5 +55,5 @@ def print_schema(_: argparse.Namespace) -> int:
     return 0
 
 
-def _summary(kind: object) -> str:
-    return (kind.__doc__ or "").partition("\n")[0].strip()
+def _summary(policy: object) -> str:
+    return (policy.__doc__ or "").partition("\n")[0].strip()

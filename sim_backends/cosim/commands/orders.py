@@ -44,10 +44,8 @@ _COLUMNS: Final = (
         "mean magnitude of the difference between the delivery time and the reference's",
         1e3,
     ),
-    SheetColumn("late_s", "late (ms)", "mean time by which the receiver had passed an arrival", 1e3),
-    SheetColumn(
-        "position_m", "place (mm)", "mean error of the relative position of two agents that the network assumes", 1e3
-    ),
+    SheetColumn("late_s", "late (ms)", "mean time by which the receiver was already past an arrival", 1e3),
+    SheetColumn("position_m", "place (mm)", "mean error of the relative position of two agents in the network", 1e3),
     SheetColumn("fates", "fate (%)", "packets with another fate", 100),
     SheetColumn("path_m", "path (mm)", "mean position error of agents at the end of a window", 1e3),
 )
@@ -92,7 +90,7 @@ def _measure(
     workers: Workers,
     sink: Sink,
 ) -> tuple[dict[str, LocalErrors], dict[str, PolicyError]]:
-    """Return the local errors of each policy over all seeds, and the errors of policies that could not be run."""
+    """Return the local errors of each policy over all seeds, and the exceptions of policies that failed."""
     tasks = [Task(name, seed) for name in policies for seed in seeds]
     report = partial(progress_reporter(sink), "local errors", len(tasks))
     report(0)
@@ -112,8 +110,7 @@ def _local_errors(scenario: CosimScenario, windows_s: Sequence[float], task: Tas
         return build(scenario, policy=policy, seed=task.seed, measures_all=True).coordinator
 
     def policy_for(window_s: float) -> SyncPolicy:
-        # The windows of error_bounded are as long as the windows of other policies unless its bound requires shorter
-        # ones.
+        # error_bounded has the same windows as the other policies unless its bound requires shorter windows.
         longest_s = window_s if task.policy == ErrorBounded.name else max(window_s, scenario.policy.longest)
         return make_policy(task.policy, **scenario.policy.parameters | {"window_s": window_s, "longest_s": longest_s})
 
@@ -141,6 +138,7 @@ def _order_sheet(by_policy: Mapping[str, LocalErrors]) -> Sheet:
     columns += [SheetColumn(measure, _HEADS[measure], "") for measure in MEASURES]
     rows = [(name, *(order_text(errors, measure) for measure in MEASURES)) for name, errors in by_policy.items()]
     part = SheetPart(
-        "order: the power of the window with which an error decreases, with its 95 % interval", ("policy", *MEASURES)
+        "order: the exponent n if the error is proportional to window^n, with its 95 % interval",
+        ("policy", *MEASURES),
     )
     return Sheet(columns, rows, [part])

@@ -37,7 +37,7 @@ _LOCAL_ERRORS: Final = {
 
 @dataclass(frozen=True)
 class CostPoint:
-    """The errors and the cost of a policy with a window; nan for an error for which there are no packets.
+    """The errors and the cost of a policy with a window; an error is nan if there are no packets to measure it.
 
     Attributes:
         policy: Its name.
@@ -69,12 +69,14 @@ def cost_points(rows: Iterable[Row]) -> list[CostPoint]:
     ]
 
 
-def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = None) -> Callable[[Format], bytes]:
+def error_against_cost(
+    points: Sequence[CostPoint], growth_panel: LogPanel | None = None
+) -> Callable[[Format], bytes]:
     """Return a function that draws errors against exchanges per simulated second, a curve per policy.
 
     Args:
         points: The points.
-        growth: An additional panel, or None.
+        growth_panel: An additional panel, or None.
     """
     panel_specs = [
         ("Delivery time", "mean error (ms)", "delivery_error_mean_s"),
@@ -86,11 +88,11 @@ def error_against_cost(points: Sequence[CostPoint], growth: LogPanel | None = No
         LogPanel(title, "exchanges per simulated second", label, _curves(points, name))
         for title, label, name in panel_specs
     ]
-    panels += [] if growth is None else [growth]
+    panels += [] if growth_panel is None else [growth_panel]
     return lambda form: plots.log_figure(panels, form)
 
 
-def growth(rows: Iterable[Row], title: str) -> LogPanel | None:
+def growth_panel(rows: Iterable[Row], title: str) -> LogPanel | None:
     """Return a panel of the distance of agents from the reference's path over time; None if all distances are 0.
 
     Args:
@@ -139,14 +141,14 @@ def _scaled(bias: IntervalEstimate, factor: float) -> tuple[float, float, float]
 
 
 def _positive_points(errors: LocalErrors, measure: str, factor: float) -> tuple[list[float], list[float]]:
-    """Return the windows in ms and the scaled errors, without windows that had no error."""
+    """Return the windows in ms and the scaled errors, without windows whose error is 0."""
     pairs = zip(errors.window_s.mean(axis=1) * 1e3, errors.mean(measure) * factor, strict=True)
     points = [(float(x), float(y)) for x, y in pairs if y > 0]
     return [x for x, _ in points], [y for _, y in points]
 
 
 def _curves(points: Sequence[CostPoint], name: str) -> list[Curve]:
-    """Return a curve per policy, of values times 1000; errors that are nan are omitted."""
+    """Return a curve per policy, with the errors times 1000; errors that are nan are omitted."""
     curves: dict[str, list[tuple[float, float]]] = {}
     for point in points:
         if not math.isnan(error := getattr(point, name)):
@@ -193,7 +195,10 @@ def _points(path: Path) -> list[CostPoint]:
 
 
 def _obstacles(recording: Recording) -> list[ObstacleOutline]:
-    """Return the outlines of the obstacles in the world of a run; none, with a note, if that world does not exist."""
+    """Return the outlines of the obstacles in the world of a run.
+
+    If the world does not exist, show a note and return an empty list.
+    """
     name = scenario_of(recording).world
     try:
         return list(outlines(load_world(name)))
@@ -215,6 +220,6 @@ def _traces(recording: Recording) -> list[FlowTrace]:
         if fate.is_decided:
             arrived_ns = fate.arrived_ns
             delay_s = math.nan if arrived_ns is None else (arrived_ns - fate.packet.enters_ns) / 1e9
-            distance_m = math.dist(fate.true[0].position_m, fate.true[1].position_m)
+            distance_m = math.dist(fate.true_states[0].position_m, fate.true_states[1].position_m)
             flows.setdefault(fate.packet.identity[0], []).append((fate.packet.sent_ns / 1e9, delay_s, distance_m))
     return [FlowTrace(name, *zip(*sorted(flows[name]), strict=True)) for name in sorted(flows)]

@@ -21,9 +21,9 @@ def run(arguments: argparse.Namespace) -> int:
     scenario = scenario_of(recording)
     result = seed_result(scenario, recording.manifest.about.seed, recording.run, recording.states)
     show_results(arguments.format, title(recording), scenario, [result])
-    if recording.manifest.ending is not RunEnding.WHOLE:
-        why = f": {recording.manifest.why}" if recording.manifest.why else ""
-        show_note(f"the run did not complete ({recording.manifest.ending}){why}")
+    if recording.manifest.ending is not RunEnding.COMPLETE:
+        reason_text = f": {recording.manifest.why}" if recording.manifest.why else ""
+        show_note(f"the run did not complete ({recording.manifest.ending}){reason_text}")
     if arguments.mcap is not None:
         _write_mcap(arguments.mcap, recording)
     return 0
@@ -52,9 +52,9 @@ def recording_at(folder: Path) -> Recording:
     seed_folders = sorted(path.parent for path in folder.glob("seed-*/run.json"))
     if seed_folders and not (folder / "run.json").exists():
         raise EvidenceError(
-            f"there are recordings of {len(seed_folders)} runs",
+            f"this folder contains the recordings of {len(seed_folders)} runs",
             where=str(folder),
-            remedy=f"name one of them: {seed_folders[0]}",
+            remedy=f"give the folder of one recording: {seed_folders[0]}",
         )
     return read_recording(folder)
 

@@ -12,7 +12,7 @@ from fieldkit.trial.simulated import PlannedExchange, SimulatedRepeat, Simulated
 from sim_backends.cosim.commands.flow_rows import BACKEND, motion_columns
 from sim_backends.cosim.commands.results import FlowResult, FlowRoundTrips, SeedResult
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import addresses, between, first_tcp_ns
+from sim_backends.cosim.recording.captures import addresses, first_tcp_packet_ns, packets_between
 from sim_backends.cosim.recording.recorder import CAPTURES
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.external import writes_captures
@@ -24,7 +24,7 @@ _TTL: Final = 64
 
 
 class ReproducedRows:
-    """Rows of the trial that a scenario reproduces.
+    """Generates the rows of the trial that a scenario reproduces.
 
     Args:
         scenario: The scenario.
@@ -43,8 +43,8 @@ class ReproducedRows:
         self._policy = policy
         self._has_captures = scenario.network.federate is None or writes_captures(scenario)
         self._repeats = trial.repeats(scenario.traffic, scenario.duration_ns)
-        first = self._repeats[0]
-        self._agents = {Role.SENDER: first.transfer.source, Role.RECEIVER: first.transfer.to[0]}
+        first_repeat = self._repeats[0]
+        self._agents = {Role.SENDER: first_repeat.transfer.source, Role.RECEIVER: first_repeat.transfer.to[0]}
         if scenario.topology is Topology.MASTER and scenario.relay is not None:
             self._agents[Role.RELAY] = scenario.relay
         self._addresses = {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()}
@@ -66,8 +66,8 @@ class ReproducedRows:
     def _distance(self) -> Distance:
         """Return the horizontal distance from the sender to the relay, or to the receiver if there is no relay."""
         starts = bodies(self._scenario, load_world(self._scenario.world))
-        other = self._agents.get(Role.RELAY, self._agents[Role.RECEIVER])
-        points_m = [starts[name].place_m[:2] for name in (self._agents[Role.SENDER], other)]
+        peer = self._agents.get(Role.RELAY, self._agents[Role.RECEIVER])
+        points_m = [starts[name].place_m[:2] for name in (self._agents[Role.SENDER], peer)]
         metres = round(math.dist(*points_m), 3)
         return Distance(metres, f"{metres:g}m")
 
@@ -82,16 +82,16 @@ class ReproducedRows:
                 remedy=remedy,
             )
         for repeat in self._repeats:
-            for what, planned, simulated in _settings(self._trial.exchange(repeat.protocol), repeat):
+            for setting_name, planned, simulated in _settings(self._trial.exchange(repeat.protocol), repeat):
                 if planned != simulated:
                     raise ConfigurationError(
-                        f"{what} is {simulated}, and {planned} in the procedure {procedure}",
+                        f"{setting_name} is {simulated}, and {planned} in the procedure {procedure}",
                         where=f"scenario {self._scenario.name}: trial.{repeat.protocol}",
                         remedy=remedy,
                     )
 
     def rows(self, trial: str, number: int, result: SeedResult, recording: Path) -> Iterator[Mapping[str, Value]]:
-        """Yield the row of each protocol whose transfer has sent a packet.
+        """Yield a row for each protocol whose transfer has sent a packet.
 
         Args:
             trial: Name of the folder of all runs.
@@ -110,7 +110,7 @@ class ReproducedRows:
             if (transfer := flows.get(transfer_name)) is None:
                 continue
             ping = flows.get(ping_name)
-            reason = result.stopped or ("the run ended before the transfer" if transfer.under_way else "")
+            reason = result.stop_reason or ("the run ended before the transfer" if transfer.packets_under_way else "")
             captures = self._captures(repeat, recording)
             values = self._values(repeat, transfer, ping)
             if repeat.protocol is Protocol.TCP and not reason and Role.RECEIVER in captures:
@@ -131,7 +131,7 @@ class ReproducedRows:
             return {}
         paths = {role: recording / CAPTURES / f"{self._agents[role]}.pcap" for role in (Role.SENDER, Role.RECEIVER)}
         return {
-            role: between(path.read_bytes(), repeat.begin_ns, repeat.end_ns)
+            role: packets_between(path.read_bytes(), repeat.begin_ns, repeat.end_ns)
             for role, path in paths.items()
             if path.exists()
         }
@@ -146,9 +146,10 @@ class ReproducedRows:
                 f"[{seconds}.{microseconds:06}] {payload_bytes + 8} bytes from {address}: icmp_seq={sequence + 1} "
                 f"ttl={_TTL} time={1e3 * trip_s:.6f} ms"
             )
-        lost = 1 - trips.answered / trips.sent if trips.sent else 0.0
+        loss = 1 - trips.reply_count / trips.request_count if trips.request_count else 0.0
         summary = (
-            f"{trips.sent} packets transmitted, {trips.answered} received, {100 * lost:g}% packet loss, time 0ms"
+            f"{trips.request_count} packets transmitted, {trips.reply_count} received, "
+            f"{100 * loss:g}% packet loss, time 0ms"
         )
         return "\n".join((*lines, "", f"--- {address} ping statistics ---", summary, ""))
 
@@ -167,16 +168,16 @@ class ReproducedRows:
             values["tcp_congestion_control"] = self._scenario.tcp.congestion
         if repeat.protocol is Protocol.UDP:
             values |= {
-                "datagrams_sent": transfer.sent,
-                "datagrams_received": transfer.arrived,
+                "datagrams_sent": transfer.sent_packets,
+                "datagrams_received": transfer.arrived_packets,
                 "datagram_loss": transfer.loss,
             }
         return values
 
 
 def _tcp_completion(capture: bytes, repeat: ReproducedRepeat, transfer: FlowResult) -> dict[str, Value]:
-    """Return the time from the arrival of the first segment until the receiving program has the whole file."""
-    first_ns = None if repeat.transfer.port is None else first_tcp_ns(capture, repeat.transfer.port)
+    """Return the time from the arrival of the first segment until the program has received the complete file."""
+    first_ns = None if repeat.transfer.port is None else first_tcp_packet_ns(capture, repeat.transfer.port)
     if first_ns is None or transfer.last_arrived_ns is None or transfer.arrived_bytes < repeat.transfer.size_bytes:
         return {}
     return {"completion_s": (transfer.last_arrived_ns - first_ns) / 1e9}

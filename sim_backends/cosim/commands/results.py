@@ -27,14 +27,14 @@ class FlowRecovery:
         fault: Index of the fault in the scenario, from 0.
         flow: Name of the flow.
         end_ns: Time when the fault ended.
-        lost: Number of packets that were sent during the fault and never arrived.
-        recovered_s: Time from `end_ns` to the first arrival of a packet sent after it; None if there was none.
+        lost_packets: Number of packets that were sent during the fault and never arrived.
+        recovered_s: Time from `end_ns` to the first arrival of a packet that was sent after it; None without one.
     """
 
     fault: int
     flow: str
     end_ns: int
-    lost: int
+    lost_packets: int
     recovered_s: float | None
 
 
@@ -47,11 +47,11 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
         scenario: The scenario with the faults.
         run: A run of the scenario.
     """
-    reached_ns = run.windows_ns[-1] if run.windows_ns else 0
+    end_of_run_ns = run.windows_ns[-1] if run.windows_ns else 0
     all_recoveries = []
     for number, fault in enumerate(scenario.faults):
         end_ns = None if isinstance(fault, StalledFederateFault) else fault.end_ns
-        if end_ns is None or end_ns > reached_ns:
+        if end_ns is None or end_ns > end_of_run_ns:
             continue
         flows = (flow_ends for traffic in scenario.traffic for flow_ends in traffic.flow_ends)
         for flow in sorted(flow for flow, *ends in flows if _affects(fault, set(ends), scenario)):
@@ -59,9 +59,9 @@ def recoveries(scenario: CosimScenario, run: Run) -> list[FlowRecovery]:
             counted_ns = [
                 fate.counted_ns for fate in fates if fate.packet.sent_ns >= end_ns and fate.counted_ns is not None
             ]
-            lost = sum(fault.begin_ns <= fate.packet.sent_ns < end_ns and bool(fate.reason) for fate in fates)
+            lost_packets = sum(fault.begin_ns <= fate.packet.sent_ns < end_ns and bool(fate.reason) for fate in fates)
             recovered_s = (min(counted_ns) - end_ns) / 1e9 if counted_ns else None
-            all_recoveries.append(FlowRecovery(number, flow, end_ns, lost, recovered_s))
+            all_recoveries.append(FlowRecovery(number, flow, end_ns, lost_packets, recovered_s))
     return all_recoveries
 
 
@@ -87,7 +87,7 @@ _JITTER_GAIN = 1 / 16
 
 @dataclass(frozen=True)
 class FlowSpread:
-    """Statistics of times of packets that arrived, in seconds; nan if no packet arrived.
+    """Statistics of the times of packets that arrived, in seconds; nan if no packet arrived.
 
     Attributes:
         minimum: The minimum.
@@ -109,16 +109,16 @@ class FlowRoundTrips:
     """The round trips of a ping; requests that may still get a reply are ignored.
 
     Attributes:
-        sent: Number of requests.
-        answered: Number of requests whose reply arrived.
+        request_count: Number of requests.
+        reply_count: Number of requests whose reply arrived.
         network_s: Time that request and reply together spent in the network.
         jitter_s: Mean absolute difference of successive round trips; nan if there are fewer than two.
         times: For each answered request, in order: its number from 0, the simulated time of the reply's arrival in
             nanoseconds, and the time in the network in seconds.
     """
 
-    sent: int
-    answered: int
+    request_count: int
+    reply_count: int
     network_s: FlowSpread
     jitter_s: float
     times: tuple[tuple[int, int, float], ...] = ()
@@ -126,25 +126,26 @@ class FlowRoundTrips:
 
 @dataclass(frozen=True)
 class FlowResult:
-    """The results of a flow. Packets that were under way at the end of the run count only in `under_way`.
+    """The results of a flow. Packets that were under way at the end of the run count only in `packets_under_way`.
 
     Attributes:
         name: The flow.
         source: The sending agent.
         destination: The receiving agent.
         protocol: Its transport.
-        sent: Number of packets whose fate is decided.
-        arrived: Number of these packets that arrived.
-        under_way: Number of packets whose fate is not decided.
+        sent_packets: Number of packets whose fate is decided.
+        arrived_packets: Number of these packets that arrived.
+        packets_under_way: Number of packets whose fate is not decided.
         sent_bytes: Total size of sent packets.
         arrived_bytes: Total size of packets that arrived.
         delay_s: Time in the network of the packets that arrived.
         first_to_last_s: Time from the first arrival to the last.
         jitter_s: Interarrival jitter after the last packet (RFC 3550, section 6.4.1); nan for fewer than two packets.
         added_s: Mean delay that the sync policy added, before and after the network.
-        distances_m: Distance of sender and receiver at the first packet; minimum, mean and maximum over all packets.
+        distances_m: Distance between sender and receiver: at the first packet, then minimum, mean and maximum over
+            all packets.
         sender_m_s: Mean speed of the sender at the times of sending.
-        relative_m_s: Mean magnitude of its velocity relative to the receiver.
+        relative_m_s: Mean magnitude of the sender's velocity relative to the receiver.
         round_trips: The round trips of a ping; None for other flows.
         last_arrived_ns: Simulated time of the last arrival; None without arrivals.
     """
@@ -153,9 +154,9 @@ class FlowResult:
     source: str
     destination: str
     protocol: str
-    sent: int
-    arrived: int
-    under_way: int
+    sent_packets: int
+    arrived_packets: int
+    packets_under_way: int
     sent_bytes: int
     arrived_bytes: int
     delay_s: FlowSpread
@@ -171,7 +172,7 @@ class FlowResult:
     @property
     def loss(self) -> float:
         """Share of the packets that never arrived; nan without packets."""
-        return 1 - self.arrived / self.sent if self.sent else np.nan
+        return 1 - self.arrived_packets / self.sent_packets if self.sent_packets else np.nan
 
 
 def flow_results(run: Run) -> tuple[FlowResult, ...]:
@@ -184,27 +185,32 @@ def flow_results(run: Run) -> tuple[FlowResult, ...]:
 
 def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) -> FlowResult:
     packet = fates[0].packet
-    decided = [fate for fate in fates if fate.is_decided]
+    decided_fates = [fate for fate in fates if fate.is_decided]
     times = [
         (fate.packet.sent_ns, fate.packet.enters_ns, fate.arrived_ns, fate.counted_ns)
-        for fate in decided
+        for fate in decided_fates
         if fate.arrived_ns is not None and fate.counted_ns is not None
     ]
-    arrived = [fate for fate in decided if fate.arrived_ns is not None]
+    arrived_fates = [fate for fate in decided_fates if fate.arrived_ns is not None]
     sent_ns, enters_ns, arrived_ns, counted_ns = np.array(times, np.int64).reshape(-1, 4).T
     delay_s = (arrived_ns - enters_ns) / 1e9
-    distances_m = _distances([fate.true[0].position_m for fate in fates], [fate.true[1].position_m for fate in fates])
-    velocities = [fate.true[0].velocity_m_s for fate in fates], [fate.true[1].velocity_m_s for fate in fates]
+    distances_m = _distances(
+        [fate.true_states[0].position_m for fate in fates], [fate.true_states[1].position_m for fate in fates]
+    )
+    velocities = (
+        [fate.true_states[0].velocity_m_s for fate in fates],
+        [fate.true_states[1].velocity_m_s for fate in fates],
+    )
     return FlowResult(
         name=name,
         source=packet.source,
         destination=packet.destination,
         protocol=packet.protocol,
-        sent=len(decided),
-        arrived=len(arrived),
-        under_way=len(fates) - len(decided),
-        sent_bytes=sum(fate.packet.size_bytes for fate in decided),
-        arrived_bytes=sum(fate.packet.size_bytes for fate in arrived),
+        sent_packets=len(decided_fates),
+        arrived_packets=len(arrived_fates),
+        packets_under_way=len(fates) - len(decided_fates),
+        sent_bytes=sum(fate.packet.size_bytes for fate in decided_fates),
+        arrived_bytes=sum(fate.packet.size_bytes for fate in arrived_fates),
         delay_s=_spread(delay_s),
         first_to_last_s=float(np.ptp(arrived_ns)) / 1e9 if len(arrived_ns) else np.nan,
         jitter_s=_jitter_s(delay_s[np.argsort(arrived_ns, kind="stable")]),
@@ -224,7 +230,7 @@ def _result(name: str, fates: Sequence[Fate], replies: Sequence[Fate] | None) ->
 
 def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRoundTrips:
     replies_by_number = {reply.packet.identity[1]: reply for reply in replies}
-    sent = 0
+    request_count = 0
     times: list[tuple[int, int, float]] = []
     for request in sorted(requests, key=lambda fate: fate.packet.identity[1]):
         reply = replies_by_number.get(request.packet.identity[1])
@@ -232,10 +238,10 @@ def _round_trips(requests: Sequence[Fate], replies: Sequence[Fate]) -> FlowRound
         request_s = _network_s(request)
         if reply is not None and reply.arrived_ns is not None and request_s is not None and reply_s is not None:
             times.append((request.packet.identity[1], reply.arrived_ns, request_s + reply_s))
-        sent += bool(request.reason) or (reply is not None and reply.is_decided)
+        request_count += bool(request.reason) or (reply is not None and reply.is_decided)
     trips_s = [trip_s for _, _, trip_s in times]
     jitter_s = float(np.abs(np.diff(trips_s)).mean()) if len(trips_s) > 1 else np.nan
-    return FlowRoundTrips(sent, len(trips_s), _spread(np.array(trips_s)), jitter_s, tuple(times))
+    return FlowRoundTrips(request_count, len(trips_s), _spread(np.array(trips_s)), jitter_s, tuple(times))
 
 
 def _network_s(fate: Fate) -> float | None:
@@ -267,13 +273,15 @@ def _jitter_s(delays_s: Floats) -> float:
 
 
 FORMATION: Final = (
-    SheetColumn("spacing_mean_m", "spacing (cm)", "error of the distance behind a leader, magnitude, mean", 1e2),
+    SheetColumn("spacing_mean_m", "spacing (cm)", "mean absolute error of the distance behind a leader", 1e2),
     SheetColumn("spacing_max_m", "max", "its maximum", 1e2),
-    SheetColumn(
-        "station_mean_m", "station (cm)", "distance of a drone from its station above its leaders, mean", 1e2
-    ),
+    SheetColumn("station_mean_m", "station (cm)", "mean distance of a drone from its station above its leaders", 1e2),
     SheetColumn("station_max_m", "max", "its maximum", 1e2),
-    SheetColumn("amplification", "amplified", "acceleration over the leader's; up to 1 the row is string stable"),
+    SheetColumn(
+        "amplification",
+        "amplified",
+        "ratio of a follower's acceleration to its leader's; a row of vehicles is string stable up to 1",
+    ),
 )
 """Columns of a `Formation`, in the order of `formation_values`."""
 
@@ -303,7 +311,7 @@ class SeedResult:
         starts_m: Position of each agent at its start, metres east, north, up.
         recoveries: Recoveries of flows after faults.
         formation: Errors of the positions of followers.
-        stopped: The reason why it ended early; empty if it is complete.
+        stop_reason: The reason why it ended early; empty if it is complete.
         error: The error that ended it early; None if it is complete or was interrupted.
         lateness: Lateness of its windows; None if it was not a run in real time.
     """
@@ -317,14 +325,14 @@ class SeedResult:
     starts_m: Mapping[str, Vector]
     recoveries: Sequence[FlowRecovery]
     formation: Formation
-    stopped: str = ""
+    stop_reason: str = ""
     error: FieldkitError | None = None
     lateness: WindowLateness | None = None
 
     @property
     def is_interrupted(self) -> bool:
         """True if Ctrl-C ended it."""
-        return bool(self.stopped) and self.error is None
+        return bool(self.stop_reason) and self.error is None
 
 
 def seed_result(
@@ -350,7 +358,7 @@ def seed_result(
     """
     ended_s = run.windows_ns[-1] / 1e9 if run.windows_ns else 0.0
     error = ended_by if isinstance(ended_by, FieldkitError) else None
-    stopped = error.located if error is not None else f"interrupted at {ended_s:g} s"
+    stop_reason = error.located if error is not None else f"interrupted at {ended_s:g} s"
     return SeedResult(
         seed=seed,
         flows=flow_results(run),
@@ -362,7 +370,7 @@ def seed_result(
         | {agent: state.position_m for agent, state in (starts or {}).items()},
         recoveries=recoveries(scenario, run),
         formation=formation(scenario, tracks_of(states)),
-        stopped="" if ended_by is None else stopped,
+        stop_reason="" if ended_by is None else stop_reason,
         error=error,
         lateness=lateness,
     )

@@ -27,13 +27,15 @@ _COLUMNS: Final = (
     SheetColumn("flow", "flow", "stream of packets and its receiver"),
     SheetColumn("protocol", "by", "its transport"),
     SheetColumn("sent", "sent", "packets whose fate is decided"),
-    SheetColumn("under_way", "open", "packets still under way when the run ended, which no other column includes"),
-    SheetColumn("loss", "lost (%)", "share of those sent that never arrived", 100),
+    SheetColumn(
+        "under_way", "open", "packets still under way when the run ended, which are not part of the other columns"
+    ),
+    SheetColumn("loss", "lost (%)", "share of the sent packets that never arrived", 100),
     SheetColumn("delay_mean_s", "delay (ms)", "mean time of a packet in the network", 1e3),
     SheetColumn("delay_p95_s", "p95", "its 95th percentile", 1e3),
     SheetColumn("delay_max_s", "max", "its maximum", 1e3),
     SheetColumn("delay_added_s", "added", "mean delay that the sync policy added, in ms", 1e3),
-    SheetColumn("distance_mean_m", "apart (m)", "distance of sender and receiver, mean"),
+    SheetColumn("distance_mean_m", "apart (m)", "mean distance of sender and receiver"),
 )
 
 
@@ -41,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Run the scenario with each seed; print the results of its flows, and write them to a folder on request.
 
     Raises:
-        FieldkitError: A run failed; its results until then are printed and written.
+        FieldkitError: A run failed; its results until the failure are printed and written.
     """
     scenario = settings.scenario(arguments)
     policy = settings.policy(arguments, scenario)
@@ -86,25 +88,25 @@ def show_results(form: str, title: str, scenario: CosimScenario, results: Sequen
         scenario: The scenario.
         results: The results.
     """
-    # A run that could not keep up with real time has no results, only its lateness.
-    kept_up = [result for result in results if not isinstance(result.error, RealTimeError)]
-    sheets = {"flows": _flow_sheet(title, kept_up)} if kept_up else {}
-    if any(result.recoveries for result in kept_up):
-        sheets["recoveries"] = _recovery_sheet(scenario, kept_up)
-    if kept_up and has_followers(scenario):
-        sheets["followers"] = _formation_sheet(kept_up)
+    # A run that was slower than real time has no results except its lateness.
+    timely_results = [result for result in results if not isinstance(result.error, RealTimeError)]
+    sheets = {"flows": _flow_sheet(title, timely_results)} if timely_results else {}
+    if any(result.recoveries for result in timely_results):
+        sheets["recoveries"] = _recovery_sheet(scenario, timely_results)
+    if timely_results and has_followers(scenario):
+        sheets["followers"] = _formation_sheet(timely_results)
     if any(result.lateness is not None for result in results):
         sheets["lateness"] = _lateness_sheet(results)
     show_all(sheets, form)
-    if form == "table" and kept_up:
-        print_text(_cost_text(kept_up))
+    if form == "table" and timely_results:
+        print_text(_cost_text(timely_results))
     for result in results:
         if isinstance(result.error, RealTimeError):
-            show_note(f"seed {result.seed}: it could not keep up with real time, so it has no results")
-        elif result.stopped:
+            show_note(f"seed {result.seed}: it was slower than real time, so it has no results")
+        elif result.stop_reason:
             # The command reports the full error when it ends.
-            why = result.stopped if result.error is None else f"stopped at {result.simulated_s:g} s"
-            show_note(f"seed {result.seed}: {why}; its numbers are those until then")
+            reason = result.stop_reason if result.error is None else f"stopped at {result.simulated_s:g} s"
+            show_note(f"seed {result.seed}: {reason}; the numbers cover only the time until then")
 
 
 def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
@@ -113,8 +115,8 @@ def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
             result.seed,
             flow.name,
             flow.protocol,
-            flow.sent,
-            flow.under_way,
+            flow.sent_packets,
+            flow.packets_under_way,
             flow.loss,
             flow.delay_s.mean,
             flow.delay_s.p95,
@@ -125,10 +127,10 @@ def _flow_sheet(title: str, results: Sequence[SeedResult]) -> Sheet:
         for result in results
         for flow in result.flows
     ]
-    hidden = {"seed"} if len(results) == 1 else set()
-    if not any(flow.under_way for result in results for flow in result.flows):
-        hidden.add("under_way")
-    return Sheet(_COLUMNS, rows, [SheetPart(title, {column.name for column in _COLUMNS} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    if not any(flow.packets_under_way for result in results for flow in result.flows):
+        hidden_columns.add("under_way")
+    return Sheet(_COLUMNS, rows, [SheetPart(title, {column.name for column in _COLUMNS} - hidden_columns)])
 
 
 def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> Sheet:
@@ -148,21 +150,23 @@ def _recovery_sheet(scenario: CosimScenario, results: Sequence[SeedResult]) -> S
             scenario.faults[recovery.fault].kind,
             recovery.flow,
             recovery.end_ns / 1e9,
-            recovery.lost,
+            recovery.lost_packets,
             recovery.recovered_s,
         )
         for result in results
         for recovery in result.recoveries
     ]
-    hidden = {"seed"} if len(results) == 1 else set()
-    return Sheet(columns, rows, [SheetPart("recovery", {column.name for column in columns} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("recovery", {column.name for column in columns} - hidden_columns)])
 
 
 def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
     columns = (
         SheetColumn("seed", "seed", ""),
         SheetColumn("late_up_to_s", "late up to (ms)", "lateness of a window against real time; 0: in time", 1e3),
-        SheetColumn("windows", "windows", "number of windows with this lateness, and more than in the row before"),
+        SheetColumn(
+            "windows", "windows", "number of windows whose lateness is at most this, and above that of the row before"
+        ),
         SheetColumn("share", "share (%)", "share of all windows", 100),
     )
     rows = [
@@ -171,15 +175,15 @@ def _lateness_sheet(results: Sequence[SeedResult]) -> Sheet:
         if result.lateness is not None
         for limit_ns, count in sorted(result.lateness.windows.items())
     ]
-    hidden = {"seed"} if len(results) == 1 else set()
-    return Sheet(columns, rows, [SheetPart("lateness", {column.name for column in columns} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("lateness", {column.name for column in columns} - hidden_columns)])
 
 
 def _formation_sheet(results: Sequence[SeedResult]) -> Sheet:
     columns = (SheetColumn("seed", "seed", ""), *FORMATION)
     rows = [(result.seed, *formation_values(result.formation)) for result in results]
-    hidden = {"seed"} if len(results) == 1 else set()
-    return Sheet(columns, rows, [SheetPart("followers", {column.name for column in columns} - hidden)])
+    hidden_columns = {"seed"} if len(results) == 1 else set()
+    return Sheet(columns, rows, [SheetPart("followers", {column.name for column in columns} - hidden_columns)])
 
 
 def _cost_text(results: Sequence[SeedResult]) -> str:

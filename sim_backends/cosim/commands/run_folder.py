@@ -17,7 +17,7 @@ TRIAL_CSV: Final = "trial.csv"
 
 
 class RunFolder:
-    """The folder of the runs of one scenario with one sync policy: a recording, or one per seed.
+    """The folder of the runs of one scenario with one sync policy: one recording, or one recording per seed.
 
     Args:
         path: The folder, which must be empty or not exist; it is created.
@@ -59,18 +59,18 @@ class RunFolder:
         return self.path if len(self._seeds) == 1 else self.path / f"seed-{seed:0{digits}}"
 
     def write_rows(self, result: SeedResult) -> None:
-        """Write the rows of a run that has ended into the folder of its recording.
+        """Write the rows of a finished run into the folder of its recording.
 
         Raises:
-            ConfigurationError: They cannot be written.
+            ConfigurationError: The file cannot be written.
         """
         number = self._seeds.index(result.seed) + 1
         path = self.recording(result.seed) / TRIAL_CSV
         trial = self.path.resolve().name
-        reproduced = self._reproduced
-        trial_rows = [] if reproduced is None else list(reproduced.rows(trial, number, result, path.parent))
-        without = () if reproduced is None else reproduced.flows
-        other_rows = flow_rows(trial, self._scenario, self._policy, number, result, without=without)
+        reproduced_rows = self._reproduced
+        trial_rows = [] if reproduced_rows is None else list(reproduced_rows.rows(trial, number, result, path.parent))
+        excluded_flows = () if reproduced_rows is None else reproduced_rows.flows
+        other_rows = flow_rows(trial, self._scenario, self._policy, number, result, excluded_flows=excluded_flows)
         rows = [*trial_rows, *other_rows]
         names = list(dict.fromkeys(name for row in rows for name in row))
         try:

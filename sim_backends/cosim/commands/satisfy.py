@@ -25,7 +25,7 @@ NOT_SATISFIED: Final = 1
 _COLUMNS: Final = (
     SheetColumn("round", "round", ""),
     SheetColumn("window_s", "w (ms)", "initial window", 1e3),
-    SheetColumn("median_window_s", "made (ms)", "median of the windows that the rule computed from it", 1e3),
+    SheetColumn("median_window_s", "median (ms)", "median of the windows that the rule computed", 1e3),
     SheetColumn("loss", "lost (%)", "share of packets whose fate is decided", 100),
     SheetColumn("fate_disagreement", "fate (%)", "lost here or in the reference, but not in both", 100),
     SheetColumn(
@@ -34,13 +34,13 @@ _COLUMNS: Final = (
         "mean magnitude of the difference between the delivery time and the reference's",
         1e3,
     ),
-    SheetColumn("position_error_mean_m", "place (mm)", "error of the network's relative positions, mean", 1e3),
+    SheetColumn("position_error_mean_m", "place (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("exchanges", "exchanges", "cost of the round"),
 )
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run rounds until one is satisfactory, and print each relative to the exact reference.
+    """Run rounds until a round is satisfactory, and print the errors of each round against the exact reference.
 
     Raises:
         ConfigurationError: The threshold is above 100 %.
@@ -69,9 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
     _sheet(title, satisfaction).show(arguments.format)
     if arguments.format in {"table", "markdown"}:
         print_text(_summary(satisfaction, threshold))
-    if not satisfaction.satisfied:
+    if not satisfaction.is_satisfied:
         show_note(f"no round was satisfactory: {satisfaction.reason}")
-    return 0 if satisfaction.satisfied else NOT_SATISFIED
+    return 0 if satisfaction.is_satisfied else NOT_SATISFIED
 
 
 class _CountedRuns:
@@ -81,11 +81,11 @@ class _CountedRuns:
         self._scenario = scenario
         self._seed = seed
         self._report = report
-        self._done = 0
+        self._finished_runs = 0
 
     def __call__(self, policy: SyncPolicy) -> Run:
-        self._report(self._done)
-        self._done += 1
+        self._report(self._finished_runs)
+        self._finished_runs += 1
         with build(self._scenario, policy=policy, seed=self._seed, measures_all=True) as simulation:
             return simulation.run()
 
@@ -111,10 +111,10 @@ def _summary(satisfaction: Satisfaction, threshold: float) -> str:
     reference = f"the exact reference loses {number_text(100 * satisfaction.reference_loss)} %"
     lines = [f"{reference} in {satisfaction.reference_exchanges:,} exchanges, independently of the window"]
     if satisfaction.rounds:
-        last = satisfaction.rounds[-1]
-        outcome = "accepted" if satisfaction.satisfied else "not accepted"
+        last_round = satisfaction.rounds[-1]
+        outcome = "accepted" if satisfaction.is_satisfied else "not accepted"
         lines.append(
-            f"{outcome} at {number_text(100 * threshold)} %: {number_text(100 * last.loss)} % after "
+            f"{outcome} at {number_text(100 * threshold)} %: {number_text(100 * last_round.loss)} % after "
             f"{format_count(len(satisfaction.rounds), 'round')} and {satisfaction.exchanges:,} exchanges"
         )
     return "\n".join(lines)

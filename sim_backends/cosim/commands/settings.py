@@ -27,21 +27,21 @@ from sim_backends.cosim.wall_time import DEADLINE_S
 
 
 def progress_reporter(sink: Sink, unit: str = "runs") -> Callable[[str, float, float], None]:
-    """Return a function that reports progress to a sink; its arguments are the activity, the total and the part done.
+    """Return a function that reports progress to a sink; its arguments are the activity, the total and the done part.
 
-    The time left is estimated from the time since the first call for the same activity.
+    The remaining time is estimated from the time since the first call for the same activity.
 
     Args:
         sink: Receives the events.
         unit: Unit of total and part.
     """
-    started_s: dict[str, float] = {}
+    start_s: dict[str, float] = {}
 
     def report(activity: str, total: float, done: float) -> None:
         now_s = time.monotonic()
-        spent_s = now_s - started_s.setdefault(activity, now_s)
-        left_s = spent_s * (total / done - 1) if done and spent_s else None
-        sink(Progress(activity, done, total, unit, left_s))
+        elapsed_s = now_s - start_s.setdefault(activity, now_s)
+        remaining_s = elapsed_s * (total / done - 1) if done and elapsed_s else None
+        sink(Progress(activity, done, total, unit, remaining_s))
 
     return report
 
@@ -51,7 +51,7 @@ ENOUGH_SEEDS: Final = 20
 
 
 def scenario(arguments: argparse.Namespace) -> CosimScenario:
-    """Return the scenario that the arguments name, with their changes.
+    """Return the scenario that the arguments name, with the changes of other arguments.
 
     Raises:
         ConfigurationError: It does not exist, or a change is invalid; the message states the key and its place.
@@ -79,15 +79,15 @@ def changes(arguments: argparse.Namespace) -> dict[str, Any]:
     return values
 
 
-def seeds(arguments: argparse.Namespace, chosen: CosimScenario) -> tuple[int, ...]:
+def seeds(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> tuple[int, ...]:
     """Return the seeds from the options; without such options, the seeds of the scenario."""
     if arguments.seeds is not None:
         return tuple(range(1, arguments.seeds + 1))
-    return chosen.seeds if arguments.seed is None else (arguments.seed,)
+    return cosim_scenario.seeds if arguments.seed is None else (arguments.seed,)
 
 
 def workers(arguments: argparse.Namespace, packets: float = math.inf) -> Workers:
-    """Return the workers that the options choose; without options, this process if there are few packets.
+    """Return the workers from the options; without such options, only this process if there are few packets.
 
     Args:
         arguments: The options.
@@ -107,25 +107,26 @@ def policies(arguments: argparse.Namespace) -> list[str]:
     return [name for name in registry.policies() if not arguments.policy or name in arguments.policy]
 
 
-def windows_s(arguments: argparse.Namespace, chosen: CosimScenario) -> list[float]:
+def windows_s(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> list[float]:
     """Return the windows of a comparison in seconds, in ascending order.
 
     Raises:
         ConfigurationError: One of them is not a duration above 0.
     """
     if not arguments.windows:
-        return [chosen.policy.window]
+        return [cosim_scenario.policy.window]
     windows = sorted({parse_duration_s(text, "--window") for text in arguments.windows.split(",")})
     if windows[0] <= 0:
         raise ConfigurationError(
-            f"--window: {arguments.windows!r} has a window that is not above 0", remedy="--window 1ms,10ms,100ms"
+            f"--window: {arguments.windows!r} contains a window that is not above 0",
+            remedy="write for example --window 1ms,10ms,100ms",
         )
     return windows
 
 
-def with_window(chosen: CosimScenario, window_s: float) -> CosimScenario:
+def with_window(cosim_scenario: CosimScenario, window_s: float) -> CosimScenario:
     """Return a scenario with another window."""
-    return chosen.model_copy(update={"policy": chosen.policy.model_copy(update={"window": window_s})})
+    return cosim_scenario.model_copy(update={"policy": cosim_scenario.policy.model_copy(update={"window": window_s})})
 
 
 def has_window(name: str) -> bool:
@@ -138,7 +139,7 @@ def figure(path: Path, option: str) -> Callable[[Callable[[Format], bytes]], Non
 
     Args:
         path: The file.
-        option: Name of the option that gave it, for messages.
+        option: Name of the option with the path, for messages.
 
     Raises:
         ConfigurationError: The suffix or the folder is invalid. The returned function raises it if the file cannot be
@@ -180,7 +181,7 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
     """Return the pace of runs in real time, or None if they run as fast as possible.
 
     Raises:
-        ConfigurationError: A value is invalid, or there is a bound without a pace.
+        ConfigurationError: A value is invalid, or there is a bound but no factor.
     """
     text, bound = arguments.realtime, arguments.late_bound
     if text is None:
@@ -192,63 +193,67 @@ def pace(arguments: argparse.Namespace) -> Pace | None:
     except ValueError:
         factor = math.nan
     if not 0 < factor < math.inf:
-        raise ConfigurationError(f"--realtime: {text!r} is not a number above 0", remedy="--realtime 1")
+        raise ConfigurationError(
+            f"--realtime: {text!r} is not a number above 0", remedy="write for example --realtime 1"
+        )
     bound_s = LATE_BOUND_S if bound is None else parse_duration_s(bound, "--late-bound")
     if bound_s <= 0:
-        raise ConfigurationError(f"--late-bound: {bound} is not above 0", remedy="--late-bound 100ms")
+        raise ConfigurationError(
+            f"--late-bound: {bound} is not above 0", remedy="write for example --late-bound 100ms"
+        )
     return Pace(factor, bound_s)
 
 
-def policy(arguments: argparse.Namespace, chosen: CosimScenario) -> str:
+def policy(arguments: argparse.Namespace, cosim_scenario: CosimScenario) -> str:
     """Return the name of the sync policy.
 
     Raises:
         ConfigurationError: There is no policy with this name, or a parameter is invalid.
     """
-    name = chosen.policy.name if arguments.policy is None else arguments.policy
-    make_policy(name, **chosen.policy.parameters)
+    name = cosim_scenario.policy.name if arguments.policy is None else arguments.policy
+    make_policy(name, **cosim_scenario.policy.parameters)
     return str(name)
 
 
 def note_commensurate_events(
-    chosen: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
+    cosim_scenario: CosimScenario, policies: Sequence[str], windows_s: Sequence[float], seeds: int
 ) -> None:
     """Print a note on each window that is commensurate with a period of the scenario; suggest a better window.
 
     Args:
-        chosen: The scenario.
+        cosim_scenario: The scenario.
         policies: Names of the sync policies that run it.
         windows_s: Windows of the policies that have one.
-        seeds: Number of seeds, each of which draws other phases.
+        seeds: Number of seeds; each seed draws different phases.
     """
     if seeds >= ENOUGH_SEEDS:
         return
     used_s = [window_s for window_s in windows_s if any(map(has_window, policies))]
     for window_s in used_s:
-        commensurate = commensurate_events(chosen, [window_s])
+        commensurate = commensurate_events(cosim_scenario, [window_s])
         if not commensurate:
             continue
         periods = ", ".join(
             f"{item.event.name} (every {item.event.period_s * 1e3:.6g} ms: {format_count(item.phases, 'phase')})"
             for item in commensurate
         )
-        other_s = incommensurate_window_s(chosen, window_s)
+        other_s = incommensurate_window_s(cosim_scenario, window_s)
         instead = f"--seeds {ENOUGH_SEEDS}" if other_s is None else f"--window {other_s * 1e3:.6g}ms"
         show_note(
             f"the window of {window_s * 1e3:.6g} ms is commensurate with the period of {periods}; errors and added "
-            "delays are those of these phases of the window, which the seed draws, and not of the policy: use "
+            "delays therefore depend on these phases, which the seed draws, and do not characterize the policy: use "
             f"{instead}" + ("" if other_s is None else f", or --seeds {ENOUGH_SEEDS}")
         )
 
 
-def policy_text(name: str, chosen: CosimScenario) -> str:
+def policy_text(name: str, cosim_scenario: CosimScenario) -> str:
     """Return the name of a sync policy and the parameter that determines its windows: `sliding_window 10 ms`."""
     if has_window(name):
-        return f"{name} {chosen.policy.window * 1e3:g} ms"
+        return f"{name} {cosim_scenario.policy.window * 1e3:g} ms"
     if "bound_m" not in inspect.signature(registry.policies()[name]).parameters:
         return name
-    bound_db = chosen.policy.bound_db
-    return f"{name} {chosen.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
+    bound_db = cosim_scenario.policy.bound_db
+    return f"{name} {cosim_scenario.policy.bound:g} m" if bound_db is None else f"{name} {bound_db:g} dB"
 
 
 def _change(text: str) -> tuple[str, Any]:

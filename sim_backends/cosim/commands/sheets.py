@@ -41,7 +41,7 @@ class SheetColumn:
     factor: float = 1.0
     digits: int = 3
 
-    def shown(self, value: Value) -> str:
+    def shown_text(self, value: Value) -> str:
         """Return the text of a value in a printed table."""
         if value is None or isinstance(value, str):
             return value or _MISSING
@@ -80,15 +80,15 @@ class Sheet:
 
     def part_cells(self, part: SheetPart) -> tuple[list[str], list[list[str]]]:
         """Return the headings and the cells of a part."""
-        chosen = [index for index, column in enumerate(self.columns) if column.name in part.columns]
-        heads = [self.columns[index].head for index in chosen]
-        return heads, [[self.columns[index].shown(row[index]) for index in chosen] for row in self.rows]
+        indices = [index for index, column in enumerate(self.columns) if column.name in part.columns]
+        heads = [self.columns[index].head for index in indices]
+        return heads, [[self.columns[index].shown_text(row[index]) for index in indices] for row in self.rows]
 
-    def legend(self, part: SheetPart, explained: Collection[str] = ()) -> dict[str, str]:
+    def legend(self, part: SheetPart, explained_heads: Collection[str] = ()) -> dict[str, str]:
         """Return the meanings of the headings of a part, except headings that are already explained."""
         columns = [column for column in self.columns if column.name in part.columns and column.meaning]
         meanings = {column.head.partition(" (")[0]: column.meaning for column in columns}
-        return {head: meaning for head, meaning in meanings.items() if head not in explained}
+        return {head: meaning for head, meaning in meanings.items() if head not in explained_heads}
 
     def records(self) -> list[dict[str, Value]]:
         """Return the rows as dictionaries, with None for missing values."""
@@ -131,13 +131,13 @@ def wrapped(text: str) -> str:
 
 
 def _table(sheet: Sheet) -> None:
-    explained: set[str] = set()
+    explained_heads: set[str] = set()
     for part in sheet.parts:
         heads, rows = sheet.part_cells(part)
         right = [index for index in range(len(heads)) if all(_NUMBER.fullmatch(row[index]) for row in rows)]
         table(heads, rows, title=part.title, right=right)
-        legend = sheet.legend(part, explained)
-        explained |= legend.keys()
+        legend = sheet.legend(part, explained_heads)
+        explained_heads |= legend.keys()
         if legend:
             print_text(wrapped(_legend_text(legend)))
         print_text()

@@ -26,7 +26,7 @@ from sim_backends.cosim.studies.shootout import Row, outcomes, rows
 COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
     SheetColumn("window_s", "w (ms)", "window", 1e3),
-    SheetColumn("seeds", "seeds", "number of runs that the numbers are means of"),
+    SheetColumn("seeds", "seeds", "number of runs over which the means are taken"),
     SheetColumn(
         "delivery_error_mean_s",
         "time (ms)",
@@ -38,16 +38,21 @@ COLUMNS: Final = (
     SheetColumn("delay_added_s", "added", "mean delay that the policy added, in ms", 1e3),
     SheetColumn("fate_disagreement", "fate (%)", "packets lost here or in the reference, but not in both", 100),
     SheetColumn("causality_violations", "late", "arrivals at a time that the receiver was already past, per run"),
-    SheetColumn("position_error_mean_m", "place (mm)", "error of the network's relative positions, mean", 1e3),
+    SheetColumn("position_error_mean_m", "place (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
     SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
-    SheetColumn("path_error_mean_m", "path (mm)", "distance of agents from the reference, mean over time", 1e3),
+    SheetColumn(
+        "path_error_mean_m",
+        "path (mm)",
+        "mean distance of agents from their positions in the reference, over time",
+        1e3,
+    ),
     SheetColumn("path_error_max_m", "max", "its maximum", 1e3),
     SheetColumn("exchanges_per_s", "per s", "exchanges per simulated second"),
     SheetColumn("wall_agents", "agents (%)", "share of wall time in physics and programs", 100),
     SheetColumn("wall_network", "network", "in the network", 100),
     SheetColumn("wall_exchange", "exchange", "in the coordinator", 100),
-    SheetColumn("wall_wait", "wait", "in federates that only waited", 100),
+    SheetColumn("wall_wait", "wait", "in federates that were idle", 100),
     SheetColumn("real_time_factor", "speed", "simulated time over wall time"),
     *FORMATION,
 )
@@ -59,7 +64,7 @@ _FOLLOWER_COLUMNS: Final = ("policy", *(column.name for column in FORMATION))
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the scenario with each policy, print the error and the cost of each, and draw them on request."""
+    """Run the scenario with each policy; print, and draw on request, the errors and the costs of the policies."""
     if arguments.orders:
         return orders.run(arguments)
     if arguments.bias:
@@ -89,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         if has_followers(scenario):
             longest_s = windows_s[-1]
             longest_rows = (row for window_s, row in all_rows if window_s == longest_s)
-            panel = plot.growth(longest_rows, f"{longest_s * 1e3:g} ms")
+            panel = plot.growth_panel(longest_rows, f"{longest_s * 1e3:g} ms")
         draw(plot.error_against_cost(plot.cost_points(row for _, row in all_rows), panel))
     return 0
 
@@ -107,28 +112,28 @@ def _all_rows(
     all_rows: list[tuple[float, Row]] = []
     report = progress_reporter(sink)
     for number, window_s in enumerate(windows_s):
-        chosen = [name for name in policies if number == 0 or settings.has_window(name)]
+        policies_to_run = [name for name in policies if number == 0 or settings.has_window(name)]
         make = partial(_build, settings.with_window(scenario, window_s))
-        runs = len({*chosen, EventDriven.name}) * len(seeds)
+        runs = len({*policies_to_run, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        window_outcomes = outcomes(make, chosen, seeds, workers=workers, progress=progress)
+        window_outcomes = outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
         window_rows = rows(window_outcomes, partial(formation, scenario))
-        all_rows += [(window_s, row) for row in window_rows if row.policy in chosen]
+        all_rows += [(window_s, row) for row in window_rows if row.policy in policies_to_run]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))
 
 
 def _exceeded_bound(scenario: CosimScenario, row: Row) -> str | None:
     """Return a note if `error_bounded` exceeded a bound in metres; otherwise None."""
-    chosen = scenario.policy
-    if row.policy != ErrorBounded.name or row.errors is None or chosen.bound_db is not None:
+    chosen_policy = scenario.policy
+    if row.policy != ErrorBounded.name or row.errors is None or chosen_policy.bound_db is not None:
         return None
     largest_m = row.errors.position_error_m.largest
-    if math.isnan(largest_m) or largest_m <= chosen.bound * (1 + _ROUNDING):
+    if math.isnan(largest_m) or largest_m <= chosen_policy.bound * (1 + _ROUNDING):
         return None
     return (
         f"{row.policy} had a position error of {largest_m * 1e3:.3g} mm, more than its bound of "
-        f"{chosen.bound * 1e3:.3g} mm: agents changed their velocity by more than the physics' limits_m_s2 allow"
+        f"{chosen_policy.bound * 1e3:.3g} mm: agents changed their velocity by more than limits_m_s2 of the physics"
     )
 
 
@@ -157,10 +162,14 @@ def _sheet(scenario: CosimScenario, all_rows: Sequence[tuple[float, Row]], seeds
 
 
 def _values(window_s: float, row: Row) -> Sequence[Value]:
-    first: tuple[Value, ...] = (row.policy, window_s if settings.has_window(row.policy) else None, len(row.by_seed))
+    first_values: tuple[Value, ...] = (
+        row.policy,
+        window_s if settings.has_window(row.policy) else None,
+        len(row.by_seed),
+    )
     if row.errors is None or row.formation is None:
-        return first + (None,) * (len(COLUMNS) - len(first))
-    return (*first, *_error_values(row.errors), *formation_values(row.formation))
+        return first_values + (None,) * (len(COLUMNS) - len(first_values))
+    return (*first_values, *_error_values(row.errors), *formation_values(row.formation))
 
 
 def _error_values(errors: Errors) -> tuple[Value, ...]:

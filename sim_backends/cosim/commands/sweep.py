@@ -26,7 +26,9 @@ from sim_backends.cosim.sweeps.sweep_runner import run_sweep
 
 INTERRUPTED: Final = 130
 
-_FAMILIES: Final = {error.exit_code: error for error in (FieldkitError, ConfigurationError, LinkError, EvidenceError)}
+_ERROR_CLASSES: Final = {
+    error.exit_code: error for error in (FieldkitError, ConfigurationError, LinkError, EvidenceError)
+}
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,7 +72,7 @@ def _workers(plan: SweepPlan, workers: Workers) -> Workers:
     """Return the workers that can run a plan.
 
     Raises:
-        ConfigurationError: The scenario publishes events of EMANE, or needs a federate with an address but the
+        ConfigurationError: The scenario publishes events of EMANE; or it needs a federate with an address, and the
             workers are a cluster.
     """
     scenarios = [setting.scenario for setting in plan.settings]
@@ -103,8 +105,8 @@ def _command(arguments: argparse.Namespace) -> str:
 def _error(failures: Sequence[tuple[SweepRun, RunFailure]], total: int, command: str) -> FieldkitError:
     """Return the error for failed runs, with the exit code of the first one."""
     run, failure = failures[0]
-    family = _FAMILIES.get(failure.exit_code, FieldkitError)
-    return family(
+    error_class = _ERROR_CLASSES.get(failure.exit_code, FieldkitError)
+    return error_class(
         f"{len(failures)} of {total} runs failed; the first, after {format_count(failure.attempts, 'attempt')}: "
         f"{failure.reason}",
         where=str(run),

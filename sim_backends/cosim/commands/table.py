@@ -29,11 +29,11 @@ _LABELS: Final = {
     "radio": SheetColumn("radio", "radio", ""),
     "when": SheetColumn("when", "when", ""),
 }
-_REASON: Final = SheetColumn("loss_reason", "mostly", "most frequent reason why packets did not arrive")
+_REASON: Final = SheetColumn("loss_reason", "main reason", "most frequent reason why packets did not arrive")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run a table of the paper, or its claims, with all seeds, and print its numbers next to ours."""
+    """Run the simulations of a table or of the claims of the paper; print the paper's numbers next to ours."""
     which, changes = arguments.which, settings.changes(arguments)
     seeds = range(1, arguments.seeds + 1) if arguments.seed is None else (arguments.seed,)
     table = None if which == "claims" else paper_table(which, changes)
@@ -66,16 +66,16 @@ def paper_sheet(title: str, rows: Sequence[PaperRow], *, is_ping: bool) -> Sheet
     columns = [*labels, *delay, *loss, _REASON]
     values = [(*row.labels.values(), *_values(row.delay), *_values(row.loss), row.reason) for row in rows]
     # Labels that are equal in all rows are omitted, because the title contains them.
-    shown = [label.name for label in labels if len({row.labels[label.name] for row in rows}) > 1]
+    shown_labels = [label.name for label in labels if len({row.labels[label.name] for row in rows}) > 1]
     delay_name = "mean round trip (ms)" if is_ping else "sum of delays (s)"
     return Sheet(
         columns,
         values,
         [
-            SheetPart(f"{title}: {delay_name}", [*shown, *(column.name for column in delay)]),
+            SheetPart(f"{title}: {delay_name}", [*shown_labels, *(column.name for column in delay)]),
             SheetPart(
                 "packets that did not arrive (%)",
-                [*shown, *(column.name for column in loss if column.head != "seeds"), _REASON.name],
+                [*shown_labels, *(column.name for column in loss if column.head != "seeds"), _REASON.name],
             ),
         ],
     )
@@ -89,39 +89,38 @@ def _columns(name: str, factor: float) -> list[SheetColumn]:
         SheetColumn(f"{name}{suffix}", "ours", "mean over seeds", factor),
         SheetColumn(f"{name}_low{suffix}", "from", "lower end of its 95 % interval", factor),
         SheetColumn(f"{name}_high{suffix}", "to", "upper end", factor),
-        SheetColumn(
-            f"{name}_seeds", "seeds", "number of seeds with which packets arrived" if name == "delay" else ""
-        ),
+        SheetColumn(f"{name}_seeds", "seeds", "number of seeds for which packets arrived" if name == "delay" else ""),
         SheetColumn(
             f"{name}_agreement",
             "verdict",
             "agrees if the printed value, with its precision, is within the interval, or equals our mean",
         ),
-        SheetColumn(f"{name}_off{suffix}", "off", "ours less the paper's", factor),
+        SheetColumn(f"{name}_off{suffix}", "off", "our value minus the paper's", factor),
     ]
 
 
 def _values(cell: PaperCell) -> tuple[Value, ...]:
-    simulated = cell.ours
+    our_value = cell.ours
     return (
         cell.printed.value,
-        simulated.value,
-        simulated.low,
-        simulated.high,
+        our_value.value,
+        our_value.low,
+        our_value.high,
         cell.seeds,
         str(cell.agreement),
-        cell.off,
+        cell.difference,
     )
 
 
 def summary(rows: Sequence[PaperRow]) -> str:
     """Return a sentence with the number of cells of a table that agree."""
     cells = [cell for row in rows for cell in (row.delay, row.loss)]
-    agree = [cell for cell in cells if cell.agreement is Agreement.AGREES]
-    by_mean = sum(cell.agrees_by_mean for cell in agree)
+    agreeing_cells = [cell for cell in cells if cell.agreement is Agreement.AGREES]
+    by_mean = sum(cell.agrees_by_mean for cell in agreeing_cells)
     return (
-        f"{len(agree)} of {format_count(len(cells), 'cell')} agree: {by_mean} by our mean, {len(agree) - by_mean} "
-        "only because our interval is that wide. Assumptions where the paper states no value: fieldkit docs paper"
+        f"{len(agreeing_cells)} of {format_count(len(cells), 'cell')} agree: {by_mean} by our mean, "
+        f"{len(agreeing_cells) - by_mean} only because our interval is wide. "
+        "Assumptions for values that the paper does not state: fieldkit docs paper"
     )
 
 
@@ -136,21 +135,26 @@ def claim_sheet(title: str, claims: Sequence[Claim]) -> Sheet:
         SheetColumn("than", "against", ""),
         SheetColumn("lines", "rows", "with line of sight, without, or all"),
         SheetColumn("quantity", "of", ""),
-        SheetColumn("paper", "paper", "as it states", 100, digits=6),
+        SheetColumn("paper", "paper", "as stated in the paper", 100, digits=6),
         SheetColumn("tables", "tables", "from its tables 1 and 3", 100),
-        SheetColumn("ours", "ours", "relative change of the delay of a packet, or change of loss in points", 100),
+        SheetColumn(
+            "ours",
+            "ours",
+            "relative change of the delay of a packet, or change of the loss in percentage points",
+            100,
+        ),
         SheetColumn("low", "from", "lower end of its 95 % interval", 100),
         SheetColumn("high", "to", "upper end", 100),
-        SheetColumn("row_count", "n", "number of rows that it is based on"),
+        SheetColumn("row_count", "n", "number of rows of the tables that the change is based on"),
         SheetColumn("agreement", "verdict", "agrees if the paper's statement is within the interval"),
     )
     rows = [
         (
-            claim.than,
+            claim.compared_system,
             claim.lines,
             claim.quantity,
-            None if claim.claimed is None else claim.claimed.value,
-            claim.tabled,
+            None if claim.claimed_change is None else claim.claimed_change.value,
+            claim.tabled_change,
             *(claim.ours.value, claim.ours.low, claim.ours.high),
             claim.rows,
             str(claim.agreement or ""),

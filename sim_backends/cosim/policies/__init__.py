@@ -1,1 +1,1 @@
-"""Sync policies: the time for which physics and network run independently, and the assumed states."""
+"""Sync policies: they determine how long physics and network run independently, and the states that they assume."""

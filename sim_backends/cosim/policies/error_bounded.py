@@ -2,17 +2,17 @@
 
 The network extrapolates the agents at the velocities that they had at the beginning of the window, as simulators of
 many vehicles do between updates (dead reckoning, IEEE Std 1278.1, annex E). Physics and programs advance ahead of the
-network: arrivals count from the end of the window, so nothing that they do in the window depends on the network. At
-the time that they have reached, a pair of agents has an error x, the distance between their true relative position
-and the relative position that the network assumes. It grows at a speed v, which changes by at most the acceleration
-limit a: after a time t it is at most x + v t + a t^2 / 2. Before the error can reach the bound, the policy evaluates
-the errors again; if less than one step of the physics remains, the window ends. The bound therefore holds for any
-motion, and no margin is lost to motions that were possible but did not occur ("send on delta": Miskowicz, Sensors 6,
-49, 2006).
+network: arrivals count from the end of the window, so nothing that physics and programs do in the window depends on
+the network. At the time that physics and programs have reached, a pair of agents has an error x: the distance between
+its true relative position and its relative position in the network. This error grows at a speed v, which changes by
+at most the acceleration limit a: after a time t, the error is at most x + v t + a t^2 / 2. Before the error can reach
+the bound, the policy evaluates the errors again; if less than one step of the physics remains, the window ends. The
+bound is therefore kept for any motion, and the windows are not shortened for motions that were possible but did not
+occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
 
 The policy examines the pairs of all agents that send, receive, forward or interfere. A bound in metres adds the pairs
-of each agent and a fixed point on the ground, so that the bound also holds for the agent's absolute position; a bound
-in dB adds the pairs of each agent and a fixed source of interference.
+of each agent and a fixed point on the ground, so that the bound also applies to the absolute position of the agent. A
+bound in dB adds the pairs of each agent and a fixed source of interference.
 
 The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
 the error grows by u q between two steps. The step is the step of the physics if u q is at most an eighth of the
@@ -53,11 +53,11 @@ _GROUND_M: Final = (STILL,)
 
 
 class ErrorBounded:
-    """Windows of as many physics steps as a bound on position errors allows, at least one.
+    """Each window has as many physics steps as a bound on position errors allows, at least one.
 
     Args:
         bound_m: Largest error of the network's relative position of two agents, in metres.
-        longest_s: Longest window, also if no agent moves.
+        longest_s: Length of the longest window; it also applies if no agent moves.
         bound_db: Largest error of the path loss between two agents in free line of sight, in dB; it replaces
             `bound_m`.
         exponent: Exponent of the log-distance law for `bound_db`.
@@ -117,7 +117,7 @@ class ErrorBounded:
         with np.errstate(divide="ignore"):
             longest_s = float(np.min(_STEP_SHARE * pairs.bounds_m / pairs.assumed_m_s, initial=math.inf))
         step_ns = situation.physics_step_ns
-        # Times are whole nanoseconds, so no event is between two of them.
+        # The step need not be shorter than 1 ns, because all times are whole nanoseconds.
         self._reckoning_step_ns = step_ns if longest_s * 1e9 >= step_ns else max(math.floor(longest_s * 1e9), 1)
         return self._reckoning_step_ns
 
@@ -144,10 +144,11 @@ class ErrorBounded:
         errors_m = pairs.error_rates_m_s * step_s
         if not (errors_m > pairs.bounds_m).any():
             return
-        worst = int(np.argmax(errors_m - pairs.bounds_m))
+        worst_pair = int(np.argmax(errors_m - pairs.bounds_m))
         raise PolicyError(
             f"this network does not extrapolate, and in one step of the physics, {step_s:g} s, the position error of "
-            f"{pairs.name(worst)} may reach {errors_m[worst]:.3g} m; the bound is {pairs.bounds_m[worst]:.3g} m",
+            f"{pairs.name(worst_pair)} may reach {errors_m[worst_pair]:.3g} m; the bound is "
+            f"{pairs.bounds_m[worst_pair]:.3g} m",
             where=f"{self.name} at {situation.now_ns / 1e9:g} s",
             remedy="use a larger bound, a shorter step of the physics, or a network that extrapolates",
         )
@@ -156,11 +157,11 @@ class ErrorBounded:
         fixed_m = situation.fixed_emitters_m if self._share else _GROUND_M
         names, first, second = _pair_rows(tuple(situation.pairs), situation.other_agents, len(fixed_m))
         states = [situation.states[name] for name in names]
-        assumed = [State(state.position_m) for state in states]
-        if situation.assumed is not None:
-            assumed = [situation.assumed[name] for name in names]
+        assumed_states = [State(state.position_m) for state in states]
+        if situation.assumed_states is not None:
+            assumed_states = [situation.assumed_states[name] for name in names]
         places_m, velocities_m_s = _arrays(states, fixed_m)
-        assumed_m, assumed_m_s = _arrays(assumed, fixed_m)
+        assumed_m, assumed_m_s = _arrays(assumed_states, fixed_m)
         # The physics may have no limit for an agent that appeared during the run.
         limits_m_s2 = np.array(
             [*(situation.limits_m_s2.get(name, math.inf) for name in names), *(0.0 for _ in fixed_m)]
@@ -231,11 +232,11 @@ class _Pairs:
 
 @lru_cache(maxsize=64)
 def _pair_rows(
-    pairs: tuple[Pair, ...], other_agents: tuple[str, ...], fixed: int
+    pairs: tuple[Pair, ...], other_agents: tuple[str, ...], fixed_count: int
 ) -> tuple[Sequence[str], Integers, Integers]:
     """Return the active agents, and the rows of both members of each pair; fixed points have the rows after them."""
     names = sorted({*other_agents, *(name for pair in pairs for name in pair)})
-    first, second = np.triu_indices(len(names) + fixed, k=1)
+    first, second = np.triu_indices(len(names) + fixed_count, k=1)
     with_agent = first < len(names)
     return names, first[with_agent], second[with_agent]
 

@@ -22,7 +22,7 @@ from sim_backends.cosim.policies.window_policies import (
 )
 
 PolicyKind = Callable[..., SyncPolicy]
-"""Returns a new policy; it has some of the parameters of `make_policy`."""
+"""A callable that returns a new policy; it accepts some of the parameters of `make_policy`."""
 
 _KINDS: Final[tuple[type[SyncPolicy], ...]] = (
     EventDriven,
@@ -45,8 +45,8 @@ _WINDOW_S: Final = 0.001
 def policies() -> Mapping[str, PolicyKind]:
     """Return every policy by its name: built-in ones, then policies of other packages, which are loaded on first use.
 
-    Reading a policy of a package raises `ConfigurationError` if it cannot be loaded, lacks a member, or has another
-    name than its entry point.
+    A look-up of a policy of another package raises `ConfigurationError` if the policy cannot be loaded, lacks a
+    member, or has another name than its entry point.
 
     Raises:
         ConfigurationError: A policy of a package has the name of a built-in one.
@@ -67,8 +67,8 @@ def policies() -> Mapping[str, PolicyKind]:
 def _load(point: EntryPoint) -> PolicyKind:
     kind: PolicyKind = plugins.load(point)
     problem = ""
-    if missing := missing_members(kind):
-        problem = f"the sync policy lacks {', '.join(missing)}"
+    if missing_names := missing_members(kind):
+        problem = f"the sync policy lacks {', '.join(missing_names)}"
     elif getattr(kind, "name", None) != point.name:
         problem = f"the sync policy's name is {getattr(kind, 'name', None)!r}, but must be {point.name!r}"
     if problem:
@@ -103,5 +103,5 @@ def make_policy(name: str, **parameters: float) -> SyncPolicy:
         raise
     except Exception as error:
         raise ConfigurationError(
-            f"the sync policy {name!r} cannot be made: {type(error).__name__}: {error}", remedy=plugins.REMEDY
+            f"the sync policy {name!r} cannot be created: {type(error).__name__}: {error}", remedy=plugins.REMEDY
         ) from error

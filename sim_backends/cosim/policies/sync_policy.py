@@ -26,9 +26,9 @@ class Situation:
         physics_step_ns: The step of the physics.
         limits_m_s2: Largest change of each agent's velocity per second.
         next_send_ns: Time before which no program sends, or None; only set for policies that look ahead.
-        assumed: States of the agents that the network assumes now, and from which it extrapolates; only set for
-            policies that look ahead. None means that they stay at their positions.
-        other_agents: Agents that forward or interfere, or have sent without being in `pairs`.
+        assumed_states: States of the agents that the network assumes now, and from which it extrapolates; only set
+            for policies that look ahead. None means that the agents stay at their positions.
+        other_agents: Agents that forward or interfere, and agents that have sent packets but are not in `pairs`.
         fixed_emitters_m: Positions of sources of interference that are not agents.
     """
 
@@ -40,7 +40,7 @@ class Situation:
     physics_step_ns: int
     limits_m_s2: Mapping[str, float]
     next_send_ns: int | None = None
-    assumed: Mapping[str, State] | None = None
+    assumed_states: Mapping[str, State] | None = None
     other_agents: tuple[str, ...] = ()
     fixed_emitters_m: tuple[Vector, ...] = ()
 
@@ -58,20 +58,20 @@ class Situation:
 
 
 class SyncPolicy(Protocol):
-    """Determines the length of each window, and how data crosses its borders.
+    """Determines the length of each window, and when data passes from one window to the next.
 
     The constructor may have the parameters `window_s`, `longest_s`, `bound_m`, `bound_db` and `exponent`: the values
     of `policy` in a scenario. A policy may have a text `decided_by` that describes what determined the last window;
-    recordings contain it. A policy with a method `extended_end_ns` is a `LookingAhead`.
+    recordings contain it. A policy with the method `extended_end_ns` is a `LookingAhead` policy.
 
     Attributes:
         name: Its name in scenarios and tables.
-        exact: True if every event is at the end of a window, so that no information is used late.
+        exact: True if every event is at the end of a window, so that all data is used without delay.
         defers_sends: True if a packet enters the network at the end of the window in which it was sent.
-        uses_end_states: True if the network uses the states at the end of a window for the whole window; its end then
-            belongs to it. Otherwise it uses the states at its beginning.
-        defers_arrivals: True if an arrival counts from the end of its window; otherwise it counts from its own time,
-            which its receiver has already passed.
+        uses_end_states: True if the network uses the states at the end of a window for the whole window; the end then
+            belongs to the window. Otherwise the network uses the states at the beginning.
+        defers_arrivals: True if an arrival counts from the end of its window; otherwise it counts from its actual
+            time, which is already in the past of the receiver.
     """
 
     name: str
@@ -95,19 +95,19 @@ class SyncPolicy(Protocol):
 class LookingAhead(SyncPolicy, Protocol):
     """A policy that advances physics and programs ahead of the network, and determines how far.
 
-    It defers arrivals: because they count from the end of the window, nothing before it depends on the network.
+    It defers arrivals. They count from the end of the window, so nothing before the end depends on the network.
     """
 
     def reckoning_step_ns(self, situation: Situation) -> int:
         """Return the step of the network's dead reckoning in the window that begins now.
 
         Args:
-            situation: The present situation; `assumed` has the velocities that the network will extrapolate.
+            situation: The present situation; `assumed_states` has the velocities that the network will extrapolate.
         """
         ...
 
     def extended_end_ns(self, situation: Situation) -> int:
-        """Return a later end of a window in which physics and programs have reached `situation.now_ns`.
+        """Return the time to which the current window can be extended; the agents have reached `situation.now_ns`.
 
         Args:
             situation: The present situation, except for the network, which is still at the beginning of the window:
@@ -115,7 +115,8 @@ class LookingAhead(SyncPolicy, Protocol):
                 need positions immediately.
 
         Returns:
-            Time of the next call; `situation.now_ns` if the window must end now.
+            The time up to which the agents may advance before the next call; `situation.now_ns` if the window must
+            end now.
         """
         ...
 
@@ -146,7 +147,7 @@ class EmptyWindows:
         """Count a window.
 
         Raises:
-            PolicyError: There are too many, or time would run backwards.
+            PolicyError: There are too many such windows, or time would run backwards.
         """
         if begin_ns != self._at_ns:
             self._at_ns, self._count = begin_ns, 0

@@ -11,32 +11,37 @@ _AS_PER_NS: Final = 10**9
 
 
 class Windows:
-    """Ends of windows whose lengths are not whole nanoseconds.
+    """Computes the ends of windows whose lengths are not whole nanoseconds.
 
     A window ends at the last whole nanosecond that the sum of all lengths so far has reached.
     """
 
     def __init__(self) -> None:
         self._length_ns = 0.0
-        self._whole_ns = self._rest = self._carried = 0
+        self._whole_ns = self._fraction_as = self._sum_of_fractions_as = 0
 
     def end_ns(self, begin_ns: int, length_ns: float) -> int:
-        """Return the end of a window of a length that begins at the end of the previous one."""
+        """Return the end of a window.
+
+        Args:
+            begin_ns: Its beginning, which is the end of the previous window.
+            length_ns: Its length, which need not be a whole number.
+        """
         if length_ns != self._length_ns:
             self._length_ns = length_ns
-            self._whole_ns, self._rest = divmod(round(length_ns * _AS_PER_NS), _AS_PER_NS)
-        self._carried += self._rest
-        if self._carried < _AS_PER_NS:
+            self._whole_ns, self._fraction_as = divmod(round(length_ns * _AS_PER_NS), _AS_PER_NS)
+        self._sum_of_fractions_as += self._fraction_as
+        if self._sum_of_fractions_as < _AS_PER_NS:
             return begin_ns + self._whole_ns
-        self._carried -= _AS_PER_NS
+        self._sum_of_fractions_as -= _AS_PER_NS
         return begin_ns + self._whole_ns + 1
 
 
 class FixedWindow:
-    """Windows of one length.
+    """Base class of the policies whose windows all have the same length.
 
     Args:
-        window_s: Their length in seconds; fractions of a nanosecond are carried over.
+        window_s: Their length in seconds; fractions of a nanosecond are added to later windows.
 
     Raises:
         PolicyError: It is not a positive time.
@@ -57,8 +62,8 @@ class FixedWindow:
         """
         if self._window_ns < situation.physics_step_ns:
             raise PolicyError(
-                f"a window of {self._window_ns:g} ns is shorter than the physics' own step of "
-                f"{situation.physics_step_ns} ns, so that nothing changes in it",
+                f"a window of {self._window_ns:g} ns is shorter than the step of the physics, "
+                f"{situation.physics_step_ns} ns, so that no state changes in it",
                 where=self.name,
                 remedy="use a longer window, or physics with a shorter step",
             )
@@ -66,7 +71,7 @@ class FixedWindow:
 
 
 class TimeStepped(FixedWindow):
-    """Data is exchanged at the ends of windows only."""
+    """Data is exchanged only at the ends of windows."""
 
     name = "time_stepped"
     defers_sends = True
@@ -84,7 +89,7 @@ class Scheduled(FixedWindow):
 
 
 class SlidingWindow(FixedWindow):
-    """The network follows the physics by one window."""
+    """The network is one window behind the physics."""
 
     name = "sliding_window"
     defers_sends = False
@@ -93,7 +98,7 @@ class SlidingWindow(FixedWindow):
 
 
 class EventDriven:
-    """A window lasts until the next event, of a program or in the network. This is the exact reference."""
+    """A window lasts until the next event of a program or of the network. This is the exact reference."""
 
     name = "event_driven"
     exact = True

@@ -1,9 +1,9 @@
 """Programs that follow other agents, using only the states that the network delivers.
 
-The age of a received state is its transmission delay, which is known from its time stamp. The state is extrapolated
+The age of a received state is its transmission delay, which follows from its time stamp. The state is extrapolated
 to the present time with its velocity. Every delay, and every error of a delivery time, therefore becomes a position
 error: after a time d, a leader with the acceleration a is a d^2 / 2 away from its extrapolated position. A follower
-that receives no state for longer than a timeout stops.
+stops if it receives no state for longer than a timeout.
 
 `FollowAtHeadway` keeps a constant time headway h: at the speed v, the distance is r + h v, where r is the distance at
 standstill. With the error e = gap - r - h v its acceleration is ((v_leader - v) + k e) / h, so that e decays as
@@ -25,7 +25,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
 from sim_backends.cosim.programs.way_points import PERIOD_NS, NeverSends, PeriodicTimer, drive_towards
-from sim_backends.network.packets import Received
+from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State, extrapolate
 
@@ -34,7 +34,7 @@ TIMEOUT_NS: Final = 1_000_000_000
 
 
 class LatestStates:
-    """The latest states received from other agents.
+    """The latest states that were received from other agents.
 
     Args:
         names: The other agents.
@@ -52,11 +52,11 @@ class LatestStates:
             )
         self._names = tuple(names)
         self._timeout_ns = timeout_ns
-        self._latest: dict[str, Received] = {}
+        self._latest: dict[str, ReceivedDatagram] = {}
 
-    def update(self, received: Sequence[Received]) -> None:
+    def update(self, received_datagrams: Sequence[ReceivedDatagram]) -> None:
         """Store the state with the latest time stamp for each agent."""
-        for datagram in received:
+        for datagram in received_datagrams:
             latest = self._latest.get(datagram.source)
             if isinstance(datagram.payload, State) and (latest is None or datagram.sent_ns >= latest.sent_ns):
                 self._latest[datagram.source] = datagram
@@ -118,16 +118,19 @@ class FollowAtHeadway(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Store received states; if a command is due, steer, or stop if there is no valid state."""
-        self._leader.update(received)
+        self._leader.update(received_datagrams)
         if not self._timer.fire_if_due(now_ns):
             return Action()
         leaders = self._leader.at(now_ns)
         return Action(command=self._command(own_state, leaders[0]) if leaders else Twist())
 
     def _command(self, own_state: State, leader: State) -> Twist:
-        e, n = (goal - own for own, goal in zip(own_state.position_m[:2], leader.position_m[:2], strict=True))
+        e, n = (
+            target - position
+            for position, target in zip(own_state.position_m[:2], leader.position_m[:2], strict=True)
+        )
         gap_m = math.hypot(e, n)
         if not gap_m:
             return Twist()
@@ -182,9 +185,9 @@ class HoldStation(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Store received states; if a command is due, steer, or hover if there is no valid state."""
-        self._leaders.update(received)
+        self._leaders.update(received_datagrams)
         if not self._timer.fire_if_due(now_ns):
             return Action()
         leaders = self._leaders.at(now_ns)
@@ -192,7 +195,10 @@ class HoldStation(NeverSends):
 
     def _command(self, own_state: State, leaders: Sequence[State]) -> Velocity:
         e, n, u = _mean([leader.position_m for leader in leaders])
-        offset_m = [goal - own for own, goal in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)]
+        offset_m = [
+            target - position
+            for position, target in zip(own_state.position_m, (e, n, u + self._above_m), strict=True)
+        ]
         gain_per_s = min(self._gain_per_s, self._top_speed_m_s / (math.hypot(*offset_m) or math.inf))
         v_e, v_n, v_u = _mean([leader.velocity_m_s for leader in leaders])
         return Velocity(

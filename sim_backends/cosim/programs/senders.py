@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sim_backends.cosim.federates import Action
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State
 
@@ -19,7 +19,7 @@ class Periodic:
         period_ns: Time between packets.
         size_bytes: Size of each packet.
         first_ns: Time of the first packet.
-        stop_ns: Time from which on nothing is sent; None for never.
+        stop_ns: Time from which nothing is sent; None to send until the end.
         protocol: Name of the transport.
     """
 
@@ -47,14 +47,14 @@ class Periodic:
         """Return the time of the next packet, or None after `stop_ns`."""
         return None if self._stop_ns is not None and self._next_ns >= self._stop_ns else self._next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send a packet if it is due."""
         wake_ns = self.next_wake_ns()
         if wake_ns is None or now_ns < wake_ns:
             return Action()
         datagram = Datagram(self._destination, self._size_bytes, self._flow, self._number, own_state, self._protocol)
         self._number += 1
-        # After a clock was set ahead, missed packets are skipped.
+        # The packets that were missed because a clock was set ahead are skipped.
         self._next_ns += self._period_ns * ((now_ns - wake_ns) // self._period_ns + 1)
         return Action((datagram,))
 
@@ -111,19 +111,19 @@ class EchoRequester:
         self._size_bytes = size_bytes
         self._next_ns = first_ns
         self._protocol = protocol
-        self._sent = 0
+        self._sent_count = 0
 
     def next_wake_ns(self) -> int | None:
         """Return the time of the next request, or None after the last."""
-        return self._next_ns if self._sent < self._count else None
+        return self._next_ns if self._sent_count < self._count else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send a request if it is due."""
         wake_ns = self.next_wake_ns()
         if wake_ns is None or now_ns < wake_ns:
             return Action()
-        request = PingRequest(self._flow, self._sent, self._size_bytes, self._protocol)
-        self._sent += 1
+        request = PingRequest(self._flow, self._sent_count, self._size_bytes, self._protocol)
+        self._sent_count += 1
         self._next_ns += self._interval_ns * ((now_ns - wake_ns) // self._interval_ns + 1)
         return Action(
             (Datagram(self._destination, self._size_bytes, self._flow, request.number, request, self._protocol),)
@@ -136,10 +136,12 @@ class EchoResponder:
     def next_wake_ns(self) -> None:
         """Return None: it wakes only when a request arrives."""
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send a reply to each received request."""
         requests = [
-            (datagram.source, datagram.payload) for datagram in received if isinstance(datagram.payload, PingRequest)
+            (datagram.source, datagram.payload)
+            for datagram in received_datagrams
+            if isinstance(datagram.payload, PingRequest)
         ]
         return Action(
             [
@@ -168,7 +170,7 @@ class BagMessage:
 def generated_bag(
     draws: RandomStream, *, length_ns: int, rate_hz: float, size_bytes: int, jitter_ns: int
 ) -> list[BagMessage]:
-    """Return a bag of messages of one size and rate; each is recorded with a random delay, and the order is kept.
+    """Return a bag of messages of one size and rate. Each is recorded with a random delay; none overtakes another.
 
     Args:
         draws: Random numbers, one for each message.
@@ -203,23 +205,25 @@ class Playback:
         self._bag = tuple(bag)
         self._begin_ns = begin_ns
         self._protocol = protocol
-        self._sent = 0
+        self._sent_count = 0
 
     def next_wake_ns(self) -> int | None:
         """Return the time of the next message, or None at the end of the bag."""
-        return self._begin_ns + self._bag[self._sent].at_ns if self._sent < len(self._bag) else None
+        return self._begin_ns + self._bag[self._sent_count].at_ns if self._sent_count < len(self._bag) else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send all messages that are due."""
         datagrams = []
         while (wake_ns := self.next_wake_ns()) is not None and wake_ns <= now_ns:
-            size_bytes = self._bag[self._sent].size_bytes
-            datagrams.append(Datagram(self._destination, size_bytes, self._flow, self._sent, None, self._protocol))
-            self._sent += 1
+            size_bytes = self._bag[self._sent_count].size_bytes
+            datagrams.append(
+                Datagram(self._destination, size_bytes, self._flow, self._sent_count, None, self._protocol)
+            )
+            self._sent_count += 1
         return Action(datagrams)
 
 
 def file_pieces(size_bytes: int, piece_bytes: int) -> list[BagMessage]:
     """Return a file as messages of at most `piece_bytes` that are all due at the same time."""
-    whole, rest = divmod(size_bytes, piece_bytes)
-    return [BagMessage(0, size) for size in (*[piece_bytes] * whole, *([rest] if rest else []))]
+    full_pieces, last_bytes = divmod(size_bytes, piece_bytes)
+    return [BagMessage(0, size) for size in (*[piece_bytes] * full_pieces, *([last_bytes] if last_bytes else []))]

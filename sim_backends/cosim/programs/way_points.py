@@ -10,7 +10,7 @@ from typing import Final
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Vector
 from sim_backends.cosim.federates import Action
-from sim_backends.network.packets import Received
+from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State
 
@@ -63,8 +63,7 @@ _APPROACH_PER_S: Final = 1.0
 class DriveThrough(NeverSends):
     """Drives a wheeled body from point to point, and stops at the last point.
 
-    It turns towards a point at a rate proportional to the heading error, and the larger the error is, the slower it
-    drives.
+    It turns towards a point at a rate proportional to the heading error. A larger error reduces its speed.
 
     Args:
         points_m: The waypoints, metres east and north.
@@ -95,27 +94,30 @@ class DriveThrough(NeverSends):
         self._has_arrived = False
         self._reached_m = reached_m
         self._braking_m_s2 = braking_m_s2
-        self._next = 0
+        self._next_index = 0
 
     def next_wake_ns(self) -> int | None:
         """Return the time of the next command, or None after the last point."""
         return None if self._has_arrived else self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Steer towards the next point if a command is due."""
         if self._has_arrived or not self._timer.fire_if_due(now_ns):
             return Action()
         here_m = own_state.position_m[:2]
-        while self._next < len(self._points_m) and math.dist(here_m, self._points_m[self._next]) <= self._reached_m:
-            self._next += 1
-        if self._next == len(self._points_m):
+        while (
+            self._next_index < len(self._points_m)
+            and math.dist(here_m, self._points_m[self._next_index]) <= self._reached_m
+        ):
+            self._next_index += 1
+        if self._next_index == len(self._points_m):
             self._has_arrived = True
             return Action(command=Twist())
         speed_m_s = self._speed_m_s
-        if self._next == len(self._points_m) - 1:
-            left_m = math.dist(here_m, self._points_m[-1])
-            speed_m_s = min(speed_m_s, math.sqrt(2 * self._braking_m_s2 * left_m))
-        return Action(command=drive_towards(own_state, self._points_m[self._next], speed_m_s))
+        if self._next_index == len(self._points_m) - 1:
+            remaining_m = math.dist(here_m, self._points_m[-1])
+            speed_m_s = min(speed_m_s, math.sqrt(2 * self._braking_m_s2 * remaining_m))
+        return Action(command=drive_towards(own_state, self._points_m[self._next_index], speed_m_s))
 
 
 class FlyThrough(NeverSends):
@@ -146,21 +148,24 @@ class FlyThrough(NeverSends):
         self._speed_m_s = speed_m_s
         self._timer = PeriodicTimer(period_ns, begin_ns)
         self._reached_m = reached_m
-        self._next = 0
+        self._next_index = 0
 
     def next_wake_ns(self) -> int:
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Steer towards the next point if a command is due."""
         if not self._timer.fire_if_due(now_ns):
             return Action()
-        last = len(self._points_m) - 1
-        while self._next < last and math.dist(own_state.position_m, self._points_m[self._next]) <= self._reached_m:
-            self._next += 1
-        stops = self._next == last
-        return Action(command=fly_towards(own_state, self._points_m[self._next], self._speed_m_s, stops=stops))
+        last_index = len(self._points_m) - 1
+        while (
+            self._next_index < last_index
+            and math.dist(own_state.position_m, self._points_m[self._next_index]) <= self._reached_m
+        ):
+            self._next_index += 1
+        stops = self._next_index == last_index
+        return Action(command=fly_towards(own_state, self._points_m[self._next_index], self._speed_m_s, stops=stops))
 
 
 def drive_towards(own_state: State, point_m: tuple[float, float], speed_m_s: float) -> Twist:
@@ -176,7 +181,7 @@ def drive_towards(own_state: State, point_m: tuple[float, float], speed_m_s: flo
     """
     if own_state.heading_rad is None:
         raise ConfigurationError(
-            "a program that drives needs the heading of its robot, and the states of this motion have none",
+            "a program that drives needs the heading of its robot, but the states of this body have no heading",
             remedy="use a body that has a heading, such as DifferentialDrive",
         )
     bearing_rad = math.atan2(point_m[1] - own_state.position_m[1], point_m[0] - own_state.position_m[0])
@@ -193,12 +198,12 @@ def fly_towards(own_state: State, point_m: Vector, speed_m_s: float, *, stops: b
         speed_m_s: Top speed.
         stops: True to slow down and stop at the point.
     """
-    offset_m = [goal - own for own, goal in zip(own_state.position_m, point_m, strict=True)]
-    left_m = math.hypot(*offset_m)
-    if not left_m:
+    offset_m = [target - position for position, target in zip(own_state.position_m, point_m, strict=True)]
+    remaining_m = math.hypot(*offset_m)
+    if not remaining_m:
         return Velocity()
-    target_m_s = min(speed_m_s, _APPROACH_PER_S * left_m) if stops else speed_m_s
-    east, north, up = (target_m_s * part / left_m for part in offset_m)
+    target_m_s = min(speed_m_s, _APPROACH_PER_S * remaining_m) if stops else speed_m_s
+    east, north, up = (target_m_s * part / remaining_m for part in offset_m)
     return Velocity((east, north, up))
 
 
@@ -242,18 +247,18 @@ class VelocityProfile(NeverSends):
         stop = Twist() if isinstance(legs[-1].command, Twist) else Velocity()
         self._commands = [*(leg.command for leg in legs), stop]
         self._times_ns = list(accumulate((leg.duration_ns for leg in legs), initial=begin_ns))
-        self._next = 0
+        self._next_index = 0
 
     def next_wake_ns(self) -> int | None:
         """Return the beginning of the next leg, or None after the last."""
-        return self._times_ns[self._next] if self._next < len(self._times_ns) else None
+        return self._times_ns[self._next_index] if self._next_index < len(self._times_ns) else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send the command of the leg that has begun, if any."""
         due = bisect_right(self._times_ns, now_ns)
-        if due == self._next:
+        if due == self._next_index:
             return Action()
-        self._next = due
+        self._next_index = due
         return Action(command=self._commands[due - 1])
 
 
@@ -282,7 +287,7 @@ class SpeedOscillation(NeverSends):
         """Return the time of the next command."""
         return self._timer.next_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:  # noqa: ARG002 (Program)
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
         """Send the present speed if a command is due."""
         if not self._timer.fire_if_due(now_ns):
             return Action()

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action, Program, next_send_ns
-from sim_backends.network.packets import Received
+from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.world.motion import State
 
 
@@ -30,12 +30,12 @@ class CombinedProgram:
         times_ns = (next_send_ns(program) for program in self._programs)
         return min((at_ns for at_ns in times_ns if at_ns is not None), default=None)
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Wake the programs that are due, or all if a datagram has arrived."""
         actions = [
-            program.wake(now_ns, own_state, received)
+            program.wake(now_ns, own_state, received_datagrams)
             for program in self._programs
-            if received or _is_due(program, now_ns)
+            if received_datagrams or _is_due(program, now_ns)
         ]
         commands = [action.command for action in actions if action.command is not None]
         datagrams = tuple(datagram for action in actions for datagram in action.datagrams)
@@ -50,7 +50,7 @@ def _is_due(program: Program, now_ns: int) -> bool:
 class Outage:
     """A program that is off during an interval: it receives and sends nothing, and its body gets a command to stop.
 
-    When it is on again, it continues as if all its packets in the interval had been lost.
+    After the interval it continues as if all its packets in the interval had been lost.
 
     Args:
         program: The program.
@@ -67,7 +67,7 @@ class Outage:
         self._is_stopped = False
 
     def next_wake_ns(self) -> int | None:
-        """Return the program's next wake time; at most the start of the outage until the body has been stopped."""
+        """Return the program's next wake time, but no later than the start of the outage if that is still ahead."""
         wake_ns = self._program.next_wake_ns()
         return wake_ns if self._is_stopped else min(self._begin_ns, self._begin_ns if wake_ns is None else wake_ns)
 
@@ -75,11 +75,11 @@ class Outage:
         """Return the program's next send time."""
         return next_send_ns(self._program)
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Wake the program; during the outage, discard its action, and stop the body once."""
         is_off = self._begin_ns <= now_ns and (self._end_ns is None or now_ns < self._end_ns)
         if not is_off:
-            return self._program.wake(now_ns, own_state, received)
+            return self._program.wake(now_ns, own_state, received_datagrams)
         wake_ns = self._program.next_wake_ns()
         if wake_ns is not None and wake_ns <= now_ns:
             self._program.wake(now_ns, own_state, ())
@@ -113,7 +113,7 @@ class AgentClock:
         if self.rate_ppb <= -_BILLION:
             raise ConfigurationError(
                 f"a clock that loses {-self.rate_ppb:,} ns per second stops or runs backwards, and no timer fires",
-                remedy="let it lose less than 10^9 ns per second",
+                remedy="set a clock that loses less than 10^9 ns per second",
             )
 
     def reading_ns(self, now_ns: int) -> int:
@@ -122,26 +122,26 @@ class AgentClock:
             return now_ns
         return now_ns + self.offset_ns + (now_ns - self.begin_ns) * self.rate_ppb // _BILLION
 
-    def first_ns(self, shown_ns: int) -> int:
-        """Return the first time at which the reading of the clock is `shown_ns` or later."""
-        if shown_ns < self.begin_ns:
-            return shown_ns
+    def first_ns(self, reading_ns: int) -> int:
+        """Return the first time at which the reading of the clock is `reading_ns` or later."""
+        if reading_ns < self.begin_ns:
+            return reading_ns
         # After n ns in the interval it has advanced by floor(n (1 + rate)): find the smallest sufficient n.
-        missing_ns = shown_ns - self.begin_ns - self.offset_ns
+        missing_ns = reading_ns - self.begin_ns - self.offset_ns
         since_ns = max(-(-missing_ns * _BILLION // (_BILLION + self.rate_ppb)), 0)
         wrong_until_ns = self.begin_ns + since_ns
         if self.end_ns is None or wrong_until_ns < self.end_ns:
             return wrong_until_ns
-        return max(shown_ns, self.end_ns)
+        return max(reading_ns, self.end_ns)
 
 
 @dataclass(frozen=True, slots=True)
-class _Stamped:
+class _StampedPayload:
     payload: Any
     sent_ns: int
 
 
-class Clocked:
+class ProgramWithClock:
     """A program that uses only the clock of its computer, including for the time stamps of its datagrams.
 
     If the clock of one agent is wrong, the programs of all agents are wrapped, so that all can read the time stamps.
@@ -157,22 +157,28 @@ class Clocked:
 
     def next_wake_ns(self) -> int | None:
         """Return the true time at which the program's timer fires."""
-        shown_ns = self._program.next_wake_ns()
-        return None if shown_ns is None else self._clock.first_ns(shown_ns)
+        reading_ns = self._program.next_wake_ns()
+        return None if reading_ns is None else self._clock.first_ns(reading_ns)
 
     def next_send_ns(self) -> int | None:
         """Return the true time before which the program does not send."""
-        shown_ns = next_send_ns(self._program)
-        return None if shown_ns is None else self._clock.first_ns(shown_ns)
+        reading_ns = next_send_ns(self._program)
+        return None if reading_ns is None else self._clock.first_ns(reading_ns)
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:
         """Wake the program at the clock's reading, and stamp its datagrams with it."""
-        shown_ns = self._clock.reading_ns(now_ns)
-        action = self._program.wake(shown_ns, own_state, [self._unstamped(datagram) for datagram in received])
-        stamped = [replace(datagram, payload=_Stamped(datagram.payload, shown_ns)) for datagram in action.datagrams]
-        return Action(stamped, action.command)
+        reading_ns = self._clock.reading_ns(now_ns)
+        action = self._program.wake(
+            reading_ns, own_state, [self._unstamped(datagram) for datagram in received_datagrams]
+        )
+        stamped_datagrams = [
+            replace(datagram, payload=_StampedPayload(datagram.payload, reading_ns)) for datagram in action.datagrams
+        ]
+        return Action(stamped_datagrams, action.command)
 
-    def _unstamped(self, received: Received) -> Received:
-        stamped: _Stamped = received.payload
-        arrived_ns = self._clock.reading_ns(received.arrived_ns)
-        return Received(received.source, stamped.payload, stamped.sent_ns, arrived_ns)
+    def _unstamped(self, received_datagram: ReceivedDatagram) -> ReceivedDatagram:
+        stamped_payload: _StampedPayload = received_datagram.payload
+        arrived_ns = self._clock.reading_ns(received_datagram.arrived_ns)
+        return ReceivedDatagram(
+            received_datagram.source, stamped_payload.payload, stamped_payload.sent_ns, arrived_ns
+        )

@@ -1,6 +1,7 @@
 """A pcap file per robot, with the internet headers of its packets.
 
-A network in another process reports no IP packets; `PacketObserver` makes them from the programs' packets.
+A network in another process reports no IP packets. `PacketObserver` therefore creates them from the packets of
+programs.
 """
 
 import os
@@ -104,13 +105,13 @@ class IpEncoder:
         protocol, transport_header = self._transport(packet)
         begin = fragment.offset_bytes
         payload_part = transport_header[begin : begin + fragment.size_bytes - HEADER_BYTES]
-        more = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
+        fragment_flag = _MORE_FRAGMENTS if fragment.index + 1 < fragment.count else 0
         words = (
             0x45,
             0,
             fragment.size_bytes,
             fragment.ip_id & 0xFFFF,
-            more | begin // 8,
+            fragment_flag | begin // 8,
             64,
             protocol,
         )
@@ -223,7 +224,7 @@ class Captures:
     Args:
         folder: Folder of the files; it is created for the first packet.
         names: The robots.
-        snap_bytes: Number of bytes kept of each packet, like tcpdump's `-s`.
+        snap_bytes: Number of bytes of each packet that are stored, like tcpdump's `-s`.
         flows: Flows with special headers, by name.
     """
 
@@ -233,18 +234,18 @@ class Captures:
         self._folder = folder
         self._snap_bytes = snap_bytes
         self._encoder = IpEncoder(names, flows)
-        self._pending: dict[str, bytearray] = {}
+        self._pending_data: dict[str, bytearray] = {}
         self._files: dict[str, FileIO] = {}
         self._written_bytes: dict[str, int] = {}
 
     def log(self, at_ns: int, name: str, fragment: Fragment) -> None:
         """Add an IP packet or fragment that a robot sent or that arrived at it (`IpLog`)."""
         data = self._encoder.encode(fragment, self._snap_bytes)
-        if name not in self._pending:
-            self._pending[name] = bytearray(
+        if name not in self._pending_data:
+            self._pending_data[name] = bytearray(
                 _FILE_HEADER.pack(_NANOSECONDS_MAGIC, 2, 4, 0, 0, self._snap_bytes, _LINKTYPE_RAW)
             )
-        self._pending[name] += _RECORD_HEADER.pack(*divmod(at_ns, 10**9), len(data), fragment.size_bytes) + data
+        self._pending_data[name] += _RECORD_HEADER.pack(*divmod(at_ns, 10**9), len(data), fragment.size_bytes) + data
 
     def flush(self) -> None:
         """Write the packets that are not written yet.
@@ -252,33 +253,33 @@ class Captures:
         Raises:
             OSError: A file cannot be written.
         """
-        for name, pending in self._pending.items():
+        for name, pending_data in self._pending_data.items():
             if name not in self._files:
                 self._folder.mkdir(exist_ok=True)
                 self._written_bytes[name] = 0
                 self._files[name] = (self._folder / f"{name}.pcap").open("xb", buffering=0)
-            self._write(name, pending)
+            self._write(name, pending_data)
 
     def close(self) -> None:
         """Close the files; packets that were not flushed are lost."""
         for file in self._files.values():
             file.close()
 
-    def _write(self, name: str, pending: bytearray) -> None:
-        descriptor, at, done = self._files[name].fileno(), self._written_bytes[name], 0
-        while done < len(pending):
+    def _write(self, name: str, pending_data: bytearray) -> None:
+        descriptor, at, written_bytes = self._files[name].fileno(), self._written_bytes[name], 0
+        while written_bytes < len(pending_data):
             # The position is explicit, so that an interrupt before the count is updated does not duplicate data.
-            done += os.pwrite(descriptor, bytes(pending[done:]), at + done)
-        self._written_bytes[name], self._pending[name] = at + done, bytearray()
+            written_bytes += os.pwrite(descriptor, bytes(pending_data[written_bytes:]), at + written_bytes)
+        self._written_bytes[name], self._pending_data[name] = at + written_bytes, bytearray()
 
 
-def between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
-    """Return a capture with the packets of another capture from `begin_ns` to `end_ns`, without the latter.
+def packets_between(capture: bytes, begin_ns: int, end_ns: int) -> bytes:
+    """Return a copy of a capture that contains only the packets of an interval of simulated time.
 
     Args:
         capture: The content of the file.
-        begin_ns: First simulated time.
-        end_ns: Simulated time after the last one.
+        begin_ns: Start of the interval.
+        end_ns: End of the interval, exclusive.
     """
     records = (capture[begin:end] for at_ns, begin, end in _records(capture) if begin_ns <= at_ns < end_ns)
     return capture[: _FILE_HEADER.size] + b"".join(records)
@@ -294,7 +295,7 @@ def _records(capture: bytes) -> Iterator[tuple[int, int, int]]:
         begin = end
 
 
-def first_tcp_ns(capture: bytes, port: int) -> int | None:
+def first_tcp_packet_ns(capture: bytes, port: int) -> int | None:
     """Return the time of the first TCP packet to a port in a capture; None if there is no such packet.
 
     Args:
@@ -322,18 +323,17 @@ class PacketObserver:
     def __init__(self, recorder: WindowObserver, log: IpLog) -> None:
         self._recorder = recorder
         self._log = log
-        self._sent = 0
 
     def begin(self, states: Mapping[str, State]) -> None:
         """Implement `WindowObserver.begin`."""
         self._recorder.begin(states)
 
     def window(self, window: Window) -> None:
-        """Log the packets of a window in order of time, and pass it on."""
-        events = [(fate.packet.enters_ns, fate.packet.source, fate.packet) for fate in window.entered]
+        """Log the packets of a window in order of time, and forward the window to the recorder."""
+        events = [(fate.packet.enters_ns, fate.packet.source, fate.packet) for fate in window.entered_fates]
         events += [
             (fate.arrived_ns, fate.packet.destination, fate.packet)
-            for fate in window.ended
+            for fate in window.decided_fates
             if fate.arrived_ns is not None
         ]
         for at_ns, name, packet in sorted(events, key=itemgetter(0)):

@@ -19,19 +19,19 @@ from fieldkit.core.errors import EvidenceError
 
 SCHEMA_VERSION: Final = 2
 RUN_AGAIN: Final = "use a copy of the folder if there is one, or run the scenario in it again"
-"""Remedy for a damaged recording."""
+"""The remedy for a damaged recording."""
 _NAME: Final = "run.json"
 _CHECKSUM: Final = "content_hash"
 """Key of the SHA-256 over the other keys, which are the fields of `RunManifest`."""
 
 
 class RunEnding(StrEnum):
-    """The status of a run: it is under way, or how it ended."""
+    """The status of a run: under way, or the way in which it ended."""
 
     UNDER_WAY = "under way"
     KILLED = "killed"
-    """`run.json` has `under way`, but no process holds the lock; this value is never written."""
-    WHOLE = "whole"
+    """`run.json` contains `under way`, but no process holds the lock; this value is never written."""
+    COMPLETE = "whole"
     INTERRUPTED = "interrupted"
     FAILED = "failed"
 
@@ -129,10 +129,10 @@ def _is_locked(folder: Path) -> bool:
 
 
 def read_manifest(folder: Path) -> RunManifest:
-    """Read `run.json`; a run was killed if it is under way there but no process writes it.
+    """Read `run.json`; the ending is `KILLED` if it contains `under way` but no process holds the lock.
 
     Raises:
-        EvidenceError: It does not exist, is invalid, or was changed.
+        EvidenceError: The file does not exist, is invalid, or was changed.
     """
     manifest = _read_file(folder)
     if manifest.ending is RunEnding.UNDER_WAY and not _is_locked(folder):
@@ -150,7 +150,9 @@ def _read_file(folder: Path) -> RunManifest:
         manifest = _CODEC.parse(content)
     except FileNotFoundError as error:
         raise EvidenceError(
-            "there is no recording of a co-simulation", where=str(folder), remedy="name the folder that has run.json"
+            "there is no recording of a co-simulation",
+            where=str(folder),
+            remedy="give the folder that contains run.json",
         ) from error
     except (OSError, ValueError, RecursionError) as error:
         raise EvidenceError(f"this is not the record of a run: {error}", where=str(path), remedy=RUN_AGAIN) from error
@@ -164,7 +166,7 @@ def _read_file(folder: Path) -> RunManifest:
         raise EvidenceError(
             "the scenario's text was changed after the run: its hash differs", where=str(path), remedy=RUN_AGAIN
         )
-    if manifest.ending is RunEnding.WHOLE and not (manifest.digest and manifest.parts):
+    if manifest.ending is RunEnding.COMPLETE and not (manifest.digest and manifest.parts):
         raise EvidenceError(
             "the run is complete, but the record has no digest or no parts", where=str(path), remedy=RUN_AGAIN
         )

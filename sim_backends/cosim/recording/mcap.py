@@ -82,7 +82,7 @@ _PACKET: Final = _object(
 
 
 def write_mcap(file: BinaryIO, recording: Recording) -> None:
-    """Write a recording; equal recordings give equal bytes. Times are simulated, from 0 on.
+    """Write a recording as MCAP; equal recordings give equal bytes. Times are simulated times, which start at 0.
 
     The topics are `/tf` with the positions of the robots in the frame `world`, `/states/ROBOT` with positions and
     velocities, and `/packets/FLOW` with each packet and its fate, at the time of sending.
@@ -96,14 +96,14 @@ def write_mcap(file: BinaryIO, recording: Recording) -> None:
     """
     writer = Writer(file, compression=CompressionType.ZSTD)
     writer.start(library=f"fieldkit {version('fieldkit')}")
-    about = recording.manifest.about
+    settings = recording.manifest.about
     writer.add_metadata(
         "fieldkit",
         {
-            "scenario": about.scenario,
-            "policy": about.policy,
-            "parameters": json.dumps(dict(about.parameters), sort_keys=True),
-            "seed": str(about.seed),
+            "scenario": settings.scenario,
+            "policy": settings.policy,
+            "parameters": json.dumps(dict(settings.parameters), sort_keys=True),
+            "seed": str(settings.seed),
             "digest": recording.manifest.digest,
             "ending": recording.manifest.ending.value,
         },
@@ -165,8 +165,8 @@ def _fate(fate: Fate) -> dict[str, Any]:
 
 
 def _time(at_ns: int) -> Json:
-    seconds, rest_ns = divmod(at_ns, 10**9)
-    return {"sec": seconds, "nsec": rest_ns}
+    seconds, nanoseconds = divmod(at_ns, 10**9)
+    return {"sec": seconds, "nsec": nanoseconds}
 
 
 def _vector(values: tuple[float, float, float]) -> Json:

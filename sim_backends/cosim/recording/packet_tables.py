@@ -129,7 +129,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
         BLAKE2b of the file, in hexadecimal.
 
     Raises:
-        OSError: It cannot be written; no file is left.
+        OSError: The part cannot be written; no incomplete file remains.
     """
     schema = SCHEMAS[table]
     columns = zip(*rows, strict=True) if rows else [()] * len(schema)
@@ -222,9 +222,9 @@ class RecordingState:
         """Add windows to the state, and return the rows of each table."""
         rows: Rows = {table: [] for table in TABLES}
         for window in windows:
-            for fate in window.entered:
+            for fate in window.entered_fates:
                 self.under_way[fate.packet.packet_id] = fate, self.windows
-            for fate in window.ended:
+            for fate in window.decided_fates:
                 _, entered_window = self.under_way.pop(fate.packet.packet_id)
                 rows["packets"].append(_packet_row(fate, entered_window, self.windows))
             rows["windows"].append(
@@ -237,7 +237,7 @@ class RecordingState:
                 )
             )
             rows["states"] += state_rows(window.end_ns, window.states)
-            self.digest.add_window(window.end_ns, window.entered, window.ended)
+            self.digest.add_window(window.end_ns, window.entered_fates, window.decided_fates)
             self.windows += 1
         return rows
 
@@ -257,7 +257,7 @@ def _packet_row(fate: Fate, entered_window: int, ended_window: int | None) -> Ro
     outcome = (
         (None, None, 0, "") if ended_window is None else (fate.arrived_ns, fate.counted_ns, fate.late_ns, fate.reason)
     )
-    ends = (*fate.assumed, *fate.true)
+    ends = (*fate.assumed_states, *fate.true_states)
     return (
         packet.packet_id,
         *packet.identity,

@@ -26,7 +26,7 @@ from sim_backends.cosim.run_record import IpObserver, Window, WindowObserver
 from sim_backends.network.ip import Fragment
 from sim_backends.world.motion import State
 
-EVERY_NS: Final = 100_000_000
+SAMPLING_INTERVAL_NS: Final = 100_000_000
 
 
 class Sampling:
@@ -36,7 +36,7 @@ class Sampling:
         every_ns: Sampling interval, in simulated nanoseconds.
     """
 
-    def __init__(self, every_ns: int = EVERY_NS) -> None:
+    def __init__(self, every_ns: int = SAMPLING_INTERVAL_NS) -> None:
         self._every_ns = every_ns
         self._due_ns = every_ns
 
@@ -98,7 +98,7 @@ class RecordingError(ConfigurationError):
 
 
 class RunRecorder:
-    """Records a run into a folder; a context manager around the run.
+    """Records a run into a folder. The run is executed within this context manager.
 
     Windows are collected in memory. About every two seconds of wall time they are written as one more part of each
     table. The part of `windows` is written last. If it exists, the parts of the other tables with the same number are
@@ -109,9 +109,9 @@ class RunRecorder:
         about: The scenario and its settings.
         states_every_ns: Interval at which true states are recorded, at ends of windows, in simulated nanoseconds.
         part_every_s: Interval at which parts are written, in seconds of wall time.
-        snap_bytes: Number of bytes kept of each IP packet in `captures/`. That folder has a file for each robot if
-            the network passes its packets to `log_ip`.
-        agents: The agents that are absent at time 0, whose packets `captures/` must also include.
+        snap_bytes: Number of bytes of each IP packet that are stored in `captures/`. That folder has a file for each
+            robot if the network passes its packets to `log_ip`.
+        agents: The agents that are absent at time 0; `captures/` must also include their packets.
         flows: Flows with special headers in the captures, by name.
     """
 
@@ -120,7 +120,7 @@ class RunRecorder:
         folder: Path,
         about: RunSettings,
         *,
-        states_every_ns: int = EVERY_NS,
+        states_every_ns: int = SAMPLING_INTERVAL_NS,
         part_every_s: float = 2.0,
         snap_bytes: int = 128,
         agents: Iterable[str] = (),
@@ -136,7 +136,7 @@ class RunRecorder:
         self._first_states = _NO_STATES
         self._windows: list[Window] = []
         self._state = RecordingState()
-        self._written_s = time.perf_counter()
+        self._last_write_s = time.perf_counter()
         self._manifest = RunManifest(about, about.scenario_hash, versions=versions())
         self._lock = ExitStack()
         self._has_begun = False
@@ -157,7 +157,7 @@ class RunRecorder:
             write_manifest(self._folder, self._manifest)
         except FileExistsError as error:
             raise ConfigurationError(
-                "there is a recording already", where=str(self._folder), remedy="name a folder that does not exist"
+                "there is already a recording", where=str(self._folder), remedy="choose a folder that does not exist"
             ) from error
         except OSError as error:
             raise self._error(error) from error
@@ -180,9 +180,9 @@ class RunRecorder:
         states = window.states if self._sampling.is_due(window.end_ns) else _NO_STATES
         # The states of all windows would need too much memory.
         self._windows.append(Window(*window[:5], states, _NO_STATES, window.wall_s))
-        if len(self._windows) >= _MAX_WINDOWS or time.perf_counter() - self._written_s >= self._part_every_s:
+        if len(self._windows) >= _MAX_WINDOWS or time.perf_counter() - self._last_write_s >= self._part_every_s:
             self._write_part()
-            self._written_s = time.perf_counter()
+            self._last_write_s = time.perf_counter()
 
     def __enter__(self) -> Self:
         """Return the recorder."""
@@ -202,18 +202,18 @@ class RunRecorder:
             self._finish(error)
 
     def _finish(self, error: BaseException | None) -> None:
-        ending = RunEnding.WHOLE
+        ending = RunEnding.COMPLETE
         if error is not None:
             ending = RunEnding.INTERRUPTED if isinstance(error, KeyboardInterrupt) else RunEnding.FAILED
-        why = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
+        error_text = f"{type(error).__name__}: {error}" if ending is RunEnding.FAILED else ""
         if not self._has_failed:
-            self._write_part(last=True)
+            self._write_part(is_last=True)
         self._close()
         self._free_reserve()
         self._manifest = replace(
             self._manifest,
             ending=ending,
-            why=why,
+            why=error_text,
             digest="" if self._has_failed else self._state.digest.hexdigest(),
             parts=self._state.checksums,
         )
@@ -224,7 +224,7 @@ class RunRecorder:
                 raise self._error(manifest_error) from manifest_error
 
     def _close(self) -> None:
-        """Close the captures; an error is raised unless writing has failed before."""
+        """Close the captures; if writing has failed before, ignore errors."""
         try:
             if self._captures is not None:
                 self._captures.close()
@@ -232,11 +232,11 @@ class RunRecorder:
             if not self._has_failed:
                 raise self._error(error) from error
 
-    def _write_part(self, *, last: bool = False) -> None:
-        """Write the collected windows; if this is interrupted, no window is counted twice.
+    def _write_part(self, *, is_last: bool = False) -> None:
+        """Write the collected windows; an interrupt does not cause a window to be counted twice.
 
-        If the disk is full, tables have priority over captures: they get the reserved space, and as many windows are
-        written as fit into it.
+        If the disk is full, the reserved space is used for tables, not for captures. As many windows are written as
+        fit into it.
 
         Raises:
             RecordingError: Some windows or packets cannot be written.
@@ -249,9 +249,9 @@ class RunRecorder:
             failure = error
             self._free_reserve()
         count = len(self._windows)
-        while count or last:
+        while count or is_last:
             try:
-                self._write_windows(count, last=last and failure is None)
+                self._write_windows(count, is_last=is_last and failure is None)
                 break
             except OSError as error:
                 failure = failure or error
@@ -262,33 +262,33 @@ class RunRecorder:
         if failure is not None:
             raise self._error(failure) from failure
 
-    def _write_windows(self, count: int, *, last: bool) -> None:
+    def _write_windows(self, count: int, *, is_last: bool) -> None:
         """Write the first `count` collected windows as a part of each table."""
         state, windows = self._state.copy(), self._windows[:count]
         rows = state.add_windows(windows)
         if not state.parts:
             rows["states"] = state_rows(0, self._first_states) + rows["states"]
-        if last:
+        if is_last:
             rows["packets"] += state.undecided_rows()
-        written: list[Path] = []
+        written_paths: list[Path] = []
         try:
             for table, table_rows in rows.items():
                 path = packet_tables.part_path(table, state.parts)
-                written.append(self._folder / path)
+                written_paths.append(self._folder / path)
                 state.checksums[path] = packet_tables.write_part(self._folder, table, state.parts, table_rows)
         except OSError:
-            for unfinished in written:  # this frees their space
+            for path_to_remove in written_paths:  # an incomplete part would use disk space
                 with suppress(OSError):
-                    unfinished.unlink(missing_ok=True)
+                    path_to_remove.unlink(missing_ok=True)
             raise
         state.parts += 1
         self._state, self._windows = state, self._windows[count:]
 
     def _allocate_reserve(self) -> None:
-        """Allocate disk space; skipped if the file system does not support it, or limits the size of files.
+        """Allocate disk space, unless the file system does not support it or limits the size of files.
 
         Raises:
-            OSError: The disk has not enough space.
+            OSError: The disk does not have enough space.
         """
         descriptor = os.open(self._folder / _RESERVE, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
         try:

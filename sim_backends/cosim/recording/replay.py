@@ -20,7 +20,7 @@ class Recording:
     Attributes:
         manifest: The scenario and its settings, and the end of the run.
         run: The run. If it is under way or was killed, the packets whose fate was not decided yet are missing.
-        states: True states as they were recorded: time in nanoseconds, agent, state.
+        states: The recorded true states: time in nanoseconds, agent, state.
         decided_by: Reason for the length of each window; empty if the policy does not report it.
     """
 
@@ -46,7 +46,7 @@ def read_recording(folder: Path) -> Recording:
     run = Run(windows_ns=windows["end_ns"])
     run.fates = {fate.packet.identity: fate for fate in sorted(fates, key=lambda fate: fate.packet.packet_id)}
     for part in run.wall_s:
-        # Added in the same order as in the run, so that the sum is equal to the last bit.
+        # The times are added in the same order as in the run, so that all bits of the sum are equal.
         for spent_s in windows[f"{part}_s"]:
             run.wall_s[part] += spent_s
     if manifest.digest:
@@ -78,14 +78,16 @@ def _check_parts(folder: Path, manifest: RunManifest) -> None:
             raise EvidenceError("the recording was changed after the run", where=str(folder / path), remedy=RUN_AGAIN)
 
 
-def _digest(run: Run, fates: Sequence[Fate], entered: Sequence[int], ended: Sequence[int | None]) -> str:
+def _digest(
+    run: Run, fates: Sequence[Fate], entered_windows: Sequence[int], ended_windows: Sequence[int | None]
+) -> str:
     """Return the digest of the recorded events; `fates` is in the order in which they were decided."""
-    entered_window = {fate.packet.packet_id: window for fate, window in zip(fates, entered, strict=True)}
+    entered_window = {fate.packet.packet_id: window for fate, window in zip(fates, entered_windows, strict=True)}
     entered_by_window: dict[int, list[Fate]] = {}
     for fate in run.fates.values():
         entered_by_window.setdefault(entered_window[fate.packet.packet_id], []).append(fate)
     ended_by_window: dict[int | None, list[Fate]] = {}
-    for fate, window in zip(fates, ended, strict=True):
+    for fate, window in zip(fates, ended_windows, strict=True):
         ended_by_window.setdefault(window, []).append(fate)
     digest = EventDigest()
     for window, end_ns in enumerate(run.windows_ns):

@@ -42,7 +42,7 @@ Point = Annotated[tuple[Coordinate, ...], Field(min_length=2, max_length=3)]
 
 
 class StandingPlan(Strict):
-    """The agent gets no command, so that it stays where it starts.
+    """The agent gets no command, so it stays at its start position.
 
     Attributes:
         kind: `standing`.
@@ -98,10 +98,10 @@ class VelocityProfilePlan(Strict):
 
 
 class FollowPlan(Strict):
-    """The agent follows others, using only their states that it receives over the network.
+    """The agent follows other agents, using only the states that it receives from them over the network.
 
-    An agent that drives keeps behind one leader, by a distance and a time; an agent that flies keeps above the centre
-    of one or several leaders. Traffic of the kind `stream` must carry their states to it.
+    An agent that drives stays behind one leader at a distance that grows with its speed; an agent that flies stays
+    above the centre of one or several leaders. Traffic of the kind `stream` must carry their states to the agent.
 
     Attributes:
         kind: `follow`.
@@ -119,7 +119,7 @@ class FollowPlan(Strict):
 
 
 class StationKeepingPlan(Strict):
-    """The agent, which flies, holds its start position.
+    """A flying agent stays at its start position.
 
     Attributes:
         kind: `station-keeping`.
@@ -151,7 +151,7 @@ class QosOptions(Strict):
     Attributes:
         reliability: `reliable`, which retransmits lost samples, or `best_effort`.
         history: `keep_last` samples up to `depth`, or `keep_all`, which makes the writer wait for readers.
-        depth: Number of samples that `keep_last` keeps.
+        depth: Number of samples that `keep_last` stores.
     """
 
     reliability: Literal["reliable", "best_effort"] = "reliable"
@@ -184,9 +184,11 @@ class _Traffic(Strict, ABC):
     @schema.model_validator(mode="after")
     def _ends_are_different(self) -> "_Traffic":
         if self.qos is not None and self.protocol != "topic":
-            raise schema.validation_error(f"only a topic has a qos, and the protocol is {self.protocol}", "qos")
+            raise schema.validation_error(
+                f"only the protocol topic has a qos, but the protocol is {self.protocol}", "qos"
+            )
         if self.source in self.to:
-            raise schema.validation_error(f"{self.source} sends to itself", "to")
+            raise schema.validation_error(f"{self.source} is both the sender and a receiver", "to")
         if len(set(self.to)) < len(self.to):
             raise schema.validation_error("an agent is listed twice", "to")
         return self
@@ -222,13 +224,13 @@ class _Traffic(Strict, ABC):
 
 
 class StreamTraffic(_Traffic):
-    """An agent sends its own state at a constant rate, for followers and for load.
+    """An agent sends its state at a constant rate, for followers or to load the network.
 
     Attributes:
         kind: `stream`.
         rate: Packets per second.
         size_bytes: Size of each packet, without the headers of the transport.
-        stop: Time from which on nothing is sent; never if omitted.
+        stop: Time from which nothing is sent; if omitted, it sends until the end.
     """
 
     kind: Literal["stream"]
@@ -252,7 +254,7 @@ class BagTraffic(_Traffic):
 
     The defaults are the paper's: 10 s of accelerometer data. The size is the size of a serialized `sensor_msgs/Imu`
     with the frame `imu_link`: 24 bytes of header, 32 of orientation, 24 of angular velocity, 24 of acceleration, and
-    72 of covariance with each of the three. The rate is the rate of the Husky's simulated IMU.
+    a covariance of 72 bytes for each of these three quantities. The rate is that of the Husky's simulated IMU.
 
     Attributes:
         kind: `bag`.
@@ -342,8 +344,8 @@ class PingTraffic(_Traffic):
 
     @override
     def packets(self, duration_s: float) -> float:
-        sent = min(self.count, (duration_s - self.start) / self.interval)
-        return 2 * len(self.to) * max(sent, 0.0)
+        request_count = min(self.count, (duration_s - self.start) / self.interval)
+        return 2 * len(self.to) * max(request_count, 0.0)
 
 
 Traffic = Annotated[StreamTraffic | BagTraffic | FileTraffic | PingTraffic, Field(discriminator="kind")]

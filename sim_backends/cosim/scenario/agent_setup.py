@@ -19,7 +19,7 @@ from sim_backends.cosim.programs.senders import (
     generated_bag,
 )
 from sim_backends.cosim.programs.way_points import PERIOD_NS, DriveThrough, FlyThrough, ProfileLeg, VelocityProfile
-from sim_backends.cosim.programs.wrappers import AgentClock, Clocked, CombinedProgram, Outage
+from sim_backends.cosim.programs.wrappers import AgentClock, CombinedProgram, Outage, ProgramWithClock
 from sim_backends.cosim.scenario.agent_plans import (
     BagTraffic,
     FileTraffic,
@@ -58,8 +58,8 @@ def limits(robot: str) -> DriveLimits | QuadrotorLimits:
     if robot in BODIES:
         return BODIES[robot]
     profile = profiles.load_profile(robot)
-    similar: DriveLimits | QuadrotorLimits = quadrotor(robot) if profile.kind == "uav" else TURTLEBOT3_BURGER
-    return replace(similar, speed_m_s=float(profile.limits.max_speed_m_s))
+    reference_limits: DriveLimits | QuadrotorLimits = quadrotor(robot) if profile.kind == "uav" else TURTLEBOT3_BURGER
+    return replace(reference_limits, speed_m_s=float(profile.limits.max_speed_m_s))
 
 
 def bodies(scenario: CosimScenario, world: World) -> dict[str, Body[Any]]:
@@ -87,8 +87,10 @@ def _start_m(plan: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
 def antennas(scenario: CosimScenario) -> dict[str, Antenna]:
     """Return the antennas of the agents that have a radio, from their plan or from their robot profile."""
     profile_names = names("robots")
-    used = {plan.robot for plan in scenario.agents.values() if plan.radio is None and plan.robot in profile_names}
-    profile_antennas = {robot: antenna_of(profiles.load_profile(robot).radio) for robot in sorted(used)}
+    used_profiles = {
+        plan.robot for plan in scenario.agents.values() if plan.radio is None and plan.robot in profile_names
+    }
+    profile_antennas = {robot: antenna_of(profiles.load_profile(robot).radio) for robot in sorted(used_profiles)}
     agent_antennas = {}
     for name, plan in scenario.agents.items():
         if (radio := plan.radio) is not None:
@@ -108,7 +110,7 @@ def stop_commands(bodies: Mapping[str, Body[Any]]) -> dict[str, Twist | Velocity
 
 
 def controllers(scenario: CosimScenario, bodies: Mapping[str, Body[Any]], seed: int) -> dict[str, Program]:
-    """Return the controller of each agent; an agent that does not move has none.
+    """Return the controllers of the agents that move, by the name of the agent.
 
     Args:
         scenario: The scenario.
@@ -193,7 +195,7 @@ START_INTERVAL_S: Final = 0.1
 def programs(
     scenario: CosimScenario, seed: int, controllers: Mapping[str, Program], stops: Mapping[str, Any]
 ) -> dict[str, Program]:
-    """Return the program of each agent; an agent without traffic and controller has none.
+    """Return the programs of all agents with traffic or a controller, by the name of the agent.
 
     Args:
         scenario: The scenario.
@@ -211,12 +213,12 @@ def programs(
         ]
     for name in {to for traffic in scenario.traffic if isinstance(traffic, PingTraffic) for to in traffic.to}:
         programs_by_agent[name].append(EchoResponder())
-    combined: dict[str, Program] = {
+    program_by_agent: dict[str, Program] = {
         name: agent_programs[0] if len(agent_programs) == 1 else CombinedProgram(agent_programs)
         for name, agent_programs in programs_by_agent.items()
         if agent_programs
     }
-    return dict(_with_faults(scenario, combined, stops))
+    return dict(_with_faults(scenario, program_by_agent, stops))
 
 
 def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> Program:
@@ -258,19 +260,19 @@ def _sender(traffic: Traffic, flow: str, to: str, begin_s: float, seed: int) -> 
 
 
 def _with_faults(
-    scenario: CosimScenario, combined: Mapping[str, Program], stops: Mapping[str, Any]
+    scenario: CosimScenario, program_by_agent: Mapping[str, Program], stops: Mapping[str, Any]
 ) -> Iterator[tuple[str, Program]]:
     skews = [fault for fault in scenario.faults if isinstance(fault, ClockSkewFault)]
     clocks = {
         skew.agent: AgentClock(skew.begin_ns, skew.end_ns, round(skew.offset_ms * 1e6), round(skew.rate_ppm * 1e3))
         for skew in skews
     }
-    for name, program in combined.items():
-        wrapped = Clocked(program, clocks.get(name, AgentClock())) if skews else program
+    for name, program in program_by_agent.items():
+        wrapped_program = ProgramWithClock(program, clocks.get(name, AgentClock())) if skews else program
         for fault in scenario.faults:
             if isinstance(fault, NodeLossFault) and fault.agent == name:
-                wrapped = Outage(wrapped, fault.begin_ns, fault.end_ns, stops.get(name))
-        yield name, wrapped
+                wrapped_program = Outage(wrapped_program, fault.begin_ns, fault.end_ns, stops.get(name))
+        yield name, wrapped_program
 
 
 def _ns(seconds: float) -> int:

@@ -25,7 +25,7 @@ from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.external import carried_radio, open_network, open_physics, writes_captures
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.wall_time import DEADLINE_S, Progress, Stall, stalled
+from sim_backends.cosim.wall_time import DEADLINE_S, Progress, Stall, with_stall
 from sim_backends.network.disturbances import Disturbance, Jammer, LinkCut, NodeLoss
 from sim_backends.network.ip import Fragment
 from sim_backends.network.radio import RadioNetwork, TransportFactory
@@ -44,8 +44,8 @@ from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.world import World, load_world
 
 _STARTS_WITHIN_NS: Final = 100_000_000
-"""Interval in which the participants of topics start. If all started at one time, their multicasts would collide, and
-so would all retransmissions."""
+"""Interval in which the participants of topics start. If all started at one time, all their multicast packets and
+retransmissions would collide."""
 
 
 def radio_network(
@@ -102,7 +102,7 @@ def captured_flows(traffic: Iterable[Traffic]) -> dict[str, CapturedFlow]:
 
 
 def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
-    """Return the description of captures with the headers of `Captures`; None if the network writes no captures."""
+    """Return the settings for captures with the same headers as in `Captures`; None if the network writes none."""
     if not writes_captures(scenario):
         return None
     flows = captured_flows(scenario.traffic)
@@ -122,7 +122,7 @@ def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
 
 
 def _transports(scenario: CosimScenario, seed: int) -> Mapping[str, TransportFactory]:
-    """Return the transports; publish-subscribe is omitted if no flow uses it, as it sends even without traffic."""
+    """Return the transports; topics are omitted if no flow uses them, because discovery sends without traffic."""
     topics: dict[str, TopicFlow] = {}
     ros1: dict[str, Ros1Flow] = {}
     for traffic in scenario.traffic:
@@ -156,7 +156,7 @@ def _qos(traffic: Traffic) -> Qos:
 
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
-    """Yield the disturbances by faults; the radio of an agent that is absent is off."""
+    """Yield the disturbances that are caused by faults, and those that switch off the radios of absent agents."""
     stations = antennas(scenario)
     for name, lifetime in scenario.lifetimes.items():
         if name not in stations:
@@ -177,12 +177,12 @@ def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance
 
 
 def _nothing_to_close() -> None:
-    """End a federate that is in this process and has no method `close`."""
+    """Close a federate that runs in this process and has no method `close`."""
 
 
 @dataclass
 class Simulation:
-    """A scenario that is ready to run, once; a context manager that ends its external federates.
+    """A scenario that is ready to run once. As a context manager, it stops its external federates.
 
     Attributes:
         scenario: The scenario.
@@ -191,7 +191,7 @@ class Simulation:
         agents: Bodies and programs.
         network: Carries packets.
         coordinator: Runs agents and network.
-        federates: Ends the external federates when it is closed.
+        federates: Stops the external federates when it is closed.
     """
 
     scenario: CosimScenario
@@ -209,7 +209,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """End the external federates; without this call they end when they are no longer referenced."""
+        """Stop the external federates; without this call they stop when they are no longer referenced."""
         self.federates.close()
 
     def run(self, until_ns: int | None = None, progress: Progress | None = None) -> Run:
@@ -220,7 +220,7 @@ class Simulation:
             progress: As for `Coordinator.advance`.
 
         Raises:
-            PolicyError: The policy has no window. `Coordinator.run` has the record so far, also after other errors.
+            PolicyError: The policy has no window. After any error, `Coordinator.run` has the record so far.
             FederateError: Physics, network or a program failed, or did not answer in time.
         """
         return self.coordinator.advance(self.scenario.duration_ns if until_ns is None else until_ns, progress)
@@ -263,11 +263,11 @@ def build(
     check(scenario, world, lambda location: f"scenario {scenario.name}: {'.'.join(map(str, location))}")
     with ExitStack() as federates:
         scenario_bodies = bodies(scenario, world)
-        details = scenario, world, scenario_bodies, seed, deadline_s
-        if physics is None and (physics := open_physics(*details)) is not None:
+        federate_arguments = scenario, world, scenario_bodies, seed, deadline_s
+        if physics is None and (physics := open_physics(*federate_arguments)) is not None:
             federates.callback(getattr(physics, "close", _nothing_to_close))
-        described = None if network is not None or captures is None else _captures(scenario, captures)
-        carrier = open_network(*details, captures=described) if network is None else None
+        captures_settings = None if network is not None or captures is None else _captures(scenario, captures)
+        carrier = open_network(*federate_arguments, captures=captures_settings) if network is None else None
         federates.callback(getattr(carrier, "close", _nothing_to_close))
         if scenario.network.transports == "federate":
             network = network or carrier
@@ -276,15 +276,15 @@ def build(
         if network is None:
             losses_db = partial(getattr, physics, "path_losses_db") if hasattr(physics, "path_losses_db") else None
             network = radio_network(scenario, world, seed, recorder, losses_db, carrier=carrier)
-        elif isinstance(recorder, IpObserver) and described is None:
+        elif isinstance(recorder, IpObserver) and captures_settings is None:
             recorder = PacketObserver(recorder, recorder.log_ip)
         for fault in scenario.faults:
             if isinstance(fault, StalledFederateFault):
                 stall = Stall(fault.begin_ns, fault.stall, deadline_s)
                 if fault.federate == "physics":
-                    physics = stalled(physics, stall)
+                    physics = with_stall(physics, stall)
                 else:
-                    network = stalled(network, stall)
+                    network = with_stall(network, stall)
         scenario_programs = programs(
             scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
         )

@@ -63,11 +63,11 @@ class Demand(NamedTuple):
     """A speed or rate that a motion requires, and the limit of the body.
 
     Attributes:
-        location: Keys of the value.
+        location: Keys of the value in the scenario.
         quantity: Name of the quantity, with its article.
         value: The required value.
         limit: The largest value that the body reaches.
-        unit: Unit of both.
+        unit: Unit of `value` and `limit`.
     """
 
     location: Location
@@ -192,12 +192,12 @@ def _robots(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
 
 def _radios(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
     stations = antennas(scenario)
-    without_radio = ({name for pair in scenario.pairs for name in pair} | {scenario.relay}) - stations.keys()
+    agents_without_radio = ({name for pair in scenario.pairs for name in pair} | {scenario.relay}) - stations.keys()
     for name, plan in scenario.agents.items():
-        if name in without_radio:
+        if name in agents_without_radio:
             yield ScenarioProblem(
                 ("agents", name),
-                f"{name} sends, receives or relays and has no radio",
+                f"{name} sends, receives or relays packets, but has no radio",
                 f"{plan.robot} is a body only: add radio: {{standard: 802.11n, tx_power_dbm: 17}} to {name}, "
                 f"or choose a robot that has a profile",
             )
@@ -237,7 +237,7 @@ def _starts(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
             yield ScenarioProblem(
                 ("agents", name, "motion", "leader"),
                 f"{plan.robot} does not fly, and only robots that fly follow several leaders",
-                f"name one of {', '.join(plan.motion.leader)}",
+                f"choose one of {', '.join(plan.motion.leader)}",
             )
     try:
         Bodies(bodies(scenario, world), world, lifetimes=scenario.lifetimes)
@@ -253,8 +253,8 @@ def _speeds(scenario: CosimScenario, world: World) -> Iterator[ScenarioProblem]:
         for excess in excesses(plan.motion, start_m, limits(plan.robot)):
             yield ScenarioProblem(
                 ("agents", name, "motion", *excess.location),
-                f"{name} has {excess.quantity} of {excess.value:.6g} {excess.unit}, and {plan.robot} reaches "
-                f"{excess.limit:.6g} {excess.unit} at most",
+                f"{name} has {excess.quantity} of {excess.value:.6g} {excess.unit}, but {plan.robot} reaches at most "
+                f"{excess.limit:.6g} {excess.unit}",
                 f"choose a lower value, or a robot that is faster than {plan.robot}",
             )
 
@@ -264,7 +264,7 @@ def _memory(scenario: CosimScenario) -> Iterator[ScenarioProblem]:
     if available is not None and needed > available:
         message = (
             f"{scenario.duration:g} s of {len(scenario.agents):,} agents would need {format_bytes(needed)} of "
-            f"memory, and {format_bytes(available)} are available"
+            f"memory, but only {format_bytes(available)} are available"
         )
         if radio_bytes(scenario) > available:
             yield ScenarioProblem(("agents",), message, "use fewer agents")

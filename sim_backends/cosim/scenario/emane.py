@@ -33,11 +33,11 @@ from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import State
 from sim_backends.world.world import load_world
 
-_LOCATIONS: Final = 20
-"""Number of locations in an event, which then fits into an Ethernet frame."""
+_LOCATIONS_PER_EVENT: Final = 20
+"""Largest number of locations in an event, so that it fits into an Ethernet frame."""
 
 Losses = Callable[[Sequence[Vector]], Mapping[tuple[int, int], float]]
-"""Returns the path loss in dB between positions, by pairs of indices."""
+"""A function that returns the path losses in dB between positions, by pairs of indices."""
 
 
 class EmaneObserver(AbstractContextManager["EmaneObserver"]):
@@ -67,7 +67,7 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         self._observer = observer
         self._frame = LocalFrame(options.reference)
         self._sampling = Sampling(round(options.interval * 1e9))
-        self._started_s = 0.0
+        self._start_s = 0.0
         self._publisher = EventPublisher(options.channel, options.device)
         if isinstance(observer, IpObserver):
             self.log_ip = observer.log_ip
@@ -76,16 +76,16 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         """Publish the states at time 0."""
         if self._observer is not None:
             self._observer.begin(states)
-        self._started_s = time.monotonic()
+        self._start_s = time.monotonic()
         self._publish(states)
 
     def window(self, window: Window) -> None:
-        """Publish the states at the end of a window if they are due; in real time, this waits for their wall time."""
+        """Publish the states at the end of a window if they are due; a run in real time first waits for that time."""
         if self._observer is not None:
             self._observer.window(window)
         if self._sampling.is_due(window.end_ns):
             if self._options.real_time:
-                time.sleep(max(self._started_s + window.end_ns / 1e9 - time.monotonic(), 0.0))
+                time.sleep(max(self._start_s + window.end_ns / 1e9 - time.monotonic(), 0.0))
             self._publish(window.states)
 
     def __exit__(
@@ -97,8 +97,8 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
     def _publish(self, states: Mapping[str, State]) -> None:
         locations = [self._location(nem, states[name]) for name, nem in self._nems.items() if name in states]
         events = [
-            SerializedEvent(ALL_NEMS, LOCATION, encode_locations(locations[first : first + _LOCATIONS]))
-            for first in range(0, len(locations), _LOCATIONS)
+            SerializedEvent(ALL_NEMS, LOCATION, encode_locations(locations[first : first + _LOCATIONS_PER_EVENT]))
+            for first in range(0, len(locations), _LOCATIONS_PER_EVENT)
         ]
         if self._losses is not None:
             events += self._pathlosses(states)
@@ -108,16 +108,16 @@ class EmaneObserver(AbstractContextManager["EmaneObserver"]):
         return NemLocation(nem, *self._frame.geodetic(state.position_m), emane_velocity(state.velocity_m_s))
 
     def _pathlosses(self, states: Mapping[str, State]) -> list[SerializedEvent]:
-        """Return an event for each agent, with its losses to all others, which are the same in both directions."""
+        """Return an event for each agent, with its losses to all other agents; they are equal in both directions."""
         assert self._losses is not None
         names = [name for name in self._nems if name in states]
         losses_db = self._losses([states[name].position_m for name in names])
-        by_receiver: dict[int, list[NemPathloss]] = {}
+        losses_by_nem: dict[int, list[NemPathloss]] = {}
         for (first, second), loss_db in losses_db.items():
-            for receiver, other in ((first, second), (second, first)):
-                loss = NemPathloss(self._nems[names[other]], loss_db, loss_db)
-                by_receiver.setdefault(self._nems[names[receiver]], []).append(loss)
-        return [SerializedEvent(nem, PATHLOSS, encode_pathlosses(losses)) for nem, losses in by_receiver.items()]
+            for receiver, peer in ((first, second), (second, first)):
+                loss = NemPathloss(self._nems[names[peer]], loss_db, loss_db)
+                losses_by_nem.setdefault(self._nems[names[receiver]], []).append(loss)
+        return [SerializedEvent(nem, PATHLOSS, encode_pathlosses(losses)) for nem, losses in losses_by_nem.items()]
 
 
 def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver | None) -> EmaneObserver:
@@ -125,11 +125,11 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
 
     Args:
         scenario: The scenario, which has a section `emane`.
-        seed: Seed of its random draws, for shadowing.
+        seed: Seed of the random draws for shadowing.
         observer: Another observer of the run, or None.
 
     Raises:
-        ConfigurationError: The section does not suit the agents, or the channel cannot be used.
+        ConfigurationError: The section does not match the agents, or the channel cannot be used.
     """
     options = scenario.emane
     assert options is not None

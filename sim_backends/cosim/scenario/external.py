@@ -1,4 +1,4 @@
-"""External federates of a scenario; only this module of the co-simulation starts, connects or makes them."""
+"""External federates of a scenario; only this module of the co-simulation starts, connects to or creates them."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import AgentStart, FederateCapability, Hello
 from sim_backends.federates.ip_radio import IpRadio
-from sim_backends.federates.named import ProgramFederate, PythonFederate, federates, named
+from sim_backends.federates.named import ProgramFederate, PythonFederate, federates, named_federate
 from sim_backends.federates.protocols import NetworkFederate, PhysicsFederate
 from sim_backends.federates.simulator_options import SimulatorOptions, options_json
 from sim_backends.federates.transports.transport_table import parse_address
@@ -43,13 +43,13 @@ def without_federates(scenario: CosimScenario) -> CosimScenario:
 def has_addresses(scenario: CosimScenario) -> bool:
     """Return True if a federate of the scenario has the address of a transport instead of a command."""
     federates = (scenario.physics.federate, scenario.network.federate)
-    return any(where is not None and parse_address(where) is not None for where in federates)
+    return any(endpoint is not None and parse_address(endpoint) is not None for endpoint in federates)
 
 
 def writes_captures(scenario: CosimScenario) -> bool:
-    """Return True if the network is a program that itself writes captures of the IP packets of its transports."""
-    where = None if scenario.network.transports == "builtin" else scenario.network.federate
-    federate = None if where is None else named(where, NETWORK)
+    """Return True if the network is a program that writes captures of its IP packets."""
+    endpoint = None if scenario.network.transports == "builtin" else scenario.network.federate
+    federate = None if endpoint is None else named_federate(endpoint, NETWORK)
     return isinstance(federate, ProgramFederate) and federate.writes_captures
 
 
@@ -114,7 +114,7 @@ class SimulatorName(NamedTuple):
     Attributes:
         name: Its name.
         role: `physics` or `network`.
-        summary: What it is, in one line.
+        summary: Description in one line.
     """
 
     name: str
@@ -129,28 +129,28 @@ def simulators() -> list[SimulatorName]:
         ConfigurationError: The package of a simulator cannot be loaded.
     """
     built_in = (SimulatorName(BUILT_IN, ROLES[role], summary) for role, summary in _BUILT_IN_SUMMARIES.items())
-    others = (SimulatorName(name, ROLES[kind.role], kind.summary) for name, kind in federates().items())
-    return [*built_in, *others]
+    package_simulators = (SimulatorName(name, ROLES[kind.role], kind.summary) for name, kind in federates().items())
+    return [*built_in, *package_simulators]
 
 
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
 ) -> PhysicsFederate | None:
-    """Start, connect or make the scenario's external physics, if it has one; arguments as for `make_hello`.
+    """Start, connect to or create the scenario's external physics, if it has one; arguments as for `make_hello`.
 
     Raises:
         ConfigurationError: The name, the command or the address cannot be used.
         FederateError: The federate failed, or has not connected or answered in time.
     """
-    where = scenario.physics.federate
-    if where is None:
+    endpoint = scenario.physics.federate
+    if endpoint is None:
         return None
     hello = make_hello(scenario, world, bodies, seed, PHYSICS)
-    federate = named(where, PHYSICS)
+    federate = named_federate(endpoint, PHYSICS)
     if isinstance(federate, PythonFederate):
-        physics: PhysicsFederate = _make_federate(federate, where, hello)
+        physics: PhysicsFederate = _make_federate(federate, endpoint, hello)
         return physics
-    return remote.open_physics(where, hello, deadline_s)
+    return remote.open_physics(endpoint, hello, deadline_s)
 
 
 def open_network(
@@ -162,7 +162,7 @@ def open_network(
     *,
     captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect or make the scenario's external network, if it has one; errors as for `open_physics`.
+    """Start, connect to or create the scenario's external network, if it has one; errors as for `open_physics`.
 
     Args:
         scenario: The scenario.
@@ -170,31 +170,35 @@ def open_network(
         bodies: The bodies.
         seed: The seed.
         deadline_s: The deadline.
-        captures: Description of the captures that a network with `writes_captures` writes; None if it writes none.
+        captures: Settings of the captures for a network with `writes_captures`; None if it writes no captures.
     """
-    where = scenario.network.federate
-    if where is None:
+    endpoint = scenario.network.federate
+    if endpoint is None:
         return None
     hello = make_hello(scenario, world, bodies, seed, NETWORK)
     if captures is not None:
         configuration = json.loads(hello.configuration) | {"captures": captures}
         hello = dataclasses.replace(hello, configuration=json.dumps(configuration).encode())
-    federate = named(where, NETWORK)
+    federate = named_federate(endpoint, NETWORK)
     if isinstance(federate, PythonFederate):
-        network: NetworkFederate = _make_federate(federate, where, hello)
+        network: NetworkFederate = _make_federate(federate, endpoint, hello)
         return network
-    network = remote.open_network(where, hello, deadline_s)
-    supported = network.welcome.transports
-    builtin = scenario.network.transports == "builtin"
-    used = [UNICAST, BROADCAST] if builtin else sorted({traffic.transport for traffic in scenario.traffic})
-    if supported and (missing := [transport for transport in used if transport not in supported]):
+    network = remote.open_network(endpoint, hello, deadline_s)
+    supported_transports = network.welcome.transports
+    is_builtin = scenario.network.transports == "builtin"
+    used_transports = (
+        [UNICAST, BROADCAST] if is_builtin else sorted({traffic.transport for traffic in scenario.traffic})
+    )
+    if supported_transports and (
+        missing_transports := [transport for transport in used_transports if transport not in supported_transports]
+    ):
         network.close()
         raise ConfigurationError(
-            f"{network.session.name} does not support the transport {', '.join(missing)} of the scenario's traffic",
-            remedy=f"use a scenario whose traffic uses {', '.join(supported)}, or an option of the network, or list "
-            "it in welcome: fieldkit docs federates",
+            f"{network.session.name} does not support the transport {', '.join(missing_transports)} of the traffic",
+            remedy=f"use a scenario whose traffic uses {', '.join(supported_transports)}, or enable the transport by "
+            "an option of the network, or list it in welcome: fieldkit docs federates",
         )
-    if builtin and not network.welcome.capabilities & FederateCapability.NEXT_EVENT:
+    if is_builtin and not network.welcome.capabilities & FederateCapability.NEXT_EVENT:
         network.close()
         raise ConfigurationError(
             f"{network.session.name} does not report the time of its next event",

@@ -42,7 +42,9 @@ class _TimedFault(_Fault):
     @schema.model_validator(mode="after")
     def _ends_after_begin(self) -> "_TimedFault":
         if self.end is not None and self.end <= self.begin:
-            raise schema.validation_error(f"it ends at {self.end:g} s, not after it begins at {self.begin:g} s", "to")
+            raise schema.validation_error(
+                f"the end at {self.end:g} s is not after the beginning at {self.begin:g} s", "to"
+            )
         return self
 
     @property
@@ -52,7 +54,7 @@ class _TimedFault(_Fault):
 
 
 class NodeLossFault(_TimedFault):
-    """An agent's computer is off: its programs and its radio are silent, and its body is commanded to stop.
+    """An agent's computer is off: its programs and its radio send nothing, and its body is commanded to stop.
 
     Attributes:
         kind: `node-loss`.
@@ -98,7 +100,7 @@ class JammerFault(_TimedFault):
         kind: `jammer`.
         power_dbm: Transmit power of the noise.
         at_m: Position of the jammer, metres east and north.
-        height: Height of the jammer over the ground.
+        height: Height of the jammer above the ground.
         agent: Instead of `at_m`: the agent that carries the jammer.
     """
 
@@ -129,7 +131,7 @@ class ClockSkewFault(_TimedFault):
         kind: `clock-skew`.
         agent: The agent.
         offset_ms: Offset of the clock at the beginning of the fault, in milliseconds; positive if it is ahead.
-        rate_ppm: Rate error of the clock from then on, in microseconds per second; positive if it is fast.
+        rate_ppm: Rate error of the clock during the fault, in microseconds per second; positive if it is fast.
     """
 
     kind: Literal["clock-skew"]
@@ -148,7 +150,7 @@ class StalledFederateFault(_Fault):
 
     Attributes:
         kind: `stalled-federate`.
-        from: Simulated time: the first request for this time or a later one is delayed.
+        from: Simulated time; the first request for this time or a later time is delayed.
         federate: `physics` or `network`.
         stall: Delay in wall time; if it exceeds the deadline of a run, the run fails with an error that names the
             federate.

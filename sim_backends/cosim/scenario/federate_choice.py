@@ -14,7 +14,7 @@ from fieldkit.config.schema import (
     WithJsonSchema,
 )
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
-from sim_backends.federates.named import federates, named
+from sim_backends.federates.named import federates, named_federate
 from sim_backends.federates.simulator_options import Options, SimulatorOptions, options_json
 
 BUILT_IN: Final = "builtin"
@@ -30,13 +30,13 @@ Federate = Annotated[str | None, AfterValidator(_without_built_in)]
 
 
 def _options_of(role: int) -> Callable[[Any, ValidationInfo], Options]:
-    """Return the validator of the options of the federate in the same mapping."""
+    """Return the validator of the options of the federate that the same mapping names."""
 
     def validated(value: Any, info: ValidationInfo) -> Options:  # noqa: ANN401 (any YAML value)
         if not isinstance(value, dict | SimulatorOptions | None):
-            raise schema.validation_error("keys with values are needed here")
-        where = info.data.get("federate")
-        federate = None if where is None else named(where, role)
+            raise schema.validation_error("this is not a mapping of keys to values")
+        endpoint = info.data.get("federate")
+        federate = None if endpoint is None else named_federate(endpoint, role)
         if federate is None or federate.options is None or isinstance(value, SimulatorOptions):
             return value
         return federate.options.model_validate(value or {})
@@ -46,7 +46,7 @@ def _options_of(role: int) -> Callable[[Any, ValidationInfo], Options]:
 
 _JSON_SCHEMA: Final = WithJsonSchema({"anyOf": [{"type": "object"}, {"type": "null"}]})
 _SERIALIZER: Final = PlainSerializer(lambda options: None if options is None else options_json(options))
-# A simulator has the defaults of its options if a scenario has no options.
+# If a scenario has no options, the defaults of the simulator's options apply.
 _VALIDATED_DEFAULT: Final = Field(validate_default=True)
 
 PhysicsFederateOptions = Annotated[
@@ -72,7 +72,7 @@ def unsupported(options: Options, scenario: schema.Strict) -> Iterator[tuple[str
 
 
 def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) -> None:  # noqa: ANN401 (any YAML value)
-    """Remove the options of each federate that a change replaces; they are valid only for the old federate.
+    """Remove the options of each federate that a change replaces, because they are valid only for the old federate.
 
     Args:
         data: A scenario file.
@@ -80,8 +80,12 @@ def drop_options_of_replaced_federates(data: Any, changes: Mapping[str, Any]) ->
     """
     for role in ROLES.values():
         section = data.get(role) if isinstance(data, dict) else None
-        other = changes.get(f"{role}.federate")
-        if isinstance(section, dict) and other and section.get("federate") not in {None, BUILT_IN, other}:
+        new_federate = changes.get(f"{role}.federate")
+        if (
+            isinstance(section, dict)
+            and new_federate
+            and section.get("federate") not in {None, BUILT_IN, new_federate}
+        ):
             section.pop("options", None)
 
 
@@ -95,9 +99,9 @@ def add_options(definitions: dict[str, Any], sections: Mapping[str, str]) -> Non
     for name, federate in federates().items():
         if federate.options is None:
             continue
-        whole = federate.options.model_json_schema()
-        definitions |= whole.pop("$defs", {})
-        definitions[f"{name}.options"] = whole
+        options_schema = federate.options.model_json_schema()
+        definitions |= options_schema.pop("$defs", {})
+        definitions[f"{name}.options"] = options_schema
         section = definitions[sections[ROLES[federate.role]]]
         reference = {"$ref": f"#/$defs/{name}.options"}
         section.setdefault("allOf", []).append(

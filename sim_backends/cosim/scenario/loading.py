@@ -16,10 +16,10 @@ from sim_backends.world.world import load_world
 
 def editor_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a scenario file, with the meaning of each key."""
-    whole = CosimScenario.model_json_schema()
-    add_options(whole["$defs"], {"physics": PhysicsOptions.__name__, "network": NetworkOptions.__name__})
+    scenario_schema = CosimScenario.model_json_schema()
+    add_options(scenario_schema["$defs"], {"physics": PhysicsOptions.__name__, "network": NetworkOptions.__name__})
     models = {model.__name__: model for model in _models(Strict)}
-    for part in (whole, *whole["$defs"].values()):
+    for part in (scenario_schema, *scenario_schema["$defs"].values()):
         model = models.get(part.get("title", ""))
         if model is None:
             continue  # an enumeration, or any JSON value
@@ -29,8 +29,8 @@ def editor_schema() -> dict[str, Any]:
             value.pop("title", None)
             value["description"] = without_links(meanings[key])
             if not isinstance(value.get("default"), str) and "string" in _types(value):
-                value.pop("default", None)  # it is a number in SI units, but files have texts with units
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **whole}
+                value.pop("default", None)  # the default is a number in SI units, but files have texts with units
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **scenario_schema}
 
 
 def _models(base: type[Strict]) -> Iterator[type[Strict]]:
@@ -86,18 +86,18 @@ def load_scenario(name_or_path: str | Path, changes: Mapping[str, Any] | None = 
 
 
 def _change(document: Document, keys: list[str], value: Any) -> None:  # noqa: ANN401 (any YAML value)
-    """Set the value of a key; missing parent mappings are created, with the line of their parent.
+    """Set the value of a key; missing parent mappings are created, and get the line number of their parent.
 
     Raises:
         ConfigurationError: A parent key has a value without keys, or an index is beyond the end of a list.
     """
     location = tuple(int(key) if key.isdecimal() else key for key in keys)
-    *parents, last = location
+    *parents, last_key = location
     data = document.data
     try:
         for key in parents:
             data = data.setdefault(key, {}) if isinstance(data, dict) else data[key]
-        data[last] = value
+        data[last_key] = value
     except (IndexError, TypeError):
         raise ConfigurationError(
             f"the key {'.'.join(keys)} cannot be changed, because it does not exist",
@@ -112,6 +112,6 @@ def _path(name_or_path: str) -> Path:
         return Path(name_or_path)
     files = scenario_files()
     if name_or_path not in files:
-        hint = did_you_mean(name_or_path, files, f"scenarios: {', '.join(files)}; or name a file that ends in .yaml")
+        hint = did_you_mean(name_or_path, files, f"scenarios: {', '.join(files)}; or give a file that ends in .yaml")
         raise ConfigurationError(f"there is no scenario {name_or_path!r}", remedy=hint)
     return files[name_or_path]

@@ -73,9 +73,9 @@ def commensurate_events(scenario: CosimScenario, windows_s: Sequence[float]) -> 
 
 
 def incommensurate_window_s(scenario: CosimScenario, window_s: float) -> float | None:
-    """Return the nearest window of whole steps without commensurate events; None if there is none of similar length.
+    """Return the nearest window of whole steps without commensurate events; None if no window of the search has this.
 
-    The search is from half the length of the window to twice its length, and at most `_MAX_STEPS` above it.
+    The search covers half to twice the length of the window, but at most `_MAX_STEPS` steps above it.
     """
     step_s = scenario.physics.step
     steps = round(window_s / step_s)

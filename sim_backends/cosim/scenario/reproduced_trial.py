@@ -15,8 +15,8 @@ class ReproducedFlows(Strict):
     """The traffic that reproduces the steps of a procedure under one protocol.
 
     Attributes:
-        transfer: Name of the traffic of kind `file` that is the transfer.
-        ping: Name of the traffic of kind `ping` that is the ping.
+        transfer: Name of the traffic of kind `file` that reproduces the transfer.
+        ping: Name of the traffic of kind `ping` that reproduces the ping.
     """
 
     transfer: Name
@@ -55,15 +55,18 @@ class ReproducedTrial(Strict):
     def flows(self) -> dict[Protocol, ReproducedFlows]:
         """The traffic by protocol."""
         flows = {Protocol.TCP: self.tcp, Protocol.UDP: self.udp}
-        return {protocol: chosen for protocol, chosen in flows.items() if chosen is not None}
+        return {protocol: selected_flows for protocol, selected_flows in flows.items() if selected_flows is not None}
 
     def problems(self, traffic: Sequence[Traffic]) -> Iterator[tuple[str, Location]]:
-        """Yield each contradiction between procedure and traffic, with the keys of the wrong value."""
+        """Yield each contradiction between this section and the traffic, with the keys of the wrong value."""
         by_name = {entry.title: entry for entry in traffic}
         ends: set[tuple[str, ...]] = set()
         for protocol, flows in self.flows.items():
-            chosen = {"transfer": (flows.transfer, "file", protocol.value), "ping": (flows.ping, "ping", "udp")}
-            for key, (name, kind, transport) in chosen.items():
+            selected_flows = {
+                "transfer": (flows.transfer, "file", protocol.value),
+                "ping": (flows.ping, "ping", "udp"),
+            }
+            for key, (name, kind, transport) in selected_flows.items():
                 entry = by_name.get(name)
                 if entry is None:
                     hint = did_you_mean(name, by_name, f"traffic: {', '.join(by_name)}")
@@ -71,14 +74,17 @@ class ReproducedTrial(Strict):
                     return
                 ends.add((entry.source, *entry.to))
                 if (entry.kind, entry.protocol) != (kind, transport) or len(entry.to) > 1 or len(ends) > 1:
-                    yield f"{name} is not a {kind} by {transport} between the same two agents", (protocol.value, key)
+                    yield (
+                        f"{name} is not traffic of kind {kind} with protocol {transport} between the same two agents",
+                        (protocol.value, key),
+                    )
                     return
         spans = [
             sorted(by_name[name].start for name in (flows.transfer, flows.ping)) for flows in self.flows.values()
         ]
         spans.sort()
         if any(earlier[-1] >= later[0] for earlier, later in pairwise(spans)):
-            yield "the traffic of one protocol starts before that of the other has started completely", ()
+            yield "the traffic of one protocol starts before all traffic of the other protocol has started", ()
 
     def repeats(self, traffic: Sequence[Traffic], duration_ns: int) -> tuple["ReproducedRepeat", ...]:
         """Return the part of a run for each protocol, in order of time.
@@ -88,12 +94,14 @@ class ReproducedTrial(Strict):
             duration_ns: Its duration.
         """
         by_name = {entry.title: entry for entry in traffic}
-        chosen = [(protocol, by_name[flows.transfer], by_name[flows.ping]) for protocol, flows in self.flows.items()]
-        begins_ns = [round(min(transfer.start, ping.start) * 1e9) for _, transfer, ping in chosen]
+        selected_flows = [
+            (protocol, by_name[flows.transfer], by_name[flows.ping]) for protocol, flows in self.flows.items()
+        ]
+        begins_ns = [round(min(transfer.start, ping.start) * 1e9) for _, transfer, ping in selected_flows]
         ends_ns = [min((later for later in begins_ns if later > begin), default=duration_ns) for begin in begins_ns]
         return tuple(
             ReproducedRepeat(protocol, transfer, ping, begin_ns, end_ns)
-            for (protocol, transfer, ping), begin_ns, end_ns in zip(chosen, begins_ns, ends_ns, strict=True)
+            for (protocol, transfer, ping), begin_ns, end_ns in zip(selected_flows, begins_ns, ends_ns, strict=True)
             if isinstance(transfer, FileTraffic) and isinstance(ping, PingTraffic)  # guaranteed by `problems`
         )
 
@@ -106,7 +114,7 @@ class ReproducedRepeat(NamedTuple):
         transfer: The traffic that is the transfer.
         ping: The traffic that is the ping.
         begin_ns: Simulated time at which the first of them starts.
-        end_ns: Simulated time at which the next repeat starts, or the run ends.
+        end_ns: Simulated time at which the next repeat starts or the run ends.
     """
 
     protocol: Protocol

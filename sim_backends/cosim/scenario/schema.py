@@ -46,7 +46,7 @@ class PolicyChoice(Strict):
         name: The default policy of a run.
         window: Length of a window, or the parameter w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
-        bound: Largest error of the network's relative position of two agents that transmit, for `error_bounded`.
+        bound: For `error_bounded`: largest error of the relative position in the network of two agents that transmit.
         bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
         exponent: Exponent of the log-distance law for `bound_db`.
     """
@@ -141,11 +141,11 @@ class AgentPlan(Strict):
         at_m: Start position, metres east and north.
         along: Instead of `at_m`: start position along the world's line, as a distance from its beginning.
         aside_m: Distance of the start from that line, to the left.
-        height: Height of the start over the ground, for agents that fly.
+        height: Height of the start above the ground, for agents that fly.
         heading_deg: Initial heading, from east towards north.
         radio: Its radio, instead of the radio of its robot profile.
         motion: Its motion.
-        phase: Time of its controller's first command, within the 50 ms between commands; if omitted, it is random.
+        phase: Time of its controller's first command, less than the 50 ms between commands; random if omitted.
         appears: Time when it appears at its start. Its motion begins at this time, and its traffic at this time or
             later.
         disappears: Time when it disappears; never if omitted.
@@ -172,7 +172,8 @@ class AgentPlan(Strict):
     def _disappears_after_it_appears(self) -> "AgentPlan":
         if self.disappears is not None and self.disappears <= self.appears:
             raise schema.validation_error(
-                f"it disappears at {self.disappears:g} s, not after it appears at {self.appears:g} s", "disappears"
+                f"its disappearance at {self.disappears:g} s is not after its appearance at {self.appears:g} s",
+                "disappears",
             )
         return self
 
@@ -216,7 +217,7 @@ class CosimScenario(Named):
         radio: The radio.
         tcp: The TCP of all agents, also for ROS 1 topics.
         topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
-        relay: The agent whose access point relays.
+        relay: The agent whose access point relays packets.
         policy: The sync policy.
         emane: If given, a run publishes its positions to the network emulator EMANE.
         agents: The agents by name.
@@ -283,18 +284,18 @@ class CosimScenario(Named):
         for agent, plan in self.agents.items():
             if isinstance(plan.motion, FollowPlan):
                 yield from ((name, ("agents", agent, "motion", "leader")) for name in plan.motion.leader)
-        for place, options in (
+        for parent_keys, options in (
             (("physics", "options"), self.physics.options),
             (("network", "options"), self.network.options),
             (("emane",), self.emane),
         ):
-            yield from ((name, (*place, *location)) for name, location in agent_references(options))
+            yield from ((name, (*parent_keys, *location)) for name, location in agent_references(options))
 
     @schema.model_validator(mode="after")
     def _simulators_support_it(self) -> "CosimScenario":
         for options in (self.physics.options, self.network.options):
-            for what, location in unsupported(options, self):
-                raise schema.validation_error(what, *location)
+            for message, location in unsupported(options, self):
+                raise schema.validation_error(message, *location)
         return self
 
     @schema.model_validator(mode="after")
@@ -304,7 +305,7 @@ class CosimScenario(Named):
         for number, traffic in enumerate(self.traffic):
             if traffic.transport == "ros1" and self.relay is None:
                 raise schema.validation_error(
-                    "ros1 needs a master: name its host by relay: AGENT", "traffic", number, "protocol"
+                    "ros1 needs a master: set its host with relay: AGENT", "traffic", number, "protocol"
                 )
         return self
 
@@ -359,12 +360,12 @@ class CosimScenario(Named):
     @schema.model_validator(mode="after")
     def _followers_receive_their_leaders(self) -> "CosimScenario":
         streams = (traffic for traffic in self.traffic if isinstance(traffic, StreamTraffic))
-        received = {(stream.source, to) for stream in streams for to in stream.to}
+        streamed_pairs = {(stream.source, to) for stream in streams for to in stream.to}
         for agent, plan in self.agents.items():
             for leader in plan.motion.leader if isinstance(plan.motion, FollowPlan) else ():
-                if (leader, agent) not in received:
+                if (leader, agent) not in streamed_pairs:
                     raise schema.validation_error(
-                        f"{agent} follows {leader} and receives no states of it; add to the traffic "
+                        f"{agent} follows {leader}, but receives no states from it; add to the traffic "
                         f"{{kind: stream, from: {leader}, to: {agent}, rate: 10Hz}}",
                         "agents",
                         agent,
@@ -376,8 +377,8 @@ class CosimScenario(Named):
     def _window_is_at_least_a_step(self) -> "CosimScenario":
         if self.policy.window < self.physics.step:
             raise schema.validation_error(
-                f"a window of {self.policy.window:.12g} s is shorter than the physics' own step of "
-                f"{self.physics.step:.12g} s, so that nothing changes in it",
+                f"a window of {self.policy.window:.12g} s is shorter than the step of the physics, "
+                f"{self.physics.step:.12g} s, so that no state changes in it",
                 "policy",
                 "window",
             )

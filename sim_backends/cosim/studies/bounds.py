@@ -13,7 +13,7 @@ from sim_backends.cosim.policies.window_policies import Scheduled
 from sim_backends.cosim.run_record import Run
 
 _TOLERANCE: Final = 1.02
-"""The search for a window stops when a window that is longer by this factor exceeds the bound."""
+"""The search ends when the window is known within this factor."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,8 @@ class BoundCost:
         largest_m: The largest position error of the run with `error_bounded`.
         exchanges: Its number of exchanges.
         added_s: Mean delay that it added; nan if nothing arrived.
-        window_s: The longest fixed window that keeps the bound in this run, to 2 %; nan if there is none.
+        window_s: The longest fixed window that keeps the bound in this run, with a tolerance of 2 %; nan if there is
+            none.
         fixed_exchanges: Number of exchanges with that window; 0 if there is none.
     """
 
@@ -36,7 +37,7 @@ class BoundCost:
 
     @property
     def factor(self) -> float:
-        """Exchanges with that window per exchange with `error_bounded`; nan if no window keeps the bound."""
+        """Ratio of the exchanges with that window to those with `error_bounded`; nan if no window keeps the bound."""
         return self.fixed_exchanges / self.exchanges if self.fixed_exchanges else math.nan
 
 
@@ -67,9 +68,11 @@ def bound_cost(
         step_s: The step of the physics, which is the shortest window.
         longest_s: The longest window.
     """
-    bounded = run(ErrorBounded(bound_m, longest_s))
+    bounded_run = run(ErrorBounded(bound_m, longest_s))
     window_s, fixed = _longest_fixed(lambda window_s: fixed_cost(run, window_s), bound_m, step_s, longest_s)
-    return BoundCost(largest_m(bounded), len(bounded.windows_ns), delay_added_s(bounded), window_s, fixed.exchanges)
+    return BoundCost(
+        largest_m(bounded_run), len(bounded_run.windows_ns), delay_added_s(bounded_run), window_s, fixed.exchanges
+    )
 
 
 def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
@@ -78,13 +81,13 @@ def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
     return FixedCost(largest_m(result), len(result.windows_ns))
 
 
-def longest_for_all(
+def longest_sufficient_window(
     longest_s: Sequence[float], costs: Callable[[float], Sequence[FixedCost]], bound_m: float
 ) -> tuple[float, Sequence[FixedCost]]:
-    """Return the longest fixed window that keeps a bound in all runs (to 2 %), and its cost in each run.
+    """Return the longest fixed window that keeps a bound in all runs, and its cost in each run.
 
-    It is the window that a user would choose for further runs. If there is none, the result is nan and an empty
-    sequence.
+    The tolerance is 2 %. It is the window that a user would choose for further runs. If there is none, the result is
+    nan and an empty sequence.
 
     Args:
         longest_s: The longest window that keeps the bound in each run.

@@ -32,8 +32,8 @@ class Tracks:
 
     def distances_m(self, other: "Tracks") -> Floats:
         """Return the distance of each agent from its position in another run, shape (common times, agents)."""
-        shorter = min(len(self.times_s), len(other.times_s))
-        distances_m: Floats = np.linalg.norm(self.places_m[:shorter] - other.places_m[:shorter], axis=2)
+        common_count = min(len(self.times_s), len(other.times_s))
+        distances_m: Floats = np.linalg.norm(self.places_m[:common_count] - other.places_m[:common_count], axis=2)
         return distances_m
 
 
@@ -104,7 +104,7 @@ def speeds_m_s(times_s: Floats, places_m: Floats) -> Floats:
 
 
 def spacing_errors_m(times_s: Floats, places_m: Floats, standstill_m: float, headway_s: float) -> Floats:
-    """Return the gap before each follower minus the desired gap, which is `standstill_m + headway_s v`.
+    """Return the gap in front of each follower minus the desired gap, which is `standstill_m + headway_s v`.
 
     Args:
         times_s: Times, shape (times,).
@@ -196,7 +196,7 @@ class Formation:
 
 
 _MIN_SAMPLES: Final = 2
-"""Number of samples that a speed needs."""
+"""Number of samples that are needed to compute a speed."""
 
 NO_FORMATION = Formation(*(math.nan,) * 5)
 """The formation of a scenario without followers."""
@@ -208,7 +208,7 @@ def has_followers(scenario: CosimScenario) -> bool:
 
 
 def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
-    """Return the errors of followers' positions; `NO_FORMATION` if there are fewer than two samples.
+    """Return the position errors of followers; `NO_FORMATION` if there are fewer than two samples.
 
     Args:
         scenario: The scenario with the followers.
@@ -216,25 +216,25 @@ def formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
     """
     if len(tracks.times_s) < _MIN_SAMPLES:
         return NO_FORMATION
-    spacing: list[Floats] = []
-    station: list[Floats] = []
+    spacing_errors: list[Floats] = []
+    station_errors: list[Floats] = []
     ratios: list[float] = []
     for name, plan in scenario.agents.items():
         if not isinstance(plan.motion, FollowPlan) or not {name, *plan.motion.leader} <= {*tracks.names}:
             continue
-        row = _places_m(tracks, [*plan.motion.leader, name])
-        present = ~np.isnan(row).any(axis=(1, 2))
-        if np.count_nonzero(present) < _MIN_SAMPLES:
+        row_m = _places_m(tracks, [*plan.motion.leader, name])
+        is_present = ~np.isnan(row_m).any(axis=(1, 2))
+        if np.count_nonzero(is_present) < _MIN_SAMPLES:
             continue
-        times_s, leaders, follower = tracks.times_s[present], row[present, :-1], row[present, -1:]
+        times_s, leaders, follower = tracks.times_s[is_present], row_m[is_present, :-1], row_m[is_present, -1:]
         if isinstance(limits(plan.robot), QuadrotorLimits):
-            station.append(station_errors_m(leaders, follower[:, 0], plan.motion.distance))
+            station_errors.append(station_errors_m(leaders, follower[:, 0], plan.motion.distance))
         else:
-            row = row[present]
-            errors_m = spacing_errors_m(times_s, row, plan.motion.distance, plan.motion.headway)
-            spacing.append(errors_m[:, 0])
-            ratios += _ratios(times_s, row)
-    return Formation(*_mean_and_max(spacing), *_mean_and_max(station), max(ratios, default=math.nan))
+            row_m = row_m[is_present]
+            errors_m = spacing_errors_m(times_s, row_m, plan.motion.distance, plan.motion.headway)
+            spacing_errors.append(errors_m[:, 0])
+            ratios += _ratios(times_s, row_m)
+    return Formation(*_mean_and_max(spacing_errors), *_mean_and_max(station_errors), max(ratios, default=math.nan))
 
 
 def mean_formation(formations: Sequence[Formation]) -> Formation:
@@ -263,7 +263,7 @@ def _ratios(times_s: Floats, row_m: Floats) -> Iterator[float]:
 
 
 def _mean_and_max(errors_m: Sequence[Floats]) -> tuple[float, float]:
-    """Return the mean and the maximum of magnitudes; nan if there are none."""
+    """Return the mean and the maximum of the magnitudes of errors; nan without errors."""
     if not errors_m:
         return math.nan, math.nan
     magnitudes = np.abs(np.concatenate(errors_m))

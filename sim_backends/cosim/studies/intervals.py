@@ -42,8 +42,8 @@ def mean(values: Floats) -> IntervalEstimate:
     value = float(values.mean()) if count else math.nan
     if count < 2:
         return IntervalEstimate(value, math.nan, math.nan)
-    half = t_quantile(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
-    return IntervalEstimate(value, value - half, value + half)
+    half_width = t_quantile(count - 1) * float(values.std(ddof=1)) / math.sqrt(count)
+    return IntervalEstimate(value, value - half_width, value + half_width)
 
 
 def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
@@ -60,8 +60,8 @@ def jackknife(value: float, leave_one_out: Floats) -> IntervalEstimate:
     if count < 2 or not np.isfinite(leave_one_out).all():
         return IntervalEstimate(value, math.nan, math.nan)
     error = math.sqrt((count - 1) * float(leave_one_out.var()))
-    half = t_quantile(count - 1) * error
-    return IntervalEstimate(value, value - half, value + half)
+    half_width = t_quantile(count - 1) * error
+    return IntervalEstimate(value, value - half_width, value + half_width)
 
 
 def repeats_needed(difference: float, deviation: float) -> int | None:

@@ -26,13 +26,14 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Error of the delivery time; time by which the receiver had passed an arrival; error of the network's relative
-position of sender and receiver; share of packets with another fate; position error of agents at the window's end."""
+"""Error of the delivery time; time by which the receiver was already past an arrival; error of the relative position
+of sender and receiver in the network; share of packets with another fate; position error of agents at the end of the
+window."""
 
 TAIL_NS: Final = 200_000_000
 """Time for which forks continue after the window, so that the fates of the affected packets are decided."""
 _LONGEST_NS: Final = 3_600_000_000_000
-"""A time that is longer than any window as long as there are events."""
+"""A time that is longer than any window that ends with an event."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,14 @@ class LocalErrors:
     counts: Mapping[str, Floats]
 
     def mean(self, measure: str) -> Floats:
-        """Return the mean error for each parameter; nan if the windows affected nothing."""
+        """Return the mean error for each parameter; nan if the windows affected no packet or agent."""
         sums, counts = self.sums[measure].sum(axis=1), self.counts[measure].sum(axis=1)
         return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
     def order(self, measure: str) -> IntervalEstimate:
-        """Return the power of the window with which an error decreases, as a slope on logarithmic axes.
+        """Return the order of an error: the exponent n if the error is proportional to the n-th power of the window.
+
+        It is the slope of a line fitted on logarithmic axes.
 
         Its interval is a jackknife over the times at which windows begin. The result is nan if fewer than two lengths
         had an error.
@@ -63,11 +66,11 @@ class LocalErrors:
         sums, counts = self.sums[measure], self.counts[measure]
         value = _slope(self.window_s.mean(axis=1), sums.sum(axis=1), counts.sum(axis=1))
         begin_indices = range(sums.shape[1])
-        without = [
+        leave_one_out = [
             _slope(*(np.delete(values, begin, axis=1).sum(axis=1) for values in (self.window_s, sums, counts)))
             for begin in begin_indices
         ]
-        return jackknife(value, np.array(without))
+        return jackknife(value, np.array(leave_one_out))
 
 
 def pool(errors_by_run: Iterable[LocalErrors]) -> LocalErrors:
@@ -99,7 +102,7 @@ def local_errors(
 
     Raises:
         PolicyError: A policy has no window for a situation.
-        FieldkitError: A fork changed its original: the scenario has an object that cannot be copied.
+        FieldkitError: A fork changed the run from which it was forked, because an object was not copied.
     """
     shape = len(parameters), len(starts_ns)
     results = {
@@ -161,17 +164,21 @@ def _differences(start_ns: int, end_ns: int, exact: _Outcome, actual: _Outcome) 
     """Return each error of a window for all packets and agents that it affected."""
     differences: dict[str, list[float]] = {measure: [] for measure in MEASURES}
     for identity, fate in exact.fates.items():
-        other = actual.fates.get(identity)
-        is_sent = start_ns < fate.packet.sent_ns <= end_ns
-        has_arrived = fate.arrived_ns is not None and start_ns < fate.arrived_ns <= end_ns
-        if not (is_sent or has_arrived) or other is None or not (fate.is_decided and other.is_decided):
+        actual_fate = actual.fates.get(identity)
+        was_sent_in_window = start_ns < fate.packet.sent_ns <= end_ns
+        arrived_in_window = fate.arrived_ns is not None and start_ns < fate.arrived_ns <= end_ns
+        if (
+            not (was_sent_in_window or arrived_in_window)
+            or actual_fate is None
+            or not (fate.is_decided and actual_fate.is_decided)
+        ):
             continue
-        if is_sent:
-            differences["position_m"].append(position_error_m(other))
-        differences["fates"].append(float(bool(fate.reason) != bool(other.reason)))
-        if fate.counted_ns is not None and other.counted_ns is not None:
-            differences["delivery_s"].append(abs(fate.counted_ns - other.counted_ns) / 1e9)
-            differences["late_s"].append(other.late_ns / 1e9)
+        if was_sent_in_window:
+            differences["position_m"].append(position_error_m(actual_fate))
+        differences["fates"].append(float(bool(fate.reason) != bool(actual_fate.reason)))
+        if fate.counted_ns is not None and actual_fate.counted_ns is not None:
+            differences["delivery_s"].append(abs(fate.counted_ns - actual_fate.counted_ns) / 1e9)
+            differences["late_s"].append(actual_fate.late_ns / 1e9)
     differences["path_m"] = [
         math.dist(state.position_m, actual.states[name].position_m)
         for name, state in exact.states.items()

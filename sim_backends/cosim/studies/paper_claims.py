@@ -39,27 +39,27 @@ class Claim(NamedTuple):
     """The change from another system to the paper's system, in some rows.
 
     Attributes:
-        than: The system with which the paper's own is compared.
+        compared_system: The system with which the paper's system is compared.
         lines: One of `LINES`.
         quantity: `delay`, with a relative change, or `loss`, with a difference.
-        claimed: The change that the paper states; None if it states none.
-        tabled: The change according to the paper's own tables; nan if the tables do not contain it.
+        claimed_change: The change that the paper states; None if it states none.
+        tabled_change: The change according to the paper's own tables; nan if the tables do not contain it.
         ours: The measured change, with its 95 % interval.
         rows: Number of rows that it is based on: for a delay, packets must have arrived in both systems.
     """
 
-    than: str
+    compared_system: str
     lines: str
     quantity: str
-    claimed: Printed | None
-    tabled: float
+    claimed_change: Printed | None
+    tabled_change: float
     ours: IntervalEstimate
     rows: int
 
     @property
     def agreement(self) -> Agreement | None:
         """The relation of our change to the stated one; None if the paper states none."""
-        return None if self.claimed is None else agreement(self.claimed, self.ours)
+        return None if self.claimed_change is None else agreement(self.claimed_change, self.ours)
 
 
 def claim_setups(changes: Changes) -> dict[str, Setup]:
@@ -84,26 +84,34 @@ def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[s
 
     Args:
         setups: The result of `claim_setups`.
-        samples: The result of `flow_samples` for them.
+        samples: The result of `flow_samples` for these setups.
     """
     flows = {
         name: [flow_samples[only_flow(setup)] for flow_samples in samples[name]] for name, setup in setups.items()
     }
     all_claims: list[Claim] = []
-    for than in (FIXED, MASTER):
-        for lines, chosen in LINES.items():
-            rows = [row for row in ROWS if row[0] in chosen]
-            ours, theirs = ([flows[_name(system, *row)] for row in rows] for system in (ADAPTIVE, than))
-            claimed = CLAIMS.get((than, lines), (None, None))
-            tabled = _changes_in_paper_tables(chosen) if than == MASTER else (math.nan, math.nan)
-            delay, used = delay_change(_delays_s(ours), _delays_s(theirs))
-            loss = mean((_losses(ours) - _losses(theirs)).mean(axis=0))
-            all_claims.append(Claim(than, lines, "delay", claimed[0], tabled[0], delay, used))
-            all_claims.append(Claim(than, lines, "loss", claimed[1], tabled[1], loss, len(rows)))
+    for compared_system in (FIXED, MASTER):
+        for lines, claim_lines in LINES.items():
+            rows = [row for row in ROWS if row[0] in claim_lines]
+            our_flows, other_system_flows = (
+                [flows[_name(system, *row)] for row in rows] for system in (ADAPTIVE, compared_system)
+            )
+            claimed_changes = CLAIMS.get((compared_system, lines), (None, None))
+            tabled_changes = (
+                _changes_in_paper_tables(claim_lines) if compared_system == MASTER else (math.nan, math.nan)
+            )
+            delay, row_count = delay_change(_delays_s(our_flows), _delays_s(other_system_flows))
+            loss = mean((_losses(our_flows) - _losses(other_system_flows)).mean(axis=0))
+            all_claims.append(
+                Claim(compared_system, lines, "delay", claimed_changes[0], tabled_changes[0], delay, row_count)
+            )
+            all_claims.append(
+                Claim(compared_system, lines, "loss", claimed_changes[1], tabled_changes[1], loss, len(rows))
+            )
     return all_claims
 
 
-def delay_change(ours_s: Floats, theirs_s: Floats) -> tuple[IntervalEstimate, int]:
+def delay_change(ours_s: Floats, other_s: Floats) -> tuple[IntervalEstimate, int]:
     """Return the relative change of delays, and the number of rows that it is based on.
 
     In each row, it compares the means over the seeds with which packets arrived in both systems; at least two such
@@ -112,33 +120,38 @@ def delay_change(ours_s: Floats, theirs_s: Floats) -> tuple[IntervalEstimate, in
 
     Args:
         ours_s: Mean delay of a packet in the paper's system, shape (rows, seeds); nan if none arrived.
-        theirs_s: The same for the other system.
+        other_s: The same for the other system.
     """
-    arrived_in_both = np.isfinite(ours_s) & np.isfinite(theirs_s)
+    arrived_in_both = np.isfinite(ours_s) & np.isfinite(other_s)
     seeds = ours_s.shape[1]
-    used = arrived_in_both.sum(axis=1) >= min(2, seeds)
-    if not used.any():
+    used_rows = arrived_in_both.sum(axis=1) >= min(2, seeds)
+    if not used_rows.any():
         return IntervalEstimate(math.nan, math.nan, math.nan), 0
-    ours_s, theirs_s = (np.where(arrived_in_both, values_s, np.nan)[used] for values_s in (ours_s, theirs_s))
+    ours_s, other_s = (np.where(arrived_in_both, values_s, np.nan)[used_rows] for values_s in (ours_s, other_s))
 
     def log_change(columns: Sequence[int]) -> float:
-        ratios = np.nanmean(ours_s[:, columns], axis=1) / np.nanmean(theirs_s[:, columns], axis=1)
+        ratios = np.nanmean(ours_s[:, columns], axis=1) / np.nanmean(other_s[:, columns], axis=1)
         return float(np.log(ratios).mean())
 
-    every = range(seeds)
-    without = [log_change([*every[:seed], *every[seed + 1 :]]) for seed in every] if seeds > 1 else []
-    estimate = jackknife(log_change(every), np.array(without))
+    all_seeds = range(seeds)
+    leave_one_out = (
+        [log_change([*all_seeds[:seed], *all_seeds[seed + 1 :]]) for seed in all_seeds] if seeds > 1 else []
+    )
+    estimate = jackknife(log_change(all_seeds), np.array(leave_one_out))
     change = IntervalEstimate(*(math.expm1(number) for number in (estimate.value, estimate.low, estimate.high)))
-    return change, int(used.sum())
+    return change, int(used_rows.sum())
 
 
 def _changes_in_paper_tables(lines: Sequence[Sight]) -> tuple[float, float]:
     """Return the changes of delay and loss from the paper's table 3, by TCP, to its table 1."""
-    ours, theirs = [PRINTED["1"][line, "topic"] for line in lines], [PRINTED["3"][line, "ros1"] for line in lines]
-    delay, _ = delay_change(
-        *(_printed_numbers([columns.delays_s for columns in system]) for system in (ours, theirs))
+    our_columns, other_columns = (
+        [PRINTED["1"][line, "topic"] for line in lines],
+        [PRINTED["3"][line, "ros1"] for line in lines],
     )
-    losses = (_printed_numbers([columns.losses for columns in system]) for system in (ours, theirs))
+    delay, _ = delay_change(
+        *(_printed_numbers([columns.delays_s for columns in system]) for system in (our_columns, other_columns))
+    )
+    losses = (_printed_numbers([columns.losses for columns in system]) for system in (our_columns, other_columns))
     return delay.value, float(np.subtract(*losses).mean())
 
 

@@ -41,27 +41,27 @@ class FlowSample:
     """The packets of a flow in one run; for a ping, its requests.
 
     Attributes:
-        sent: Number of packets.
-        arrived: Number of them that arrived, or were replied to, before the run ended.
+        sent_packets: Number of packets.
+        arrived_packets: Number of packets that arrived or, for a ping, got a reply before the run ended.
         delay_sum_s: Sum of their delays, from sending to the arrival that counts for the receiver, or of round trips;
-            nan if none arrived, because 0 would mean a fast transmission.
+            nan if none arrived, because 0 would mean an immediate transmission.
         reasons: Number of the other packets by the reason why they did not arrive.
     """
 
-    sent: int
-    arrived: int
+    sent_packets: int
+    arrived_packets: int
     delay_sum_s: float
     reasons: Mapping[str, int]
 
     @property
     def loss(self) -> float:
         """Share of the packets that did not arrive; nan without packets."""
-        return 1 - self.arrived / self.sent if self.sent else np.nan
+        return 1 - self.arrived_packets / self.sent_packets if self.sent_packets else np.nan
 
     @property
     def delay_mean_s(self) -> float:
         """Mean delay of packets that arrived; nan if no packet arrived."""
-        return self.delay_sum_s / self.arrived if self.arrived else np.nan
+        return self.delay_sum_s / self.arrived_packets if self.arrived_packets else np.nan
 
 
 def flow_samples(
@@ -108,17 +108,17 @@ def _deliveries(run: Run, flow: str) -> FlowSample:
 
 def _round_trips(run: Run, flow: str) -> FlowSample:
     trips_s = round_trips_s(run, flow)
-    answered_s = trips_s[np.isfinite(trips_s)]
-    return _flow_sample(len(trips_s), answered_s.tolist(), _fates(run, flow))
+    finite_trips_s = trips_s[np.isfinite(trips_s)]
+    return _flow_sample(len(trips_s), finite_trips_s.tolist(), _fates(run, flow))
 
 
 def _fates(run: Run, flow: str) -> list[Fate]:
     return [fate for (name, _), fate in run.fates.items() if name == flow]
 
 
-def _flow_sample(sent: int, delays_s: Sequence[float], fates: Sequence[Fate]) -> FlowSample:
+def _flow_sample(sent_packets: int, delays_s: Sequence[float], fates: Sequence[Fate]) -> FlowSample:
     reasons = Counter(fate.reason or UNDER_WAY for fate in fates if fate.arrived_ns is None)
-    return FlowSample(sent, len(delays_s), sum(delays_s) if delays_s else np.nan, dict(reasons))
+    return FlowSample(sent_packets, len(delays_s), sum(delays_s) if delays_s else np.nan, dict(reasons))
 
 
 Changes = Mapping[str, Any]
@@ -138,12 +138,12 @@ def masterless(line: Sight, distance_m: float, changes: Changes, *, flying: bool
 
     Args:
         line: With line of sight or without.
-        distance_m: Distance between the two along that line.
+        distance_m: Distance between the two agents along that line.
         changes: Changes that apply to all rows.
         flying: True if the drone sends, instead of a ground robot.
     """
-    source, destination, moved = ("iris", "husky-1", "iris") if flying else ("husky-1", "husky-2", "husky-2")
-    places = {f"agents.{moved}.along": f"{distance_m}m"}
+    source, destination, moved_agent = ("iris", "husky-1", "iris") if flying else ("husky-1", "husky-2", "husky-2")
+    places = {f"agents.{moved_agent}.along": f"{distance_m}m"}
     return Setup(_baylands(line, places | _bag(source, destination, "topic"), changes), VelocityAware.name)
 
 
@@ -167,7 +167,7 @@ def master_based(line: Sight, distance_m: float, protocol: str, changes: Changes
 
 
 def mesh(radio: Changes, changes: Changes) -> Setup:
-    """Return the setup of the experiment with EMANE. It is run exactly, as an emulator has no sync policy.
+    """Return the setup of the experiment with EMANE. Its policy is exact, because an emulator has no sync policy.
 
     Args:
         radio: One of `RADIOS`.

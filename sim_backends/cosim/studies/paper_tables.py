@@ -30,7 +30,7 @@ class Agreement(StrEnum):
     AGREES = "agrees"
     ABOVE = "above"
     BELOW = "below"
-    NOTHING = "no value"
+    NO_VALUE = "no value"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Printed:
     Attributes:
         text: Its digits, in the printed unit.
         per_si: Factor from SI units to the printed unit: 100 for %, 1000 for ms.
-        step: Precision of numbers of its kind; if empty, the precision is one unit of its last digit.
+        step: Precision of the number, in the printed unit; if empty, one unit of its last digit.
     """
 
     text: str
@@ -69,7 +69,7 @@ def agreement(printed: Printed, ours: IntervalEstimate) -> Agreement:
     estimate rounds to it.
     """
     if math.isnan(ours.value):
-        return Agreement.NOTHING
+        return Agreement.NO_VALUE
     low, high = printed.bounds
     if max(ours.value, _or_value(ours.high, ours.value)) < low:
         return Agreement.BELOW
@@ -91,7 +91,7 @@ class PrintedColumns(NamedTuple):
 
     Attributes:
         delays_s: Sums of delays.
-        losses: Shares lost.
+        losses: Shares of lost packets.
     """
 
     delays_s: tuple[Printed, ...]
@@ -102,7 +102,7 @@ def _columns(delays_s: str, losses_percent: str) -> PrintedColumns:
     """Return columns from their digits.
 
     A delay of `1` is printed in columns with values such as `0.8`, and means `1.0`. All 40 losses are multiples of
-    10 %, which is taken as their precision.
+    10 %, so their precision is assumed to be 10 %.
     """
     return PrintedColumns(
         tuple(Printed(text, step="" if "." in text else "0.1") for text in delays_s.split()),
@@ -139,7 +139,7 @@ EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
         "after": (Printed("54.309", per_si=1000), Printed("0", per_si=100)),
     }
 )
-"""Section "Discussion": mean round trip and share lost of 100 pings, before and after node 10 moved."""
+"""Section "Discussion": mean round trip and share of lost requests of 100 pings, before and after node 10 moved."""
 
 FIXED: Final = "fixed window"
 """The paper's own system with a window that does not adapt."""
@@ -191,12 +191,12 @@ class PaperCell:
 
     @property
     def agrees_by_mean(self) -> bool:
-        """True if the mean itself rounds to the printed number, and not only a value in its interval."""
-        alone = IntervalEstimate(self.ours.value, np.nan, np.nan)
-        return agreement(self.printed, alone) is Agreement.AGREES
+        """True if the mean rounds to the printed number; False if only another value in its interval does."""
+        mean_only = IntervalEstimate(self.ours.value, np.nan, np.nan)
+        return agreement(self.printed, mean_only) is Agreement.AGREES
 
     @property
-    def off(self) -> float:
+    def difference(self) -> float:
         """Difference of our number from the printed one; nan if our number is unknown."""
         return self.ours.value - self.printed.value
 
@@ -284,7 +284,7 @@ def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
 
 
 def _cell(printed: Printed, values: Sequence[float], highest: float) -> PaperCell:
-    """Return a cell for the values of all seeds, nan if unknown; its interval is clipped to 0 to `highest`."""
+    """Return a cell for the values of all seeds, nan if unknown; its interval is clipped to [0, `highest`]."""
     finite = np.array([value for value in values if np.isfinite(value)])
     ours = mean(finite)
     low, high = np.clip((ours.low, ours.high), 0, highest).tolist()

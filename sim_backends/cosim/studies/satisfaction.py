@@ -25,8 +25,8 @@ class Round:
     """One round.
 
     Attributes:
-        window_s: Its initial w.
-        median_window_s: Median of the windows that the rule computed from it.
+        window_s: The parameter w of its policy.
+        median_window_s: Median of the windows that the rule computed from w.
         loss: Share of lost packets among the packets whose fate is decided.
         errors: Errors relative to the reference.
         exchanges: Number of windows.
@@ -45,14 +45,14 @@ class Satisfaction:
 
     Attributes:
         rounds: All rounds.
-        satisfied: True if the loss of the last round was accepted.
+        is_satisfied: True if the loss of the last round was accepted.
         reference_loss: Loss of the exact reference.
         reference_exchanges: Number of windows of the exact reference.
-        reason: The reason why the loop ended without an accepted round; empty if it was satisfied.
+        reason: The reason why the loop ended without an accepted round; empty if a round was accepted.
     """
 
     rounds: Sequence[Round]
-    satisfied: bool
+    is_satisfied: bool
     reference_loss: float
     reference_exchanges: int
     reason: str
@@ -71,7 +71,7 @@ def satisfy(
     window_s: float = 0.001,
     max_rounds: int = 20,
 ) -> Satisfaction:
-    """Run rounds until one is satisfactory, or further rounds cannot change the result.
+    """Run rounds until a round is satisfactory, or until further rounds cannot change the result.
 
     Args:
         run: Runs the same scenario and seed with a policy.

@@ -17,14 +17,14 @@ _FEW_PACKETS: Final = 400
 """Number of packets whose simulation takes about as long as the start of two processes: 2 s of processor time."""
 
 
-def workers_for(packets: float, chosen: Workers = ALL_PROCESSORS) -> Workers:
-    """Return the chosen workers, or this process if none were chosen and it is faster.
+def workers_for(packets: float, workers: Workers = ALL_PROCESSORS) -> Workers:
+    """Return the workers for a number of packets: without a choice of the user, only this process if it is faster.
 
     Args:
         packets: Approximate number of packets in all runs.
-        chosen: The workers that the user chose.
+        workers: The workers that the user chose, or the default.
     """
-    return Workers(1) if chosen.is_default and packets <= _FEW_PACKETS else chosen
+    return Workers(1) if workers.is_default and packets <= _FEW_PACKETS else workers
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def run_many(
     Args:
         work: As for `tasks.completed`.
         tasks: The tasks.
-        workers: Where they run.
+        workers: The workers that run the tasks.
         progress: Called with the number of finished tasks.
 
     Raises:
@@ -77,7 +77,7 @@ def run_many(
 def as_completed_tasks(
     work: Callable[[Task], Result], tasks: Sequence[Task], *, workers: Workers = ALL_PROCESSORS
 ) -> Iterator[tuple[int, Result]]:
-    """Yield the number and the result of each task when it has finished; otherwise like `run_many`."""
+    """Yield the number and the result of each task when it has finished; arguments, errors as for `run_many`."""
     for end in completed(partial(_run_task, work), tasks, workers):
         if isinstance(end.error, WorkerDiedError):
             end.error.where = str(tasks[end.number])

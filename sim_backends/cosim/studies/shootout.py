@@ -23,7 +23,7 @@ SAMPLING_NS = 100_000_000
 """Interval at which the positions of agents are sampled."""
 
 
-class Simulated(Protocol):
+class RunnableScenario(Protocol):
     """A scenario that is ready to run, like `scenario.build.Simulation`."""
 
     agents: Agents
@@ -33,11 +33,11 @@ class Simulated(Protocol):
         ...
 
     def close(self) -> None:
-        """End the external federates."""
+        """Stop the external federates."""
         ...
 
 
-Make = Callable[[str, int], Simulated]
+Make = Callable[[str, int], RunnableScenario]
 """Builds the scenario for the name of a policy and a seed."""
 
 
@@ -62,7 +62,7 @@ class Outcomes:
         seeds: The seeds.
         reference: Outcomes with the exact reference, by seed.
         runs: Outcomes by policy, including the reference, and by seed; runs that failed are missing.
-        failures: The error of each policy that failed, with the first seed for which it did.
+        failures: The error of each policy that failed, from the first seed with which it failed.
     """
 
     seeds: Sequence[int]
@@ -94,7 +94,7 @@ def outcomes(
         progress: As for `run_many`.
 
     Raises:
-        FieldkitError: A run failed for another reason than that its policy had no window.
+        FieldkitError: A run failed with an error other than `PolicyError`.
     """
     names = [EventDriven.name, *(name for name in policies if name != EventDriven.name)]
     tasks = [Task(name, seed) for name in names for seed in seeds]
@@ -110,18 +110,18 @@ def outcomes(
 
 
 def _outcome(make: Make, task: Task) -> RunOutcome | PolicyError:
-    simulated = make(task.policy, task.seed)
-    sampled = SampledPhysics(simulated.agents.physics, SAMPLING_NS)
-    simulated.agents.physics = sampled
+    scenario_run = make(task.policy, task.seed)
+    sampled_physics = SampledPhysics(scenario_run.agents.physics, SAMPLING_NS)
+    scenario_run.agents.physics = sampled_physics
     try:
-        with closing(simulated):
-            return RunOutcome(simulated.run(), sampled.tracks)
+        with closing(scenario_run):
+            return RunOutcome(scenario_run.run(), sampled_physics.tracks)
     except PolicyError as error:
         return error
 
 
 def delay_s(outcome: RunOutcome) -> float:
-    """Return the mean delay of packets that arrived, as their receivers count it; nan if none arrived."""
+    """Return the mean time from sending to the arrival that counts for the receiver; nan if no packet arrived."""
     delays_ns = [
         fate.counted_ns - fate.packet.sent_ns for fate in outcome.run.fates.values() if fate.counted_ns is not None
     ]
@@ -166,20 +166,21 @@ class Bias:
 
 def biases(outcomes: Outcomes) -> dict[str, dict[str, Bias]]:
     """Return the bias of each measure for each policy that could be run with all seeds."""
-    complete = [name for name, runs in outcomes.runs.items() if len(runs) == len(outcomes.seeds)]
+    complete_policies = [name for name, runs in outcomes.runs.items() if len(runs) == len(outcomes.seeds)]
     return {
-        policy: {name: _bias(outcomes, policy, measure) for name, measure in MEASURES.items()} for policy in complete
+        policy: {name: _bias(outcomes, policy, measure) for name, measure in MEASURES.items()}
+        for policy in complete_policies
     }
 
 
 def _bias(outcomes: Outcomes, policy: str, measure: Callable[[RunOutcome], float]) -> Bias:
     values = np.array([measure(outcomes.runs[policy][seed]) for seed in outcomes.seeds])
     differences = values - np.array([measure(outcomes.reference[seed]) for seed in outcomes.seeds])
-    finite = differences[np.isfinite(differences)]
-    bias = mean(finite)
-    deviation = float(finite.std(ddof=1)) if len(finite) > 1 else math.nan
-    needed = None if math.isnan(deviation) else repeats_needed(bias.value, deviation)
-    return Bias(values, mean(values[np.isfinite(values)]), bias, deviation, needed)
+    finite_differences = differences[np.isfinite(differences)]
+    bias = mean(finite_differences)
+    deviation = float(finite_differences.std(ddof=1)) if len(finite_differences) > 1 else math.nan
+    seeds_needed = None if math.isnan(deviation) else repeats_needed(bias.value, deviation)
+    return Bias(values, mean(values[np.isfinite(values)]), bias, deviation, seeds_needed)
 
 
 @dataclass(frozen=True)
@@ -190,9 +191,9 @@ class Row:
         policy: Its name.
         by_seed: Its errors relative to the reference for each seed; empty if it could not be run.
         formations: Position errors of the followers, for each seed.
-        growth_m: Times in seconds, and the largest distance of an agent from its position in the reference, mean over
-            seeds: both of shape (times,).
-        failure: The reason why it could not be run with at least one seed; empty if it could.
+        growth_m: Times in seconds; and the largest distance of an agent from its position in the reference, as a mean
+            over seeds. Both have the shape (times,).
+        failure: The reason why it could not be run with a seed; empty if it could be run with all seeds.
     """
 
     policy: str

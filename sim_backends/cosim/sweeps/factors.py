@@ -54,7 +54,7 @@ _QUANTITIES: Final = (
 
 
 def _in_unit(text: str, unit: str, factors: dict[str, float]) -> float:
-    """Return a quantity in a unit; only levels may be negative. Errors are as for `parse_quantity`."""
+    """Return a quantity in a unit; only levels in dB or dBm may be negative. Errors are as for `parse_quantity`."""
     magnitude = text.removeprefix("-") if unit in {"dB", "dBm"} else text
     value = parse_quantity(magnitude, factors, "value")
     return value if magnitude == text else -value
@@ -102,7 +102,7 @@ def parse_factors(words: Sequence[str]) -> tuple[Factor, ...]:
     """Return the factors of `--over NAME=VALUE,...`.
 
     Raises:
-        ConfigurationError: A word has another form, or a factor or a value is given twice.
+        ConfigurationError: A word does not have this form, or a factor or a value is given twice.
     """
     factors: dict[str, Factor] = {}
     for word in words:
@@ -116,7 +116,7 @@ def parse_factors(words: Sequence[str]) -> tuple[Factor, ...]:
         if factor.column in factors:
             raise ConfigurationError(f"--over: {name} is given twice", remedy="list all its values after one NAME=")
         if len(set(values)) < len(values):
-            raise ConfigurationError(f"--over: {name} has a value twice", remedy="remove one of them")
+            raise ConfigurationError(f"--over: {name} has the same value twice", remedy="remove one of them")
         factors[factor.column] = factor
     return tuple(factors.values())
 
@@ -138,17 +138,19 @@ def settings_of(
     for factor in factors:
         _require_setting(factor, scenario)
     for values in product(*(factor.values for factor in factors)):
-        named = dict(zip((factor.name for factor in factors), values, strict=True))
-        changed = dict(changes) | {
-            _SHORT_NAMES.get(name, name): _parsed(name, value) for name, value in named.items() if name != DISTANCE
+        values_by_name = dict(zip((factor.name for factor in factors), values, strict=True))
+        all_changes = dict(changes) | {
+            _SHORT_NAMES.get(name, name): _parse_value(name, value)
+            for name, value in values_by_name.items()
+            if name != DISTANCE
         }
-        if DISTANCE in named:
-            placed = load_scenario(name_or_path, changed)
-            changed |= _placements(placed, parse_distance(named[DISTANCE]).metres)
-        yield values, load_scenario(name_or_path, changed)
+        if DISTANCE in values_by_name:
+            scenario_with_values = load_scenario(name_or_path, all_changes)
+            all_changes |= _placements(scenario_with_values, parse_distance(values_by_name[DISTANCE]).metres)
+        yield values, load_scenario(name_or_path, all_changes)
 
 
-def _parsed(name: str, text: str) -> Any:  # noqa: ANN401 (any YAML value)
+def _parse_value(name: str, text: str) -> Any:  # noqa: ANN401 (any YAML value)
     """Return a value as in the scenario's file."""
     return schema.parse(f"value: {text}", source=f"--over {name}").data["value"]
 
@@ -157,7 +159,7 @@ def _require_setting(factor: Factor, scenario: CosimScenario) -> None:
     """Check that the keys above a setting exist; the schema checks the last one.
 
     Raises:
-        ConfigurationError: They do not exist, so that a mapping would be added to the scenario.
+        ConfigurationError: They do not exist; the setting would add a mapping to the scenario.
     """
     document = schema.parse(schema.dump(scenario), source="").data
     names = [*_SHORT_NAMES, DISTANCE, *(key for key, _ in _leaves(document) if key not in _NOT_SETTINGS)]
@@ -193,9 +195,9 @@ def _leaves(value: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:  # noqa:
 
 
 def _placements(scenario: CosimScenario, distance_m: float) -> dict[str, str]:
-    """Return the changes that place the ends of the first flow at a distance; with a relay, its sender and the relay.
+    """Return the changes that set the distance of the ends of the first flow or, with a relay, of sender and relay.
 
-    All agents on the world's line keep their relative positions, measured from the sender.
+    The distances of all agents on the world's line from the sender change by the same factor.
 
     Raises:
         ConfigurationError: The scenario does not place these agents on the world's line.

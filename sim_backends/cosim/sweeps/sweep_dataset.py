@@ -1,6 +1,6 @@
 """The results of a sweep as a dataset of Parquet files, partitioned by its factors (Hive style).
 
-Equal results give equal bytes: rows have the order of the plan; the order in which the runs ended does not matter.
+Equal results give equal bytes: rows are in the order of the plan, not in the order in which the runs ended.
 """
 
 import json
@@ -20,7 +20,7 @@ from sim_backends.cosim.sweeps.factors import Factor
 from sim_backends.cosim.sweeps.sweep_folder import SweepFolder
 from sim_backends.cosim.sweeps.sweep_plan import SweepPlan, SweepSetting
 
-_ADDED: Final[Mapping[str, Mapping[str, str]]] = {
+_SWEEP_COLUMNS: Final[Mapping[str, Mapping[str, str]]] = {
     "flow": {"unit": "text", "meaning": "Stream of packets and its receiver."},
     "added_delay_mean_s": {
         "unit": "s",
@@ -48,38 +48,38 @@ def write_dataset(plan: SweepPlan, folder: SweepFolder) -> int:
     rows = {setting.digest: _rows_of(setting, plan, folder) for setting in plan.settings}
     partitions = [factor.column for factor in plan.factors]
     schema = _schema((row for setting_rows in rows.values() for row in setting_rows), plan.factors)
-    new, old = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
+    new_folder, previous_folder = (folder.path / f".{folder.results.name}.{suffix}" for suffix in ("new", "old"))
     with folder.error_conversion():
-        for leftover in (new, old):
-            shutil.rmtree(leftover, ignore_errors=True)
+        for old_folder in (new_folder, previous_folder):
+            shutil.rmtree(old_folder, ignore_errors=True)
         for setting in plan.settings:
             if rows[setting.digest]:
                 parts = [
                     f"{column}={quote(value, safe='')}"
                     for column, value in zip(partitions, setting.values.values(), strict=True)
                 ]
-                path = new.joinpath(*parts, "part-0.parquet")
+                path = new_folder.joinpath(*parts, "part-0.parquet")
                 path.parent.mkdir(parents=True)
                 table = pa.Table.from_pylist(rows[setting.digest], schema=schema)
                 pa.parquet.write_table(table, path, compression="zstd")
-        new.mkdir(exist_ok=True)
-        paths = sorted(new.rglob("*"))
+        new_folder.mkdir(exist_ok=True)
+        paths = sorted(new_folder.rglob("*"))
         files.sync([path for path in paths if path.is_file()])
-        for path in (new, *(path for path in paths if path.is_dir())):
+        for path in (new_folder, *(path for path in paths if path.is_dir())):
             files.sync_folder(path)
         if folder.results.exists():
-            folder.results.rename(old)
-        new.rename(folder.results)
+            folder.results.rename(previous_folder)
+        new_folder.rename(folder.results)
         files.sync_folder(folder.path)
-        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(previous_folder, ignore_errors=True)
     return sum(map(len, rows.values()))
 
 
 def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> list[dict[str, Value]]:
     numbers: dict[str, Value] = {}
     for factor in plan.factors:
-        if (declared := factor.numbers) is not None:
-            name, _, values = declared
+        if (number_column := factor.numbers) is not None:
+            name, _, values = number_column
             numbers[name] = values[factor.values.index(setting.values[factor.name])]
     runs = (run for run in plan.runs if run.setting is setting)
     hashes = scenario_hashes(plan.scenario)  # a factor changes a setting, not the procedure
@@ -87,22 +87,22 @@ def _rows_of(setting: SweepSetting, plan: SweepPlan, folder: SweepFolder) -> lis
 
 
 def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> pa.Schema:
-    """Return the schema of all files; columns that are folders are not in it."""
+    """Return the schema of all files, without the columns that are folders of the dataset."""
     types: dict[str, set[type]] = {}
     for row in rows:
         for name, value in row.items():
             types.setdefault(name, set()).add(type(value))
-    declarations = dict(_ADDED)
-    by, partitions = [], {}
+    declarations = dict(_SWEEP_COLUMNS)
+    group_columns, partitions = [], {}
     for factor in factors:
         meaning = f"Value of the setting {factor.name}, as in the command."
         partitions[factor.column] = meaning
-        if (declared := factor.numbers) is None:
-            by.append(factor.column)
+        if (number_column := factor.numbers) is None:
+            group_columns.append(factor.column)
         else:
-            name, unit, _ = declared
+            name, unit, _ = number_column
             declarations[name] = {"unit": unit, "meaning": meaning.replace("as in the command", "as a number")}
-            by.append(name)
+            group_columns.append(name)
     fields = [
         pa.field(name, _arrow_type(column_type), metadata=declarations.get(name))
         for name, column_type in types.items()
@@ -112,7 +112,7 @@ def _schema(rows: Iterable[Mapping[str, Value]], factors: Sequence[Factor]) -> p
         "fieldkit_version": version("fieldkit"),
         "schema_version": str(SCHEMA_VERSION),
         "partitions": json.dumps(partitions),
-        "by": json.dumps(["flow", *by]),
+        "by": json.dumps(["flow", *group_columns]),
     }
     return pa.schema(fields, metadata=metadata)
 

@@ -1,4 +1,4 @@
-"""The state of a sweep on disk: a file per finished run, a file per failed run, and what was planned.
+"""The state of a sweep on disk: a file per finished run, a file per failed run, and a file with the plan.
 
 A file is written under a temporary name, synced and renamed, so that it is complete or does not exist.
 """
@@ -32,11 +32,11 @@ class RunFailure:
 
     Attributes:
         attempts: Number of attempts so far.
-        reason: Why the last one failed.
-        remedy: What to do; may be empty.
+        reason: Reason of the last failure.
+        remedy: Remedy for the failure; may be empty.
         exit_code: Exit code of the error.
         rows: Columns of its flows until the failure.
-        is_final: Whether another attempt would end in the same way.
+        is_final: True if another attempt would fail in the same way.
     """
 
     attempts: int
@@ -72,11 +72,12 @@ class SweepFolder:
         """Create the folder or open it again, and lock it during the body of the `with` statement.
 
         Raises:
-            ConfigurationError: It contains something else, another process runs the sweep, or it cannot be written.
+            ConfigurationError: The folder contains other files or another sweep, another process runs the sweep, or
+                the folder cannot be written.
         """
-        with self._explained():
+        with self._converted_errors():
             self.path.mkdir(parents=True, exist_ok=True)
-            self._require_same(plan)
+            self._require_same_sweep(plan)
             for folder in (_RUNS, _FAILED):
                 (self.path / folder).mkdir(exist_ok=True)
             descriptor = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
@@ -92,21 +93,23 @@ class SweepFolder:
         finally:
             os.close(descriptor)
 
-    def _require_same(self, plan: SweepPlan) -> None:
+    def _require_same_sweep(self, plan: SweepPlan) -> None:
         path = self.path / SWEEP
         if not path.exists():
             if next(self.path.iterdir(), None) is not None:
                 raise ConfigurationError("this folder is not empty", where=str(self.path), remedy="choose another -o")
             return
-        before, now = self._read(path), _description(plan)
-        for what in ("scenario", "factors"):
-            old, new = ([*item] if isinstance(item, dict) else item for item in (before.get(what), now[what]))
-            if old != new:
+        stored_plan, current_plan = self._read(path), _description(plan)
+        for key in ("scenario", "factors"):
+            old_value, new_value = (
+                [*item] if isinstance(item, dict) else item for item in (stored_plan.get(key), current_plan[key])
+            )
+            if old_value != new_value:
                 raise ConfigurationError(
-                    f"this is a sweep with other {what}: {old}", where=str(self.path), remedy="choose another -o"
+                    f"this is a sweep with other {key}: {old_value}", where=str(self.path), remedy="choose another -o"
                 )
 
-    def finished(self) -> set[str]:
+    def finished_runs(self) -> set[str]:
         """Return the names of the finished runs."""
         return {path.stem for path in (self.path / _RUNS).glob("*.json")}
 
@@ -145,7 +148,7 @@ class SweepFolder:
         self._write(self.path / _FAILED / f"{run.name}.json", _identity(run) | vars(failure))
 
     @contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _converted_errors(self) -> Iterator[None]:
         """Convert an `OSError` of the body to a `ConfigurationError`."""
         try:
             yield
@@ -157,11 +160,11 @@ class SweepFolder:
             ) from error
 
     def error_conversion(self) -> Any:  # noqa: ANN401 (a context manager)
-        """Return a context manager that converts an `OSError` to a `ConfigurationError` with the way to continue."""
-        return self._explained()
+        """Return a context manager that converts an `OSError` to an error with the command that continues."""
+        return self._converted_errors()
 
     def _write(self, path: Path, content: Mapping[str, Any]) -> None:
-        with self._explained():
+        with self._converted_errors():
             files.write(path, json.dumps(content, indent=1).encode() + b"\n")
 
     def _read(self, path: Path) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class SweepRun:
 
     @cached_property
     def name(self) -> str:
-        """Name of its result."""
+        """Name of the file of its result, without the suffix."""
         return hashlib.sha256(f"{self.setting.digest} seed {self.seed}".encode()).hexdigest()[:24]
 
     def __str__(self) -> str:
@@ -99,11 +99,12 @@ def plan_sweep(
     """
     settings: dict[str, SweepSetting] = {}
     for values, scenario in settings_of(name_or_path, factors, changes):
-        named = dict(zip((factor.name for factor in factors), values, strict=True))
-        setting = SweepSetting(named, scenario, digest(scenario))
-        if (same := settings.setdefault(setting.digest, setting)) is not setting:
+        values_by_name = dict(zip((factor.name for factor in factors), values, strict=True))
+        setting = SweepSetting(values_by_name, scenario, digest(scenario))
+        if (existing_setting := settings.setdefault(setting.digest, setting)) is not setting:
             raise ConfigurationError(
-                f"--over: these are the same setting: {same}; and {setting}", remedy="remove one of the values"
+                f"--over: these are the same setting: {existing_setting}; and {setting}",
+                remedy="remove one of the values",
             )
     all_settings = tuple(settings.values())
     return SweepPlan(load_scenario(name_or_path, changes), tuple(factors), all_settings, tuple(seeds))

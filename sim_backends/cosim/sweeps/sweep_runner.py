@@ -1,4 +1,4 @@
-"""Runs a sweep: submits the missing runs, writes each result when it arrives, repeats runs that a crash ended."""
+"""Runs a sweep: submits the missing runs, writes each result when it arrives, and repeats runs that crashed."""
 
 import time
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ _TRANSIENT: Final = (LinkError, FederateError, WorkerDiedError, OSError, MemoryE
 Other errors occur again, because a run depends only on its settings and seed."""
 
 _IN_OTHER_COLUMNS: Final = frozenset({"policy", DISTANCE, "line", "topology"})
-"""Factors that the name of the procedure need not contain."""
+"""Factors that the name of the procedure does not contain, because they are in other columns."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def execute(run: SweepRun, *, verify: bool = False) -> RunResult:
 
     Args:
         run: The run.
-        verify: Whether to check that world and robot profiles are the same as in the process that planned the run.
+        verify: True to check that world and robot profiles are the same as in the process that planned the run.
 
     Raises:
         ConfigurationError: The world or a robot profile differs.
@@ -80,17 +80,17 @@ def execute(run: SweepRun, *, verify: bool = False) -> RunResult:
     result = simulate(scenario, scenario.policy.name, run.seed, None)
     if result.is_interrupted:
         raise KeyboardInterrupt
-    rows = flow_rows(f"{scenario.name}-{run.setting.digest[:8]}", scenario, _text(run), run.seed, result)
+    rows = flow_rows(f"{scenario.name}-{run.setting.digest[:8]}", scenario, _settings_text(run), run.seed, result)
     content = {
         "simulated_s": result.simulated_s,
         "event_hash": result.digest,
         "wall_s": dict(result.wall_s),
-        "rows": [row | _more_columns(run, flow, result) for row, flow in zip(rows, result.flows, strict=True)],
+        "rows": [row | _sweep_columns(run, flow, result) for row, flow in zip(rows, result.flows, strict=True)],
     }
     return RunResult(content, result.error)
 
 
-def _text(run: SweepRun) -> str:
+def _settings_text(run: SweepRun) -> str:
     """Return the settings that the name of the procedure contains, so that conditions have different names."""
     scenario = run.setting.scenario
     text = settings.policy_text(scenario.policy.name, scenario)
@@ -100,12 +100,12 @@ def _text(run: SweepRun) -> str:
     )
 
 
-def _more_columns(run: SweepRun, flow: FlowResult, result: SeedResult) -> dict[str, Value]:
+def _sweep_columns(run: SweepRun, flow: FlowResult, result: SeedResult) -> dict[str, Value]:
     """Return the columns that only sweeps have; a distance is written as in the command."""
     columns: dict[str, Value] = {"flow": flow.name}
     if DISTANCE in run.setting.values:
         columns["distance"] = run.setting.values[DISTANCE]
-    if flow.arrived:
+    if flow.arrived_packets:
         columns["added_delay_mean_s"] = flow.added_s
     if result.simulated_s:
         columns["exchanges_per_s"] = result.windows / result.simulated_s
@@ -115,31 +115,36 @@ def _more_columns(run: SweepRun, flow: FlowResult, result: SeedResult) -> dict[s
 def run_sweep(
     plan: SweepPlan, folder: SweepFolder, workers: Workers, *, sink: Sink, again: bool = False
 ) -> SweepOutcome:
-    """Run all runs without a result, and return the state afterwards.
+    """Execute all runs that have no result, and return the state of the sweep afterwards.
 
     Args:
         plan: The plan.
         folder: Its opened folder.
-        workers: Where the runs are executed.
+        workers: The workers that execute the runs.
         sink: Receives events.
-        again: Whether failed runs without an attempt left are tried again.
+        again: True to also repeat failed runs that have no attempt left.
 
     Raises:
-        ConfigurationError: A result cannot be written; the message has the command that continues. Or a worker has
-            another version or other files.
+        ConfigurationError: A result cannot be written (the message contains the command that continues), or a worker
+            has another version or other files.
         LinkError: The scheduler of the cluster does not answer.
     """
-    finished = folder.finished()
-    missing = [run for run in plan.runs if run.name not in finished]
-    before = {} if again else {run.name: folder.failure(run) for run in missing}
-    attempts = {run.name: 0 if (failure := before.get(run.name)) is None else failure.attempts for run in missing}
-    final = {name for name, failure in before.items() if failure is not None and failure.is_final}
-    done = len(plan.runs) - len(missing)
-    sink(SweepPlanned(str(folder.path), done, len(plan.runs), len(plan.settings), len(plan.seeds)))
-    report = _Reporter(sink, done, len(plan.runs))
+    finished = folder.finished_runs()
+    missing_runs = [run for run in plan.runs if run.name not in finished]
+    previous_failures = {} if again else {run.name: folder.failure(run) for run in missing_runs}
+    attempts = {
+        run.name: 0 if (failure := previous_failures.get(run.name)) is None else failure.attempts
+        for run in missing_runs
+    }
+    final_failures = {name for name, failure in previous_failures.items() if failure is not None and failure.is_final}
+    finished_count = len(plan.runs) - len(missing_runs)
+    sink(SweepPlanned(str(folder.path), finished_count, len(plan.runs), len(plan.settings), len(plan.seeds)))
+    report = _Reporter(sink, finished_count, len(plan.runs))
     work = partial(execute, verify=bool(workers.cluster))
     while tasks := [
-        run for run in missing if attempts[run.name] < ATTEMPTS and run.name not in finished and run.name not in final
+        run
+        for run in missing_runs
+        if attempts[run.name] < ATTEMPTS and run.name not in finished and run.name not in final_failures
     ]:
         for end in completed(work, tasks, workers, lambda text: sink(Note(text))):
             run = tasks[end.number]
@@ -152,10 +157,14 @@ def run_sweep(
                 finished.add(run.name)
             elif failure is not None:
                 folder.write_failure(run, failure)
-                final |= {run.name} if failure.is_final else set()
-            report.ended(run, failure)
-    failures = [(run, failure) for run in missing if run.name not in finished and (failure := folder.failure(run))]
-    sink(SweepEnded(str(folder.path), len(finished & attempts.keys()) + done, len(failures), len(plan.runs)))
+                final_failures |= {run.name} if failure.is_final else set()
+            report.report_end(run, failure)
+    failures = [
+        (run, failure) for run in missing_runs if run.name not in finished and (failure := folder.failure(run))
+    ]
+    sink(
+        SweepEnded(str(folder.path), len(finished & attempts.keys()) + finished_count, len(failures), len(plan.runs))
+    )
     return SweepOutcome(len(plan.runs), len(plan.runs) - len(failures), failures)
 
 
@@ -174,17 +183,24 @@ def _failure(end: TaskEnd[RunResult], attempts: int) -> RunFailure | None:
 class _Reporter:
     """Reports the end of each run and the remaining time."""
 
-    def __init__(self, sink: Sink, done: int, total: int) -> None:
-        self._sink, self._done, self._total, self._done_before = sink, done, total, done
-        self._started_s = time.monotonic()
-        sink(Progress("sweep", done, total, "runs"))
+    def __init__(self, sink: Sink, finished_count: int, total: int) -> None:
+        self._sink, self._finished_count, self._total, self._initial_count = (
+            sink,
+            finished_count,
+            total,
+            finished_count,
+        )
+        self._start_s = time.monotonic()
+        sink(Progress("sweep", finished_count, total, "runs"))
 
-    def ended(self, run: SweepRun, failure: RunFailure | None) -> None:
-        self._done += failure is None
-        spent_s, new = time.monotonic() - self._started_s, self._done - self._done_before
-        left_s = spent_s / new * (self._total - self._done) if new else None
+    def report_end(self, run: SweepRun, failure: RunFailure | None) -> None:
+        self._finished_count += failure is None
+        spent_s, new_count = time.monotonic() - self._start_s, self._finished_count - self._initial_count
+        remaining_s = spent_s / new_count * (self._total - self._finished_count) if new_count else None
         if failure is None:
-            self._sink(SweepRunEnded(str(run.setting), run.seed, run.name, "", "", 1, self._done, self._total))
+            self._sink(
+                SweepRunEnded(str(run.setting), run.seed, run.name, "", "", 1, self._finished_count, self._total)
+            )
         else:
             event = SweepRunEnded(
                 str(run.setting),
@@ -193,8 +209,8 @@ class _Reporter:
                 failure.reason,
                 failure.remedy,
                 failure.attempts,
-                self._done,
+                self._finished_count,
                 self._total,
             )
             self._sink(event)
-        self._sink(Progress("sweep", self._done, self._total, "runs", left_s))
+        self._sink(Progress("sweep", self._finished_count, self._total, "runs", remaining_s))

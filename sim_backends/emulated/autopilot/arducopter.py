@@ -11,10 +11,10 @@ from sim_backends.emulated.autopilot.parameters import (
     FlightLimits,
     Parameter,
     Parameters,
-    fixed,
+    constant,
     integer,
-    of_profile,
-    stored,
+    profile_limit,
+    without_effect,
 )
 
 _d = dialect
@@ -22,7 +22,7 @@ _FIRST_ITEM: Final = 1
 _CM: Final = 100.0
 _RTL_M: Final = 15.0
 
-_STORED: Final = stored(
+_WITHOUT_EFFECT: Final = without_effect(
     **{f"FLTMODE{number}": mode for number, mode in enumerate((7, 9, 6, 3, 5, 0), 1)},
     **{
         f"RC{channel}_{end}": us
@@ -85,10 +85,10 @@ _GROUPS: Final = (
 )
 
 
-def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
-    """Return its parameters (https://ardupilot.org/copter/docs/parameters.html), each with PX4's name."""
+def _parameters_within(limits: FlightLimits) -> tuple[Parameter, ...]:
+    """Return ArduCopter's parameters, with PX4's names as keys (https://ardupilot.org/copter/docs/parameters.html)."""
     return (
-        *_STORED,
+        *_WITHOUT_EFFECT,
         *(integer(group.parameter, 0, 0, 50) for group in _GROUPS),
         Parameter("BATT_ARM_VOLT", 0.0, 0.0, 100.0),
         integer("BATT_CAPACITY", 3300, 0, 100_000),
@@ -101,9 +101,9 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("BATT_LOW_VOLT", 10.5, 0.0, 100.0),
         Parameter("DISARM_DELAY", 10.0, 0.0, 127.0, "COM_DISARM_PRFLT"),
         integer("FENCE_ACTION", 1, 0, 5),
-        of_profile("FENCE_ALT_MAX", limits.height_m, minimum=1.0, key="GF_MAX_VER_DIST"),
+        profile_limit("FENCE_ALT_MAX", limits.height_m, minimum=1.0, key="GF_MAX_VER_DIST"),
         Parameter("FENCE_ENABLE", 1, 1, 1, integer=True),
-        of_profile("FENCE_RADIUS", limits.fence_m, minimum=1.0, key="GF_MAX_HOR_DIST"),
+        profile_limit("FENCE_RADIUS", limits.fence_m, minimum=1.0, key="GF_MAX_HOR_DIST"),
         Parameter("FENCE_TYPE", 3, 3, 3, integer=True),
         integer("FS_GCS_ENABLE", 0, 0, 7),
         Parameter("FS_GCS_TIMEOUT", 5.0, 2.0, 120.0),
@@ -117,16 +117,16 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("WPNAV_ACCEL", 250.0, 50.0, 500.0, "MPC_ACC_HOR", _CM),
         Parameter("WPNAV_ACCEL_Z", 100.0, 50.0, 500.0, "MPC_ACC_UP_MAX", _CM),
         Parameter("WPNAV_RADIUS", 200.0, 5.0, 1000.0, "NAV_ACC_RAD", _CM),
-        of_profile("WPNAV_SPEED", limits.speed_m_s, minimum=0.1, key="MPC_XY_VEL_MAX", scale=_CM),
+        profile_limit("WPNAV_SPEED", limits.speed_m_s, minimum=0.1, key="MPC_XY_VEL_MAX", scale=_CM),
         Parameter("WPNAV_SPEED_DN", 150.0, 10.0, 500.0, "MPC_Z_VEL_MAX_DN", _CM),
         Parameter("WPNAV_SPEED_UP", 250.0, 10.0, 1000.0, "MPC_Z_VEL_MAX_UP", _CM),
         integer("WP_YAW_BEHAVIOR", 2, 0, 3),
         # Constants in ArduCopter's code, or parameters of PX4 that the vehicle reads.
-        fixed("", 2.1, "COM_DISARM_LAND"),
-        fixed("", 1.0, "MPC_ACC_DOWN_MAX"),
-        fixed("", 0.0, "MIS_TAKEOFF_ALT"),
-        fixed("", float(FLIGHT_S), "SIM_BAT_DRAIN"),
-        fixed("", 0.0, "SIM_BAT_MIN_PCT"),
+        constant("", 2.1, "COM_DISARM_LAND"),
+        constant("", 1.0, "MPC_ACC_DOWN_MAX"),
+        constant("", 0.0, "MIS_TAKEOFF_ALT"),
+        constant("", float(FLIGHT_S), "SIM_BAT_DRAIN"),
+        constant("", 0.0, "SIM_BAT_MIN_PCT"),
     )
 
 
@@ -181,22 +181,22 @@ ARDUCOPTER: Final = Firmware(
     },
     starting_flags=0xA7,
     boot_mode=Mode.STABILIZE,
-    unarmable=frozenset({Mode.LAND, Mode.RTL, Mode.HOMECOMING, Mode.BRAKE, Mode.MISSION}),
-    refused=_d.MAV_RESULT_FAILED,
+    modes_without_arming=frozenset({Mode.LAND, Mode.RTL, Mode.HOMECOMING, Mode.BRAKE, Mode.MISSION}),
+    refusal_result=_d.MAV_RESULT_FAILED,
     unknown_mode=_d.MAV_RESULT_FAILED,
     unknown_rate=_d.MAV_RESULT_DENIED,
     unknown_message=_d.MAV_RESULT_FAILED,
     mode_refusal=_mode_refusal,
-    prearm=("PreArm: ", "Arm: "),
+    prearm_prefixes=("PreArm: ", "Arm: "),
     arming_errors=_arming_errors,
-    parameters=_declared,
+    parameters=_parameters_within,
     failsafes=ArduCopterFailsafes,
     streams_hz={_d.MAVLINK_MSG_ID_TIMESYNC: 0.1},
     groups=_GROUPS,
     spool_s=3.0,
     landed_s=1.0,
     fix_type=_d.GPS_FIX_TYPE_RTK_FIXED,
-    guided_holds=True,
-    lifts_off=False,
+    holds_without_set_points=True,
+    set_points_lift_off=False,
     first_item=_FIRST_ITEM,
 )

@@ -84,7 +84,7 @@ class Autopilot:
         self._streams = self._default_streams()
 
     def receive(self, datagram: bytes, sender: Address, now_ns: int) -> Iterator[Frame]:
-        """Yield the answers to a datagram with any content; the caller must consume all.
+        """Yield the answers to a datagram, whose content may be invalid. The caller must consume all answers.
 
         Args:
             datagram: The datagram.
@@ -112,7 +112,7 @@ class Autopilot:
         yield from self._port.frames(message for message in messages if message is not None)
 
     def next_ns(self) -> int | None:
-        """Return the time at which `advance` has the next frame to send, or None without clients."""
+        """Return the time of the next frame that `advance` sends, or None if there are no clients."""
         return self._streams.next_ns if self._port.is_used else None
 
     def _reboot(self) -> None:
@@ -153,7 +153,7 @@ class Autopilot:
     def _replies(self, message: Message, now_ns: int) -> Iterator[Message]:
         kind = message.get_type()
         if kind in {"COMMAND_LONG", "COMMAND_INT"}:
-            yield from self._command(message, now_ns)
+            yield from self._run_command(message, now_ns)
         elif kind.startswith("MISSION_"):
             if kind == "MISSION_SET_CURRENT" and message.seq < len(self.vehicle.mission.items):
                 self.vehicle.mission.set_current(message.seq)
@@ -178,17 +178,17 @@ class Autopilot:
                 self._parameters.set(group.parameter, rate_hz)
                 self._apply_parameter(group.parameter)
 
-    def _command(self, message: Message, now_ns: int) -> Iterator[Message]:
+    def _run_command(self, message: Message, now_ns: int) -> Iterator[Message]:
         """Yield the answer to a command: COMMAND_ACK, and the message that the command requests."""
-        param1, requested = message.param1, list[Message]()
+        param1, requested_messages = message.param1, list[Message]()
         if message.command == dialect.MAV_CMD_REQUEST_MESSAGE:
-            requested = self._requested(param1, message.param2)
+            requested_messages = self._requested_messages(param1, message.param2)
         elif message.command in _REQUESTED_MESSAGES:
-            requested = self._requested(_REQUESTED_MESSAGES[message.command], 0)
+            requested_messages = self._requested_messages(_REQUESTED_MESSAGES[message.command], 0)
         elif message.command == dialect.MAV_CMD_GET_MESSAGE_INTERVAL and is_integer_up_to(param1, _LAST_MESSAGE_ID):
             interval_us = self._streams.interval_us(int(param1))
-            requested = [dialect.MAVLink_message_interval_message(int(param1), interval_us)]
-        if requested:
+            requested_messages = [dialect.MAVLink_message_interval_message(int(param1), interval_us)]
+        if requested_messages:
             result = int(dialect.MAV_RESULT_ACCEPTED)
         elif message.command == dialect.MAV_CMD_SET_MESSAGE_INTERVAL:
             result = self._set_interval(param1, message.param2, now_ns)
@@ -198,10 +198,10 @@ class Autopilot:
             result = self._commands.run(message)
         sender = message.get_srcSystem(), message.get_srcComponent()
         yield dialect.MAVLink_command_ack_message(message.command, result, 0, 0, *sender)
-        yield from requested
+        yield from requested_messages
 
-    def _requested(self, kind: float, param2: float) -> list[Message]:
-        """Return the messages with an id; empty if the autopilot does not send them on request."""
+    def _requested_messages(self, kind: float, param2: float) -> list[Message]:
+        """Return the messages that a client requests by id; empty if the autopilot does not send them on request."""
         if kind == AVAILABLE_MODES:
             return self._telemetry.available_modes(param2)
         build = self._telemetry.builders.get(int(kind)) if is_integer_up_to(kind, _LAST_MESSAGE_ID) else None

@@ -49,7 +49,7 @@ class Commands:
     def run(self, message: Message) -> int:
         """Execute the command in a COMMAND_LONG or COMMAND_INT; return its MAV_RESULT.
 
-        The reason of a refusal is added to the vehicle's status texts.
+        The reason for a refusal is added to the vehicle's status texts.
         """
         handler = self._handlers.get(message.command)
         if handler is None:
@@ -58,7 +58,7 @@ class Commands:
             return handler(message)
         except Refused as refusal:
             self._report_refusal(refusal)
-            return self._vehicle.firmware.refused
+            return self._vehicle.firmware.refusal_result
 
     def set_mode(self, custom_mode: int) -> None:
         """Execute SET_MODE, which has no answer."""
@@ -69,8 +69,8 @@ class Commands:
 
     def _report_refusal(self, refusal: Refused) -> None:
         if str(refusal):
-            ardupilot = self._vehicle.firmware.is_ardupilot
-            severity = dialect.MAV_SEVERITY_WARNING if ardupilot else dialect.MAV_SEVERITY_CRITICAL
+            is_ardupilot = self._vehicle.firmware.is_ardupilot
+            severity = dialect.MAV_SEVERITY_WARNING if is_ardupilot else dialect.MAV_SEVERITY_CRITICAL
             self._vehicle.report(severity, str(refusal))
 
     def _check(self, _: Message) -> int:
@@ -87,7 +87,7 @@ class Commands:
         return _ACCEPTED
 
     def _take_off(self, message: Message) -> int:
-        """Take off to a height above home (COMMAND_LONG) or in the named frame; NaN or 0 means the default height."""
+        """Take off. NaN or 0 means the default height. In COMMAND_LONG, the height is relative to home."""
         height_m, home_m = _seventh_parameter(message), self._vehicle.home_m
         if not math.isfinite(height_m) or height_m == 0:
             self._vehicle.take_off()
@@ -122,7 +122,7 @@ class Commands:
         return _ACCEPTED if self._change_custom_mode(number) else self._vehicle.firmware.unknown_mode
 
     def _change_custom_mode(self, custom_mode: int) -> bool:
-        """Change to the mode with a number; return True if the firmware has this mode."""
+        """Change to the mode with this number; return True if the firmware has such a mode."""
         mode = self._vehicle.firmware.mode_of(custom_mode)
         if mode is not None:
             self._vehicle.change_mode(mode)
@@ -135,7 +135,7 @@ class Commands:
         if message.param1 != 1:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
         if self._vehicle.armed:
-            return self._vehicle.firmware.refused
+            return self._vehicle.firmware.refusal_result
         self._vehicle.boot(self._vehicle.body.now_ns)
         return _ACCEPTED
 
@@ -164,7 +164,7 @@ class Commands:
         return _ACCEPTED if self._select_item(message.param1) else _DENIED
 
     def _select_item(self, number: float) -> bool:
-        """Make the item with a number the current item; return True if there is such an item."""
+        """Make the item with this number the current item; return True if there is such an item."""
         mission = self._vehicle.mission
         if not is_integer_up_to(number, len(mission.items) - 1):
             return False
@@ -183,5 +183,5 @@ def is_integer_up_to(value: float, maximum: int) -> bool:
 
 
 def _seventh_parameter(message: Message) -> float:
-    """Return the seventh parameter of a command in either message."""
+    """Return the seventh parameter of a command, which is named `z` in COMMAND_INT."""
     return float(message.z if message.get_type() == "COMMAND_INT" else message.param7)

@@ -135,15 +135,15 @@ class ArduCopterFailsafes:
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
         parameters = self._parameters
         for stage, (name, level_text) in enumerate(self._STAGES, 1):
-            volt, charge_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
-            left_mah = parameters["BATT_CAPACITY"] - state.battery.used_mah
-            low = charge_mah > 0 and left_mah < charge_mah
-            if volt > 0 and state.battery.voltage_v < volt:
+            limit_v, limit_mah = parameters[f"BATT_{name}_VOLT"], parameters[f"BATT_{name}_MAH"]
+            remaining_mah = parameters["BATT_CAPACITY"] - state.battery.used_mah
+            is_low = limit_mah > 0 and remaining_mah < limit_mah
+            if limit_v > 0 and state.battery.voltage_v < limit_v:
                 since_ns = self._below_ns.setdefault(name, state.now_ns)
-                low = low or state.now_ns - since_ns > parameters["BATT_LOW_TIMER"] * 1e9
+                is_low = is_low or state.now_ns - since_ns > parameters["BATT_LOW_TIMER"] * 1e9
             else:
                 self._below_ns.pop(name, None)
-            if not low or stage <= self._stage:
+            if not is_low or stage <= self._stage:
                 continue
             self._stage = stage
             battery = state.battery
@@ -159,11 +159,11 @@ class ArduCopterFailsafes:
                 self._gcs_lost = False
                 yield Reaction("GCS Failsafe Cleared")
             return
-        lost = state.now_ns - self._gcs_heartbeat_ns > parameters["FS_GCS_TIMEOUT"] * 1e9
-        if lost and not self._gcs_lost:
+        is_lost = state.now_ns - self._gcs_heartbeat_ns > parameters["FS_GCS_TIMEOUT"] * 1e9
+        if is_lost and not self._gcs_lost:
             self._gcs_lost = True
             yield from self._action_reactions(int(parameters["FS_GCS_ENABLE"]), _GCS_ACTIONS, "GCS Failsafe", state)
-        elif self._gcs_lost and not lost:
+        elif self._gcs_lost and not is_lost:
             self._gcs_lost = False
             yield Reaction("GCS Failsafe Cleared")
 
@@ -190,7 +190,8 @@ _GCS_ACTIONS: Final = {1: Mode.RTL, 2: Mode.RTL, 3: Mode.RTL, 4: Mode.LAND, 5: M
 class Px4Failsafes:
     """Ground-station (data-link) and battery failsafes of PX4.
 
-    The vehicle first holds for COM_FAIL_ACT_T, so that a pilot can take over. A mode change ends a failsafe.
+    The vehicle first holds its position for COM_FAIL_ACT_T, so that a pilot can take over. A change of mode ends a
+    failsafe.
 
     Args:
         parameters: NAV_DLL_ACT, COM_DL_LOSS_T, COM_LOW_BAT_ACT, BAT_*_THR, COM_FAIL_ACT_T.
@@ -202,7 +203,7 @@ class Px4Failsafes:
         self._gcs_lost = False
         self._warning = 0
         self._active = False
-        self._next: tuple[int, Mode] | None = None
+        self._pending_change: tuple[int, Mode] | None = None
 
     @property
     def active(self) -> bool:
@@ -222,7 +223,7 @@ class Px4Failsafes:
 
     def mode_changed(self, now_ns: int) -> None:  # noqa: ARG002
         """Implement `Failsafes.mode_changed`: the failsafe ends."""
-        self._active, self._next = False, None
+        self._active, self._pending_change = False, None
 
     def set_points_lost(self) -> None:
         """Implement `Failsafes.set_points_lost`: the failsafe lasts until a client changes the mode."""
@@ -232,25 +233,25 @@ class Px4Failsafes:
         """Implement `Failsafes.advance`."""
         yield from self._data_link(state)
         yield from self._battery(state)
-        if self._next is not None and state.now_ns >= self._next[0]:
-            mode, self._next = self._next[1], None
+        if self._pending_change is not None and state.now_ns >= self._pending_change[0]:
+            mode, self._pending_change = self._pending_change[1], None
             yield Reaction("Failsafe activated", _CRITICAL, mode)
 
     def _data_link(self, state: VehicleState) -> Iterator[Reaction]:
         if self._gcs_heartbeat_ns is None:
             return
-        lost = state.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
-        if lost and not self._gcs_lost:
+        is_lost = state.now_ns - self._gcs_heartbeat_ns > self._parameters["COM_DL_LOSS_T"] * 1e9
+        if is_lost and not self._gcs_lost:
             self._gcs_lost = True
             yield Reaction("Connection to ground station lost", _INFO)
             yield from self._trigger(_DATA_LINK_ACTIONS.get(int(self._parameters["NAV_DLL_ACT"])), state)
-        elif self._gcs_lost and not lost:
+        elif self._gcs_lost and not is_lost:
             self._gcs_lost = False
             yield Reaction("Connection to ground station regained", _INFO)
 
     def _battery(self, state: VehicleState) -> Iterator[Reaction]:
-        parameters, left = self._parameters, state.battery.left
-        warning = sum(left < parameters[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
+        parameters, charge = self._parameters, state.battery.charge
+        warning = sum(charge < parameters[name] for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
         if warning <= self._warning:
             return
         self._warning = warning
@@ -271,7 +272,7 @@ class Px4Failsafes:
         if mode is Mode.LOITER or hold_s < 1:
             yield Reaction("Failsafe activated", _CRITICAL, mode)
             return
-        self._next = state.now_ns + round(hold_s * 1e9), mode
+        self._pending_change = state.now_ns + round(hold_s * 1e9), mode
         yield Reaction(f"Failsafe activated: entering Hold for {hold_s:.0f} seconds", _CRITICAL, Mode.LOITER)
 
 
@@ -318,11 +319,16 @@ class Fence:
         share = radius_m / max(math.hypot(east, north), radius_m)
         return share * east, share * north, min(up, height_m)
 
-    def is_crossed(self, here_m: Vector, rest_m: Vector) -> bool:
-        """Return True if a vehicle that brakes now stops outside the fence, and farther from home than it is."""
+    def is_crossed(self, here_m: Vector, stop_m: Vector) -> bool:
+        """Return True if a vehicle that brakes now stops outside the fence, and farther from home than now.
+
+        Args:
+            here_m: Position of the vehicle.
+            stop_m: Position at which it stops if it brakes now.
+        """
         radius_m, height_m = self.limits_m
-        out_m = math.hypot(*rest_m[:2])
-        return out_m > max(radius_m, math.hypot(*here_m[:2])) or rest_m[2] > max(height_m, here_m[2])
+        stop_distance_m = math.hypot(*stop_m[:2])
+        return stop_distance_m > max(radius_m, math.hypot(*here_m[:2])) or stop_m[2] > max(height_m, here_m[2])
 
     def reset(self) -> None:
         """Treat the vehicle as inside, after it was armed or carried to another place."""

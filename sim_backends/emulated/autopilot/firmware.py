@@ -69,24 +69,27 @@ class Firmware:
         names: Name of each mode in AVAILABLE_MODES.
         starting_flags: Flags of its position estimate before the estimate has an origin.
         boot_mode: Mode after power-on.
-        unarmable: Modes in which it cannot be armed.
-        refused: MAV_RESULT of a command that it refuses now.
+        modes_without_arming: Modes in which it cannot be armed.
+        refusal_result: MAV_RESULT of a command that it refuses now.
         unknown_mode: MAV_RESULT of a change to a mode that it does not have.
         unknown_rate: MAV_RESULT of MAV_CMD_SET_MESSAGE_INTERVAL for a message that it does not send.
         unknown_message: MAV_RESULT of MAV_CMD_REQUEST_MESSAGE for such a message.
         mode_refusal: Returns the refusal of a change of mode; None if it is accepted.
-        prearm: Prefixes of the texts with the reasons against arming: on request, and on arming.
+        prearm_prefixes: Prefixes of texts with reasons against arming: in answers to MAV_CMD_RUN_PREARM_CHECKS, and
+            after a refused command to arm.
         arming_errors: Returns the reasons against arming.
         parameters: Its parameters, within the limits of a profile.
         failsafes: Its failsafes.
         streams_hz: Default rates of messages on a telemetry port.
-        groups: Groups of messages whose rates parameters and REQUEST_DATA_STREAM set; empty if it ignores these.
+        groups: Groups of messages whose rates are set by parameters and REQUEST_DATA_STREAM; empty if the firmware
+            has no such groups.
         spool_s: Time from arming to the earliest lift-off.
-        landed_s: Time on the ground after which it has detected its landing.
+        landed_s: Time on the ground after which it detects its landing.
         fix_type: GPS_FIX_TYPE with a good receiver.
-        guided_holds: True if it holds its position in the mode of set-points when set-points are missing.
-        lifts_off: True if set-points make it lift off.
-        first_item: Number of the first item of a mission that is flown; ArduPilot's item 0 is home.
+        holds_without_set_points: True if the vehicle holds its position when it is in mode OFFBOARD and set-points
+            are missing.
+        set_points_lift_off: True if the vehicle lifts off when it receives set-points.
+        first_item: Number of the first item of a mission that the vehicle executes; ArduPilot's item 0 is home.
     """
 
     autopilot: int
@@ -97,13 +100,13 @@ class Firmware:
     names: Mapping[Mode, str]
     starting_flags: int
     boot_mode: Mode
-    unarmable: frozenset[Mode]
-    refused: int
+    modes_without_arming: frozenset[Mode]
+    refusal_result: int
     unknown_mode: int
     unknown_rate: int
     unknown_message: int
     mode_refusal: Callable[[Mode, ModeConditions], ModeRefusal | None]
-    prearm: tuple[str, str]
+    prearm_prefixes: tuple[str, str]
     arming_errors: Callable[[Parameters, Battery], list[str]]
     parameters: Callable[[FlightLimits], tuple[Parameter, ...]]
     failsafes: Callable[[Parameters], Failsafes]
@@ -112,14 +115,14 @@ class Firmware:
     spool_s: float
     landed_s: float
     fix_type: int
-    guided_holds: bool
-    lifts_off: bool
+    holds_without_set_points: bool
+    set_points_lift_off: bool
     first_item: int
 
     @property
     def is_ardupilot(self) -> bool:
         """True if it is ArduPilot."""
-        return self.guided_holds
+        return self.holds_without_set_points
 
     def mode_of(self, custom_mode: int) -> Mode | None:
         """Return the mode with a custom mode number, or None if the firmware has no such mode."""

@@ -22,8 +22,9 @@ STEP_NS: Final = 10_000_000
 _STEP_S: Final = STEP_NS / 1e9
 
 _APPROACH: Final = 0.5
-"""Near its goal the speed of the drone is the remaining distance times this share of the velocity gain. Without lag
-it overshoots by at most 4 % (PX4 has 0.95 for MPC_XY_P, and 1.8 for MPC_XY_VEL_P_ACC)."""
+"""Near its goal, the speed of the drone is the remaining distance, times the gain of velocity control, times this
+factor. If attitude control had no lag, the drone would overshoot by at most 4 %. The ratio of PX4's gains is similar:
+0.95 for MPC_XY_P, 1.8 for MPC_XY_VEL_P_ACC."""
 
 _MIN_COURSE_M_S: Final = 0.3
 """A slower drone does not turn to its direction of flight."""
@@ -34,7 +35,10 @@ _SEARCH_M: Final = 2.0
 
 
 class Airframe:
-    """The drone: metres and m/s east, north, up of home; radians from east towards north.
+    """The airframe of the drone, and its motion.
+
+    Positions are in metres relative to home, velocities in m/s: east, north, up. Headings are in radians from east
+    towards north.
 
     Args:
         limits: Limits of the airframe.
@@ -46,7 +50,7 @@ class Airframe:
     Attributes:
         home_m: Position of home in the world; `position_m` is relative to it.
         now_ns: Time of the current state.
-        driven: True if its motors turn; without them it rests or falls.
+        motors_on: True if its motors turn. If they do not, it rests or falls.
         on_ground: True if it is on the ground or on an obstacle.
         turn_rad_s: Turn rate to the left.
     """
@@ -55,7 +59,7 @@ class Airframe:
         self, limits: QuadrotorLimits, place_m: Vector, facing_rad: float, obstacles: Sequence[Footprint], now_ns: int
     ) -> None:
         self.now_ns = now_ns
-        self.driven = False
+        self.motors_on = False
         self.on_ground = True
         self.turn_rad_s = 0.0
         self._pose = FlightPose(place_m, heading_rad=facing_rad)
@@ -94,27 +98,27 @@ class Airframe:
         return self._pose.roll_rad, -self._pose.pitch_rad
 
     def step(self, target_m_s: Vector, limits: QuadrotorLimits, yaw_rad: float | None = None) -> None:
-        """Fly for one step towards a velocity, within its limits; the ground and obstacles stop it.
+        """Fly for one step and change the velocity towards a target; the ground and obstacles stop the drone.
 
         Args:
-            target_m_s: The velocity.
+            target_m_s: The target velocity.
             limits: Current limits of the airframe.
             yaw_rad: Heading to turn to; None to keep the heading.
         """
         self.now_ns += STEP_NS
         if limits != self._limits:
             self._limits, self._quadrotor = limits, Quadrotor(limits, self._pose.place_m)
-        body = self._quadrotor if self.driven else self._unpowered
+        body = self._quadrotor if self.motors_on else self._unpowered
         before_m = self._pose.place_m
         pose = body.course(self._pose, Velocity(target_m_s, yaw_rad), _STEP_S).at(1)
-        obstacles = self._nearby(before_m)
+        obstacles = self._nearby_obstacles(before_m)
         stop = move(body, before_m, pose.place_m, obstacles)
         if stop is not None:
             pose = body.stopped(pose, stop, None)
         self.turn_rad_s = math.remainder(pose.heading_rad - self._pose.heading_rad, math.tau) / _STEP_S
         self._pose = pose
-        self.on_ground = pose.velocity_m_s[2] <= _REST_M and self._rests(obstacles)
-        if self.on_ground and (not self.driven or target_m_s[2] <= 0):
+        self.on_ground = pose.velocity_m_s[2] <= _REST_M and self._is_supported(obstacles)
+        if self.on_ground and (not self.motors_on or target_m_s[2] <= 0):
             # At rest it neither slides nor tilts nor turns.
             self._pose, self.turn_rad_s = FlightPose(pose.place_m, heading_rad=pose.heading_rad), 0.0
 
@@ -122,13 +126,13 @@ class Airframe:
         """Stay on the ground without power until this time, in whole steps."""
         self.now_ns += (now_ns - self.now_ns) // STEP_NS * STEP_NS
 
-    def _rests(self, obstacles: Sequence[Footprint]) -> bool:
+    def _is_supported(self, obstacles: Sequence[Footprint]) -> bool:
         east, north, up = self._pose.place_m
         stop = move(self._quadrotor, self._pose.place_m, (east, north, up - _REST_M), obstacles)
         return stop is not None and any(contact.normal[2] > 0 for contact in stop.contacts)
 
-    def _nearby(self, place_m: Vector) -> Sequence[Footprint]:
-        """Return the obstacles that it may hit in this step."""
+    def _nearby_obstacles(self, place_m: Vector) -> Sequence[Footprint]:
+        """Return the obstacles that the drone may hit in this step."""
         if not math.dist(place_m, self._searched_m) < _SEARCH_M / 2:
             self._searched_m = place_m
             self._obstacles_nearby = [
@@ -138,7 +142,7 @@ class Airframe:
 
     @property
     def course_rad(self) -> float | None:
-        """Direction of flight over the ground; None while it is slow."""
+        """Direction of flight over the ground; None while the drone is slow."""
         east, north, _ = self.velocity_m_s
         return math.atan2(north, east) if math.hypot(east, north) > _MIN_COURSE_M_S else None
 
@@ -173,7 +177,7 @@ def velocity_to(goal_m: Vector, body: Airframe, limits: QuadrotorLimits) -> Vect
 def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
     """Return the position at which it can stop, relative to home; the position is not below home.
 
-    It is the sum of the distance during the lags of attitude and velocity control, and of v^2 / 2a.
+    The stopping distance is the distance during the lags of attitude and velocity control, plus v^2 / 2a.
     """
     (x, y, z), (east, north, up) = body.position_m, body.velocity_m_s
     brake_s = limits.lag_s + 1 / limits.gains_per_s[0] + math.hypot(east, north) / 2 / limits.acceleration_m_s2
@@ -181,9 +185,12 @@ def stop_m(body: Airframe, limits: QuadrotorLimits) -> Vector:
     return x + east * brake_s, y + north * brake_s, max(z + up * climb_s, min(z, 0.0))
 
 
-def _approach(left_m: float, acceleration_m_s2: float, gain_per_s: float) -> float:
-    """Return the speed at a distance s: proportional to s when near, otherwise v^2 = a s, half of 2 a s."""
-    return min(left_m * _APPROACH * gain_per_s, math.sqrt(acceleration_m_s2 * left_m))
+def _approach(remaining_m: float, acceleration_m_s2: float, gain_per_s: float) -> float:
+    """Return the speed at a remaining distance s: proportional to s near the goal, sqrt(a s) farther away.
+
+    From the speed sqrt(a s), braking with the acceleration a needs half of the distance s.
+    """
+    return min(remaining_m * _APPROACH * gain_per_s, math.sqrt(acceleration_m_s2 * remaining_m))
 
 
 NEAR_M: Final = 0.1
@@ -214,7 +221,7 @@ class Guidance:
         parameters: Its parameters.
 
     Attributes:
-        goal_m: Goal in modes that follow no set-points; a goal below home means landing.
+        goal_m: Goal in modes without set-points; a goal below home means landing.
         set_point: The last set-point.
         set_point_ns: Time of the last set-point; None before the first one.
     """
@@ -226,7 +233,7 @@ class Guidance:
         self.hold((0.0, 0.0, 0.0))
 
     def hold(self, place_m: Vector) -> None:
-        """Hold a position, in all modes."""
+        """Make a position both the goal and the set-point, so that the drone holds it in every mode."""
         self.goal_m = place_m
         self.set_point = SetPoint(place_m, is_place=True)
 
@@ -235,7 +242,7 @@ class Guidance:
         return self.set_point_ns is not None and now_ns - self.set_point_ns <= self._parameters["COM_OF_LOSS_T"] * 1e9
 
     def is_home(self, body: Airframe) -> bool:
-        """Return True if it is near enough to home to descend."""
+        """Return True if the drone is near enough to home to descend."""
         return math.hypot(*body.position_m[:2]) < self._parameters["NAV_ACC_RAD"]
 
     def velocity_m_s(self, mode: Mode, body: Airframe, limits: QuadrotorLimits, ceiling_m: float) -> Vector:

@@ -1,9 +1,10 @@
 """MAVLink frames of the common dialect, and the port that sends and receives them.
 
-The only module that imports `pymavlink` for the emulated autopilot. Constants and messages have the names of the
-dialect (https://mavlink.io/en/messages/common.html). The port is behind a router: one stream of frames for several
-clients, with its own sequence numbers and message rates. As in mavlink-router, a frame with a target is sent only to
-the clients that have sent frames of this system and component, so other clients receive gaps in the sequence numbers.
+No other module of the emulated autopilot imports `pymavlink`. Constants and messages have the names of the dialect
+(https://mavlink.io/en/messages/common.html). The port acts like an autopilot behind a router: all clients receive one
+stream of frames, with the same sequence numbers and message rates. As in mavlink-router, a frame with a target is
+sent only to the clients that have sent frames of this system and component, so other clients receive gaps in the
+sequence numbers.
 """
 
 import struct
@@ -179,7 +180,7 @@ class MavlinkPort:
         return bool(self._clients)
 
     def register(self, sender: Address, message: Message, now_ns: int) -> bool:
-        """Register a message of a client; return False if it is ignored because there are `MAX_CLIENTS` others."""
+        """Register a message of a client; return False if there are `MAX_CLIENTS` other clients, so it is ignored."""
         client = self._clients.get(sender)
         if client is None:
             if len(self._clients) == MAX_CLIENTS:

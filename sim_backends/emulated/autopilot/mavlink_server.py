@@ -31,11 +31,11 @@ class PhysicsFiles(NamedTuple):
 
     Attributes:
         commands: File of `FlightCommandRecord`.
-        flown: File of `FlightRecord`.
+        flight: File of `FlightRecord`.
     """
 
     commands: Path
-    flown: Path
+    flight: Path
 
 
 @dataclass(frozen=True)
@@ -69,14 +69,14 @@ class Drone:
     physics: PhysicsFiles | None = None
 
 
-def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
+def serve(drone: Drone, *, assigned_paths: Path, motion_record: Path, ready: Path) -> None:
     """Serve until the process is killed.
 
     Args:
         drone: Settings of the drone.
-        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records its motion (`own_motion.MotionReporter`).
-        ready: Created when the port is open.
+        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
+        motion_record: The file in which the robot records its motion (`own_motion.MotionReporter`).
+        ready: File that is created when the port is open.
 
     Raises:
         OSError: The port is in use.
@@ -88,7 +88,7 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
         power_on_ns = time.monotonic_ns()
         ready.touch()
         selector.select()
-        autopilot, reporter = _load(drone, motion, steered, power_on_ns)
+        autopilot, reporter = _load(drone, assigned_paths, motion_record, power_on_ns)
         while True:
             reporter.read_placement(time.monotonic_ns())
             _exchange(autopilot, endpoint)
@@ -97,11 +97,13 @@ def serve(drone: Drone, *, motion: Path, steered: Path, ready: Path) -> None:
             selector.select(_wait_s(autopilot))
 
 
-def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple[Autopilot, DroneMotionReporter]":
+def _load(
+    drone: Drone, assigned_paths: Path, motion_record: Path, power_on_ns: int
+) -> "tuple[Autopilot, DroneMotionReporter]":
     """Return the autopilot, which has been on since `power_on_ns`.
 
-    It is loaded when a client appears: the dialect needs 50 ms and 40 MB, the world needs as much again, and in most
-    trials no client connects to the drone.
+    It is loaded when the first client connects, because the dialect and the world each need 50 ms and 40 MB, and in
+    most trials no client connects to the drone.
     """
     from sim_backends.emulated.autopilot.arducopter import ARDUCOPTER  # noqa: PLC0415
     from sim_backends.emulated.autopilot.autopilot import Autopilot  # noqa: PLC0415
@@ -111,7 +113,7 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
     from sim_backends.world.world import World  # noqa: PLC0415
 
-    reporter = MotionReporter(motion, steered, time.monotonic_ns())
+    reporter = MotionReporter(assigned_paths, motion_record, time.monotonic_ns())
     world = World.model_validate_json(drone.world) if drone.world and drone.physics is None else None
     autopilot = Autopilot(
         firmware={"px4": PX4, "ardupilot": ARDUCOPTER}[drone.autopilot],
@@ -127,17 +129,23 @@ def _load(drone: Drone, motion: Path, steered: Path, power_on_ns: int) -> "tuple
 
 
 def simulated_airframe(profile: str, files: PhysicsFiles, reporter: MotionReporter) -> "MakeAirframe":
-    """Return the function that creates the drone, which a physics moves, at a place."""
+    """Return the function that creates a drone at a place; a physics moves this drone."""
     from sim_backends.emulated.autopilot.simulated_airframe import SimulatedAirframe  # noqa: PLC0415 (as above)
     from sim_backends.physics.robot_limits import quadrotor  # noqa: PLC0415
 
     limits = quadrotor(profile)
-    commands, flown = FlightCommandRecord.open(files.commands), FlightRecord.open(files.flown)
+    commands, flight_record = FlightCommandRecord.open(files.commands), FlightRecord.open(files.flight)
 
     def make(place_m: Vector, facing_rad: float, now_ns: int) -> SimulatedAirframe:
         path_start_ns = reporter.path_start_ns
         return SimulatedAirframe(
-            limits, place_m, facing_rad, now_ns, commands=commands, flown=flown, path_start_ns=path_start_ns
+            limits,
+            place_m,
+            facing_rad,
+            now_ns,
+            commands=commands,
+            flight_record=flight_record,
+            path_start_ns=path_start_ns,
         )
 
     return make
@@ -196,7 +204,7 @@ def _send(endpoint: socket.socket, frames: "Iterable[Frame]") -> None:
 
 
 def _wait_s(autopilot: "Autopilot") -> float | None:
-    """Return the maximum wait; without clients a drone on the ground waits for a datagram."""
+    """Return the maximum time to wait for a datagram; None (no limit) for a drone on the ground without clients."""
     vehicle = autopilot.vehicle
     if autopilot.next_ns() is None and not vehicle.armed and vehicle.body.on_ground:
         return None

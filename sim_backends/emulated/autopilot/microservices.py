@@ -39,7 +39,7 @@ class ParameterService:
     Args:
         firmware: Family of the autopilot.
         parameters: Its parameters.
-        changed: Called with the name of a parameter that was set.
+        on_change: Called with the name of a parameter that was set.
         report: Called with the severity and the text of a STATUSTEXT message.
     """
 
@@ -47,12 +47,12 @@ class ParameterService:
         self,
         firmware: Firmware,
         parameters: Parameters,
-        changed: Callable[[str], None],
+        on_change: Callable[[str], None],
         report: Callable[[int, str], None],
     ) -> None:
         self._firmware = firmware
         self._parameters = parameters
-        self._changed = changed
+        self._on_change = on_change
         self._report = report
 
     def handle(self, message: Message) -> Iterator[Message]:
@@ -83,7 +83,7 @@ class ParameterService:
             if expected == _INT:
                 (value,) = struct.unpack("<i", struct.pack("<f", value))
         if self._parameters.set(name, value):
-            self._changed(name)
+            self._on_change(name)
 
     def value(self, name: str) -> Message:
         """Return PARAM_VALUE of a parameter."""
@@ -286,14 +286,12 @@ class MissionTransfer:
     def _accept_item(self, message: Message, client: tuple[int, int], now_ns: int) -> Iterator[Message]:
         upload = self._upload
         if upload is None or upload.client != client:
-            if self._last_upload is not None and self._last_upload[:2] == (
-                client,
-                message.seq,
-            ):  # the answer was lost
+            if self._last_upload is not None and self._last_upload[:2] == (client, message.seq):
+                # The client repeats the last item, because our answer was lost.
                 yield _ack(client, self._last_upload[2])
             return
         if message.seq != len(upload.items):
-            return  # late, or a duplicate
+            return  # The item is late, or a duplicate.
         item = item_of(message)
         fault = self._check(item)
         if fault != dialect.MAV_MISSION_ACCEPTED:

@@ -53,7 +53,7 @@ class Item:
         x: Latitude, 1e-7 degrees.
         y: Longitude, 1e-7 degrees.
         z: Height in metres above the reference of the frame.
-        autocontinue: Its field as received.
+        autocontinue: The field `autocontinue` as received.
     """
 
     frame: int
@@ -107,7 +107,7 @@ def fault(item: Item, home_m: Vector, fence_m: tuple[float, float]) -> int:
     goal = goal_m(item.frame, item.x, item.y, item.z, home_m)
     if goal is None:
         return int(dialect.MAV_MISSION_UNSUPPORTED_FRAME)
-    if item.command == dialect.MAV_CMD_NAV_TAKEOFF:  # straight up from where it is
+    if item.command == dialect.MAV_CMD_NAV_TAKEOFF:  # A take-off climbs vertically.
         goal = (0.0, 0.0, goal[2])
     inside = is_within(goal, fence_m)
     return int(dialect.MAV_MISSION_ACCEPTED if inside else dialect.MAV_MISSION_DENIED)
@@ -115,12 +115,13 @@ def fault(item: Item, home_m: Vector, fence_m: tuple[float, float]) -> int:
 
 REPEATS: Final = 10
 REPEAT_NS: Final = 1_000_000_000
-"""The last completed item is reported this many times again, at this interval, as in PX4: messages may be lost."""
+"""The report of the last completed item is repeated this many times at this interval, as in PX4, because messages may
+be lost."""
 
 _BELOW_M: Final = -1.0
 """Height of a landing point: below the ground, which stops the descent."""
 
-_RISEN_M: Final = 0.2
+_CLIMB_TOLERANCE_M: Final = 0.2
 """The climb to the first item ends this far below its height."""
 
 
@@ -128,7 +129,7 @@ class Mission:
     """The items of a mission, in their order.
 
     Args:
-        first: Number of the first item that is flown; ArduPilot's item 0 is home.
+        first: Number of the first item that the vehicle executes; ArduPilot's item 0 is home.
 
     Attributes:
         items: The items as uploaded.
@@ -146,7 +147,7 @@ class Mission:
         self._repeated_reports: Iterator[int] = iter(())
         self._next_repeat_ns = 0
         self._start_m: Vector | None = None  # position at the start of the current item
-        self._rises = False
+        self._is_climbing = False
         self._arrived_ns: int | None = None
 
     def load(self, items: tuple[Item, ...]) -> None:
@@ -154,17 +155,17 @@ class Mission:
         self.items, self.speed_m_s = items, None
         self.set_current(0)
 
-    def begin(self) -> None:
+    def start(self) -> None:
         """Continue at the current item, or start at the first if all are done."""
         if self._done:
             self.set_current(0)
-        self._enter()
+        self._reset_item_state()
 
     def set_current(self, number: int) -> None:
-        """Make the item with this number the current item, or the nearest item if there is none."""
+        """Make the item with this number the current item, or the nearest one if no item has this number."""
         self.current, self._done = max(number, min(self._first, len(self.items) - 1), 0), False
         self._reached, self._repeated_reports = [], iter(())
-        self._enter()
+        self._reset_item_state()
 
     def reached(self, now_ns: int) -> Iterator[int]:
         """Yield the numbers of completed items that must be reported now; times must not decrease."""
@@ -177,12 +178,14 @@ class Mission:
             self._next_repeat_ns = now_ns + REPEAT_NS
 
     def fly(self, body: Airframe, home_m: Vector, near_m: float) -> Vector | str:
-        """Return the point to fly to, relative to home (below it to land), or the name of the mode to change to.
+        """Return the point to fly to, or the name of the mode to change to.
+
+        The point is relative to home. A point below home means landing.
 
         Args:
             body: State of motion of the vehicle.
             home_m: Home in the world.
-            near_m: Radius within which a point is reached, unless the item has one.
+            near_m: Radius within which a point is reached, unless the item defines a radius.
         """
         while not self._done:
             item = self.items[self.current]
@@ -193,7 +196,7 @@ class Mission:
                 self.speed_m_s = item.parameters[1] if item.parameters[1] > 0 else None
             elif item.command not in SKIPPED:
                 if self._start_m is None:
-                    self._start_m, self._rises = body.position_m, body.on_ground
+                    self._start_m, self._is_climbing = body.position_m, body.on_ground
                 goal = self._goal_m(item, self._start_m, body, home_m, near_m)
                 if not self._is_complete(item, body, goal, near_m):
                     return goal
@@ -211,8 +214,8 @@ class Mission:
         if item.command == dialect.MAV_CMD_NAV_LAND:
             is_above = math.dist(goal[:2], here_m[:2]) < near_m or body.on_ground
             return *goal[:2], _BELOW_M if is_above else start_m[2]
-        self._rises = self._rises and here_m[2] < goal[2] - _RISEN_M
-        if self._rises or item.command == dialect.MAV_CMD_NAV_TAKEOFF:
+        self._is_climbing = self._is_climbing and here_m[2] < goal[2] - _CLIMB_TOLERANCE_M
+        if self._is_climbing or item.command == dialect.MAV_CMD_NAV_TAKEOFF:
             return *start_m[:2], goal[2]
         return goal
 
@@ -224,7 +227,7 @@ class Mission:
         if item.command == dialect.MAV_CMD_NAV_WAYPOINT and radius_m > 0:
             near_m = radius_m
         if self._arrived_ns is None:
-            if self._rises or math.dist(goal, body.position_m) > near_m:
+            if self._is_climbing or math.dist(goal, body.position_m) > near_m:
                 return False
             self._arrived_ns = body.now_ns
         must_wait = item.command in WITH_HOLD_TIME and wait_s > 0
@@ -236,7 +239,7 @@ class Mission:
             self.current += 1
         else:
             self._done = True
-        self._enter()
+        self._reset_item_state()
 
-    def _enter(self) -> None:
-        self._start_m, self._rises, self._arrived_ns = None, False, None
+    def _reset_item_state(self) -> None:
+        self._start_m, self._is_climbing, self._arrived_ns = None, False, None

@@ -7,8 +7,8 @@ from typing import Final
 class Mode(Enum):
     """A flight mode; each firmware has its own names: ArduCopter's GUIDED is PX4's OFFBOARD.
 
-    The last four are a pilot's modes. There are no sticks: in the air the drone holds its position, as with centred
-    sticks, and on the ground it stays, as with the throttle closed.
+    The last four are modes for a pilot with a remote control, which is not emulated. In the air the drone holds its
+    position, as if the sticks were centred. On the ground it stays, as if the throttle were closed.
     """
 
     TAKEOFF = auto()

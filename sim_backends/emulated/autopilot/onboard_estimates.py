@@ -16,40 +16,40 @@ FLIGHT_S: Final = 15 * 60
 
 
 class Battery:
-    """Charge of the battery, used up by flight; at rest it lasts longer by the ratio of the currents.
+    """Charge of the battery. The current is constant in flight, and lower at rest.
 
     Attributes:
-        left: Remaining charge, from 0 to 1.
+        charge: Remaining charge, from 0 to 1.
         current_a: Current.
         full_v: Voltage of the full battery (SIM_BATT_VOLTAGE of ArduPilot's simulator).
         flight_s: Flight time of a full charge (SIM_BAT_DRAIN of PX4's simulator).
-        min_charge: Minimum of `left` (SIM_BAT_MIN_PCT as a fraction).
+        min_charge: Minimum of `charge` (SIM_BAT_MIN_PCT as a fraction).
     """
 
     def __init__(self, now_ns: int) -> None:
         self._last_ns = now_ns
-        self.left = 1.0
+        self.charge = 1.0
         self.current_a = _REST_A
         self.full_v = FULL_V
         self.flight_s = float(FLIGHT_S)
         self.min_charge = 0.0
 
-    def advance(self, now_ns: int, *, driven: bool) -> None:
-        """Use up the charge of the time since the last call."""
-        self.current_a = _HOVER_A if driven else _REST_A
+    def advance(self, now_ns: int, *, motors_on: bool) -> None:
+        """Reduce the charge by the consumption since the last call."""
+        self.current_a = _HOVER_A if motors_on else _REST_A
         used = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
-        self.left, self._last_ns = max(min(self.min_charge, self.left), self.left - used), now_ns
+        self.charge, self._last_ns = max(min(self.min_charge, self.charge), self.charge - used), now_ns
 
     @property
     def used_mah(self) -> float:
-        """Charge used so far."""
-        return (1 - self.left) * self.flight_s / 3.6 * _HOVER_A
+        """Charge that has been used since power-on."""
+        return (1 - self.charge) * self.flight_s / 3.6 * _HOVER_A
 
     @property
     def voltage_v(self) -> float:
         """Voltage of the battery, linear in the remaining charge."""
         empty, full = CELL_V
-        return self.full_v * (empty + (full - empty) * self.left) / full
+        return self.full_v * (empty + (full - empty) * self.charge) / full
 
 
 _GOOD_FLAGS: Final = 831
@@ -90,7 +90,7 @@ class PositionEstimate:
         return now_ns - self.booted_ns < self._boot_ns
 
     def has_fix(self, now_ns: int) -> bool:
-        """Return True if the GPS receiver has a fix, which it gets in half of the time until there is an origin."""
+        """Return True if the GPS receiver has a fix, which it gets after half of the time until the origin is set."""
         return self.origin_m is not None or now_ns - self.booted_ns >= self._boot_ns / 2
 
     @property
@@ -126,7 +126,7 @@ class LandDetector:
 
     Attributes:
         landed: True if it has detected that the drone is on the ground.
-        flew: True if the drone was in the air since it was armed last.
+        has_flown: True if the drone was in the air since it was armed last.
         grounded_ns: Time of the last contact with the ground, or of arming.
         armed_ns: Time of arming.
     """
@@ -143,12 +143,12 @@ class LandDetector:
 
     def arm(self, now_ns: int) -> None:
         """Record that the drone was armed."""
-        self.flew = False
+        self.has_flown = False
         self.grounded_ns = self.armed_ns = now_ns
 
     def advance(self, now_ns: int, *, on_ground: bool) -> None:
-        """Update the state from the present contact with the ground."""
+        """Update the state with the present contact with the ground."""
         if not on_ground:
-            self.flew, self.landed, self.grounded_ns = True, False, now_ns
+            self.has_flown, self.landed, self.grounded_ns = True, False, now_ns
         elif now_ns - self.grounded_ns >= self._landed_s * 1e9:
             self.landed = True

@@ -1,4 +1,7 @@
-"""Parameters of the emulated autopilots: with names and units of the firmware, read in SI units by PX4's names."""
+"""Parameters of the emulated autopilots.
+
+Clients use the names and units of the firmware. The vehicle reads the values in SI units, by PX4's names.
+"""
 
 import math
 from dataclasses import dataclass
@@ -49,12 +52,12 @@ class FlightLimits:
     fence_m: float
 
 
-def of_profile(name: str, maximum: float, *, minimum: float, key: str = "", scale: float = 1.0) -> Parameter:
-    """Return a parameter whose value is its maximum, given by a profile in SI units."""
+def profile_limit(name: str, maximum: float, *, minimum: float, key: str = "", scale: float = 1.0) -> Parameter:
+    """Return a parameter whose value and maximum are a limit of the profile, in SI units."""
     return Parameter(name, maximum * scale, min(minimum, maximum) * scale, maximum * scale, key, scale)
 
 
-def fixed(name: str, value: float, key: str = "") -> Parameter:
+def constant(name: str, value: float, key: str = "") -> Parameter:
     """Return a float parameter with a constant value."""
     return Parameter(name, value, value, value, key)
 
@@ -64,8 +67,8 @@ def integer(name: str, value: int, minimum: int, maximum: int, key: str = "") ->
     return Parameter(name, value, minimum, maximum, key, integer=True)
 
 
-def stored(**values: float) -> tuple[Parameter, ...]:
-    """Return parameters that ground stations read and write, without effect on the emulated vehicle."""
+def without_effect(**values: float) -> tuple[Parameter, ...]:
+    """Return parameters that ground stations read and write, but that have no effect on the emulated vehicle."""
     limit = 1e9
     return tuple(
         Parameter(name, value, -limit, limit, integer=isinstance(value, int))

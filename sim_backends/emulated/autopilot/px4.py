@@ -11,10 +11,10 @@ from sim_backends.emulated.autopilot.parameters import (
     FlightLimits,
     Parameter,
     Parameters,
-    fixed,
+    constant,
     integer,
-    of_profile,
-    stored,
+    profile_limit,
+    without_effect,
 )
 
 _d = dialect
@@ -26,7 +26,7 @@ def _custom(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
-_STORED: Final = stored(
+_WITHOUT_EFFECT: Final = without_effect(
     **{f"COM_FLTMODE{number}": -1 for number in range(1, 7)},
     BAT1_CAPACITY=-1.0,
     BAT1_N_CELLS=3,
@@ -56,10 +56,10 @@ _STORED: Final = stored(
 """Parameters that QGroundControl and MAVSDK read."""
 
 
-def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
-    """Return its parameters (https://docs.px4.io/main/en/advanced_config/parameter_reference)."""
+def _parameters_within(limits: FlightLimits) -> tuple[Parameter, ...]:
+    """Return PX4's parameters (https://docs.px4.io/main/en/advanced_config/parameter_reference)."""
     return (
-        *_STORED,
+        *_WITHOUT_EFFECT,
         Parameter("BAT_CRIT_THR", _CRITICAL, 0.05, 0.5),
         Parameter("BAT_EMERGEN_THR", 0.05, 0.03, 0.5),
         Parameter("BAT_LOW_THR", 0.15, 0.12, 0.5),
@@ -71,8 +71,8 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         integer("COM_LOW_BAT_ACT", 0, 0, 3),
         integer("COM_OBL_RC_ACT", 0, 0, 7),
         Parameter("COM_OF_LOSS_T", 1.0, 0.1, 60.0),
-        of_profile("GF_MAX_HOR_DIST", limits.fence_m, minimum=1.0),
-        of_profile("GF_MAX_VER_DIST", limits.height_m, minimum=1.0),
+        profile_limit("GF_MAX_HOR_DIST", limits.fence_m, minimum=1.0),
+        profile_limit("GF_MAX_VER_DIST", limits.height_m, minimum=1.0),
         integer("MAV_SYS_ID", 1, 1, 250),
         Parameter("MIS_TAKEOFF_ALT", 2.5, 0.5, 80.0),
         Parameter("MPC_ACC_DOWN_MAX", 3.0, 0.5, 15.0),
@@ -80,7 +80,7 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("MPC_ACC_UP_MAX", 4.0, 0.5, 15.0),
         Parameter("MPC_LAND_ALT2", 5.0, 1.0, 80.0),
         Parameter("MPC_LAND_SPEED", 0.7, 0.1, 2.0),
-        of_profile("MPC_XY_VEL_MAX", limits.speed_m_s, minimum=0.1),
+        profile_limit("MPC_XY_VEL_MAX", limits.speed_m_s, minimum=0.1),
         Parameter("MPC_Z_VEL_MAX_DN", 1.5, 0.1, 4.0),
         Parameter("MPC_Z_VEL_MAX_UP", 3.0, 0.1, 8.0),
         Parameter("NAV_ACC_RAD", 0.5, 0.05, 200.0),
@@ -89,14 +89,14 @@ def _declared(limits: FlightLimits) -> tuple[Parameter, ...]:
         Parameter("SIM_BAT_DRAIN", float(FLIGHT_S), 1.0, 86400.0),
         Parameter("SIM_BAT_MIN_PCT", 0.0, 0.0, 100.0),
         # Parameters of ArduPilot that the vehicle reads.
-        fixed("", FULL_V, "SIM_BATT_VOLTAGE"),
-        fixed("", 1.0, "WP_YAW_BEHAVIOR"),
+        constant("", FULL_V, "SIM_BATT_VOLTAGE"),
+        constant("", 1.0, "WP_YAW_BEHAVIOR"),
     )
 
 
 def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
     minimum = parameters["COM_ARM_BAT_MIN"]
-    return ["Low battery"] if battery.left < (minimum if minimum >= 0 else _CRITICAL) else []
+    return ["Low battery"] if battery.charge < (minimum if minimum >= 0 else _CRITICAL) else []
 
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
@@ -142,17 +142,17 @@ PX4: Final = Firmware(
     },
     starting_flags=0xA5,
     boot_mode=Mode.LOITER,
-    unarmable=frozenset(),
-    refused=_d.MAV_RESULT_TEMPORARILY_REJECTED,
+    modes_without_arming=frozenset(),
+    refusal_result=_d.MAV_RESULT_TEMPORARILY_REJECTED,
     unknown_mode=_d.MAV_RESULT_DENIED,
     unknown_rate=_d.MAV_RESULT_FAILED,
     unknown_message=_d.MAV_RESULT_DENIED,
     mode_refusal=_mode_refusal,
-    prearm=("Preflight Fail: ", "Preflight Fail: "),
+    prearm_prefixes=("Preflight Fail: ", "Preflight Fail: "),
     arming_errors=_arming_errors,
-    parameters=_declared,
+    parameters=_parameters_within,
     failsafes=Px4Failsafes,
-    # MAVLINK_MODE_NORMAL, of a telemetry radio and of port 14550 (mavlink_main.cpp), as far as emulated.
+    # Rates of MAVLINK_MODE_NORMAL (mavlink_main.cpp), which PX4 uses on a telemetry radio and on port 14550.
     streams_hz={
         _d.MAVLINK_MSG_ID_ALTITUDE: 1.0,
         _d.MAVLINK_MSG_ID_ATTITUDE: 15.0,
@@ -173,7 +173,7 @@ PX4: Final = Firmware(
     spool_s=1.0,
     landed_s=1.0,
     fix_type=_d.GPS_FIX_TYPE_3D_FIX,
-    guided_holds=False,
-    lifts_off=True,
+    holds_without_set_points=False,
+    set_points_lift_off=True,
     first_item=0,
 )

@@ -11,14 +11,14 @@ from sim_backends.physics.body import Velocity
 from sim_backends.physics.quadrotor import FlightPose, Quadrotor
 from sim_backends.physics.robot_limits import QuadrotorLimits
 
-_LATEST_NS: Final = 100_000_000
+_MAX_EXTRAPOLATION_NS: Final = 100_000_000
 """Longest extrapolation of a state of the physics, which records one every 10 ms."""
 
 
 class SimulatedAirframe(Airframe):
     """A drone that a physics moves, as `Airframe`.
 
-    On the ground its rotors turn without thrust until it climbs. Before its first flight from a place it is where
+    On the ground its rotors turn without thrust until it climbs. Until its first flight it stays at the place where
     the lab has put it.
 
     Args:
@@ -27,7 +27,7 @@ class SimulatedAirframe(Airframe):
         facing_rad: Heading.
         now_ns: Time of this state.
         commands: Record of the autopilot's commands.
-        flown: Record of the flight by the physics.
+        flight_record: Record of the flight by the physics.
         path_start_ns: Start of the assigned path that put it at its place.
     """
 
@@ -39,12 +39,12 @@ class SimulatedAirframe(Airframe):
         now_ns: int,
         *,
         commands: FlightCommandRecord,
-        flown: FlightRecord,
+        flight_record: FlightRecord,
         path_start_ns: int,
     ) -> None:
         super().__init__(limits, place_m, facing_rad, (), now_ns)
         self._commands = commands
-        self._flown = flown
+        self._flight_record = flight_record
         self._path_start_ns = path_start_ns
         self._is_off = False
 
@@ -52,7 +52,7 @@ class SimulatedAirframe(Airframe):
     def step(self, target_m_s: Vector, limits: QuadrotorLimits, yaw_rad: float | None = None) -> None:
         self.now_ns += STEP_NS
         self._sense()
-        if not self.driven or (self.on_ground and target_m_s[2] <= 0):
+        if not self.motors_on or (self.on_ground and target_m_s[2] <= 0):
             self._switch_off()
             return
         target = Quadrotor(limits, self.place_m).target(Velocity(target_m_s, yaw_rad))
@@ -83,8 +83,8 @@ class SimulatedAirframe(Airframe):
         )
 
     def _sense(self) -> None:
-        """Read the state of the physics, and extrapolate it to the present; there is none before the first flight."""
-        flight = self._flown.read()
+        """Read the state of the physics, if there is one already, and extrapolate it to the present."""
+        flight = self._flight_record.read()
         if flight is None or flight.path_start_ns != self._path_start_ns:
             return
         self.on_ground, self.turn_rad_s = flight.is_supported, flight.turn_rad_s
@@ -95,6 +95,6 @@ class SimulatedAirframe(Airframe):
     def _extrapolated_m(self, flight: FlightMotion) -> Vector:
         if flight.is_supported:
             return flight.place_m
-        elapsed_s = min(max(self.now_ns - flight.time_ns, 0), _LATEST_NS) / 1e9
+        elapsed_s = min(max(self.now_ns - flight.time_ns, 0), _MAX_EXTRAPOLATION_NS) / 1e9
         (e, n, u), (v_e, v_n, v_u) = flight.place_m, flight.velocity_m_s
         return e + v_e * elapsed_s, n + v_n * elapsed_s, u + v_u * elapsed_s

@@ -47,7 +47,7 @@ class Telemetry:
         self._parameters = parameters
         self._pings = 0
         d = dialect
-        ardupilot = vehicle.firmware.is_ardupilot
+        is_ardupilot = vehicle.firmware.is_ardupilot
         self.builders: Final[Mapping[int, Callable[[], Message | None]]] = {
             d.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             d.MAVLINK_MSG_ID_SYS_STATUS: self._sys_status,
@@ -64,9 +64,9 @@ class Telemetry:
             d.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             d.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink_frames.PROTOCOL_VERSION: mavlink_frames.protocol_version,
-            **(self._ardupilot_builders() if ardupilot else self._px4_builders()),
+            **(self._ardupilot_builders() if is_ardupilot else self._px4_builders()),
         }
-        """Builder per message id; a builder returns None while its message is not available."""
+        """Builders by message id; a builder returns None while its message is not available."""
         self.streamed_only: Final = frozenset({mavlink_frames.EKF_STATUS_REPORT})
         """Messages that have a rate, but are not sent on request."""
 
@@ -114,9 +114,9 @@ class Telemetry:
     def _heartbeat(self) -> Message:
         vehicle, firmware = self._vehicle, self._vehicle.firmware
         base = dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | firmware.base_mode
-        px4 = not firmware.is_ardupilot
+        is_px4 = not firmware.is_ardupilot
         is_automatic = vehicle.mode not in {Mode.OFFBOARD, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD}
-        base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if px4 and is_automatic else 0
+        base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if is_px4 and is_automatic else 0
         base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0
         return dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_QUADROTOR, firmware.autopilot, base, firmware.modes[vehicle.mode], self._state(), 3
@@ -125,18 +125,18 @@ class Telemetry:
     def _state(self) -> int:
         """Return MAV_STATE: ArduCopter is ACTIVE after it lifts off, PX4 while it is armed."""
         vehicle = self._vehicle
-        ardupilot = vehicle.firmware.is_ardupilot
-        if vehicle.failsafes.active and (ardupilot or vehicle.armed):
+        is_ardupilot = vehicle.firmware.is_ardupilot
+        if vehicle.failsafes.active and (is_ardupilot or vehicle.armed):
             return int(dialect.MAV_STATE_CRITICAL)
-        active = vehicle.armed and not (ardupilot and vehicle.land_detector.landed)
-        return int(dialect.MAV_STATE_ACTIVE if active else dialect.MAV_STATE_STANDBY)
+        is_active = vehicle.armed and not (is_ardupilot and vehicle.land_detector.landed)
+        return int(dialect.MAV_STATE_ACTIVE if is_active else dialect.MAV_STATE_STANDBY)
 
     def _sys_status(self) -> Message:
         battery = self._vehicle.battery
         failed = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
         return dialect.MAVLink_sys_status_message(
             *(_SENSORS, _SENSORS, _SENSORS & ~failed),
-            *(200, _u16(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.left * 100)),
+            *(200, _u16(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.charge * 100)),
             *(0,) * 6,
         )
 
@@ -149,7 +149,7 @@ class Telemetry:
             dialect.MAV_BATTERY_TYPE_LIPO,
             0x7FFF,
             cells,
-            *(round(battery.current_a * 1e2), round(battery.used_mah), -1, math.ceil(battery.left * 100)),
+            *(round(battery.current_a * 1e2), round(battery.used_mah), -1, math.ceil(battery.charge * 100)),
         )
 
     def _gps_raw_int(self) -> Message:
@@ -191,7 +191,7 @@ class Telemetry:
         )
 
     def _in_body(self, vector: Vector) -> Vector:
-        """Return a vector in NED along the axes of the body: forward, right, down."""
+        """Return a NED vector in body axes: forward, right, down."""
         w, x, y, z = self._quaternion
         north, east, down = vector
         return (

@@ -43,23 +43,23 @@ class Vehicle(VehicleBase):
         if self.armed:
             raise self._refusal("Prearm checks denied: armed")
         for reason in self.arming_errors:
-            self.report(_CRITICAL, self.firmware.prearm[0] + reason)
+            self.report(_CRITICAL, self.firmware.prearm_prefixes[0] + reason)
 
     def arm(self) -> None:
         """Start the motors; does nothing if they run.
 
         Raises:
-            Refused: It is falling, or cannot be armed now.
+            Refused: The vehicle is falling, or cannot be armed now.
         """
         if self.armed:
             return
         if not self.body.on_ground:
             raise self._refusal("Arming denied: it falls")
         reasons = self.arming_errors
-        if self.mode in self.firmware.unarmable:
+        if self.mode in self.firmware.modes_without_arming:
             reasons.append(f"{self.firmware.names[reported_mode(self.mode)]} mode not armable")
         for reason in reasons:
-            self.report(_CRITICAL, self.firmware.prearm[1] + reason)
+            self.report(_CRITICAL, self.firmware.prearm_prefixes[1] + reason)
         if reasons:
             raise self._refusal("Arming denied: Resolve system health failures first")
         self.home_m = self.body.home_m = self.body.place_m
@@ -88,7 +88,7 @@ class Vehicle(VehicleBase):
             self.mode = Mode.LOITER
 
     def take_off(self, height_m: float | None = None) -> None:
-        """Take off; a repeated command, as after a lost answer, has no further effect until it lifts off.
+        """Take off. If the command is repeated before the vehicle lifts off, it has no further effect.
 
         Args:
             height_m: Height above home; None for the height in the parameter.
@@ -125,8 +125,8 @@ class Vehicle(VehicleBase):
     def accept_set_point(self, set_point: SetPoint) -> None:
         """Accept a set-point for mode OFFBOARD.
 
-        ArduCopter ignores set-points in other modes and on the ground, and positions outside its fence; an accepted
-        one ends a take-off.
+        ArduCopter ignores set-points in other modes and on the ground, and positions outside its fence. An accepted
+        set-point ends a take-off.
         """
         if self.firmware.is_ardupilot:
             if self.mode not in {Mode.OFFBOARD, Mode.TAKEOFF} or self.body.on_ground:
@@ -156,14 +156,14 @@ class Vehicle(VehicleBase):
         parameters, battery = self._parameters, self.battery
         battery.full_v, battery.flight_s = parameters["SIM_BATT_VOLTAGE"], parameters["SIM_BAT_DRAIN"]
         battery.min_charge = parameters["SIM_BAT_MIN_PCT"] / 100
-        battery.advance(now_ns, driven=self.armed)
+        battery.advance(now_ns, motors_on=self.armed)
         while self.body.now_ns + STEP_NS <= now_ns:
             if not self.armed and self.body.on_ground:
                 self.body.rest(now_ns)
                 self.land_detector.landed = True
                 break
             self._update_ground_state()
-            self.body.driven = self.armed
+            self.body.motors_on = self.armed
             target_m_s = self._target_m_s()  # it may change the mode
             self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
         self._update_boot_state()
@@ -203,7 +203,7 @@ class Vehicle(VehicleBase):
             self._switch(mode)
 
     def _switch(self, mode: Mode) -> None:
-        """Change the mode; errors as `change_mode`."""
+        """Change the mode, without a report to the failsafes; raises the errors of `change_mode`."""
         if mode is self.mode:
             return
         if mode is Mode.TAKEOFF:
@@ -211,9 +211,9 @@ class Vehicle(VehicleBase):
             return
         self._check_mode(mode)
         if mode is Mode.MISSION:
-            self.mission.begin()
-        self.guidance.goal_m = self._rest_m()
-        if mode is Mode.OFFBOARD and self.firmware.guided_holds:
+            self.mission.start()
+        self.guidance.goal_m = self._stop_m()
+        if mode is Mode.OFFBOARD and self.firmware.holds_without_set_points:
             self.guidance.hold(self.guidance.goal_m)
         self.mode = mode
 
@@ -237,36 +237,39 @@ class Vehicle(VehicleBase):
             raise self._refusal(f"{mode.name} denied: beyond the fence")
         self.mode, self.guidance.goal_m = mode, goal_m
 
-    def _refusal(self, why: str) -> Refused:
+    def _refusal(self, reason: str) -> Refused:
         """Return the exception for a refused command; ArduCopter answers without a text."""
-        return Refused("" if self.firmware.is_ardupilot else why)
+        return Refused("" if self.firmware.is_ardupilot else reason)
 
     def _update_ground_state(self) -> None:
         """Detect take-off and landing; stop idle motors; react to missing set-points and to the fence."""
-        now_ns, ardupilot = self.body.now_ns, self.firmware.is_ardupilot
+        now_ns, is_ardupilot = self.body.now_ns, self.firmware.is_ardupilot
         self.land_detector.advance(now_ns, on_ground=self.body.on_ground)
         if self.armed and now_ns - self.land_detector.grounded_ns > self._idle_s() * 1e9:
-            if not ardupilot:
-                reason = "landing" if self.land_detector.flew else "auto preflight disarming"
+            if not is_ardupilot:
+                reason = "landing" if self.land_detector.has_flown else "auto preflight disarming"
                 self.report(_INFO, f"Disarmed by {reason}")
             self.disarm()
-        if ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
+        if is_ardupilot and (breach := self.fence.advance(self._state, self.body.position_m)):
             self._react(breach)
         if self.mode is Mode.OFFBOARD:
             self._check_set_points()
 
     def _idle_s(self) -> float:
-        """Return the time on the ground after which its motors stop; ArduCopter stops them early in landing modes."""
-        stops = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
-        landed = (self.land_detector.flew and stops) or self.mode in LANDING
-        return self._parameters["COM_DISARM_LAND" if landed else "COM_DISARM_PRFLT"]
+        """Return the time on the ground after which the motors stop.
+
+        It is shorter after a landing; with ArduCopter only in MISSION and the landing modes.
+        """
+        stops_after_landing = self.mode is Mode.MISSION or not self.firmware.is_ardupilot
+        has_landed = (self.land_detector.has_flown and stops_after_landing) or self.mode in LANDING
+        return self._parameters["COM_DISARM_LAND" if has_landed else "COM_DISARM_PRFLT"]
 
     def _check_set_points(self) -> None:
-        """React to missing set-points (hold, or COM_OBL_RC_ACT), and hold if they lead outside PX4's fence."""
+        """React to missing set-points, and to set-points that lead outside PX4's fence."""
         has_recent_set_point = self.guidance.has_recent_set_point(self.body.now_ns)
         if self.firmware.is_ardupilot:
             if not self.guidance.set_point.is_place and not has_recent_set_point:
-                self.guidance.set_point = SetPoint(self._rest_m(), is_place=True)
+                self.guidance.set_point = SetPoint(self._stop_m(), is_place=True)
         elif not has_recent_set_point:
             self.report(_CRITICAL, "Failsafe activated")
             self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
@@ -276,13 +279,13 @@ class Vehicle(VehicleBase):
             self._switch_automatically(Mode.LOITER)
 
     def _cannot_lift_off(self) -> bool:
-        """Return True if it cannot lift off now: its motors spool up, or its mode does not lift off."""
+        """Return True if it cannot lift off now: its motors spool up, or its mode has no take-off."""
         spools_up = self.body.now_ns - self.land_detector.armed_ns < self.firmware.spool_s * 1e9
-        follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.lifts_off
+        follows_set_points = self.mode is Mode.OFFBOARD and not self.firmware.set_points_lift_off
         return self.body.on_ground and (spools_up or follows_set_points or self.mode in PILOTED)
 
     def _target_m_s(self) -> Vector:
-        """Return the target velocity, after the changes of mode that are due."""
+        """Make the changes of mode that are due, and return the target velocity."""
         if not self._cannot_lift_off():
             self._advance_mode()
         if self._cannot_lift_off():

@@ -44,7 +44,7 @@ class VehicleBase:
         estimate: Its position estimate.
         fence: Its fence.
         guidance: Its goal and set-points.
-        home_m: Home in the world, metres east, north, up: where it was armed last; before that, where it booted.
+        home_m: Home in the world, metres east, north, up: the place where it was armed last, or where it booted.
         failsafes: Its failsafes.
         status_texts: Texts that are not sent yet; the reader clears the list.
     """
@@ -131,6 +131,6 @@ class VehicleBase:
     def _state(self) -> VehicleState:
         return VehicleState(self.body.now_ns, self.armed, self.land_detector.landed, self.mode, self.battery)
 
-    def _rest_m(self) -> Vector:
+    def _stop_m(self) -> Vector:
         """Return the position at which it stops if it brakes now, or the nearest point inside the fence."""
         return self.fence.nearest_inside(stop_m(self.body, self.limits))

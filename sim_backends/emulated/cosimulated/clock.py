@@ -25,6 +25,6 @@ class RealTime:
         """Return the simulated time at a time of the monotonic clock."""
         return monotonic_ns - self.epoch_ns
 
-    def give_up(self, lag_ns: int) -> None:
-        """Shift all later simulated time by a delay, so that a late simulation does not catch up."""
+    def skip_lag(self, lag_ns: int) -> None:
+        """Delay simulated time by a lag, so that a late simulation does not have to catch up."""
         self.epoch_ns += lag_ns

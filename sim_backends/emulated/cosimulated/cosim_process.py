@@ -1,11 +1,11 @@
-"""The process of a co-simulated medium: packets between devices through a network, robots moved by a physics.
+"""The process of a co-simulated medium: a network carries packets between devices, and a physics moves the robots.
 
-`client` runs it as `python -m sim_backends.emulated.cosimulated.cosim_process FD SEED FRAMING`, as the process of the
-medium of a radio model. It answers the same requests, and in addition `simulate`, with simulators and policy, and
-`body`, with the body of a robot.
+`client` runs it as `python -m sim_backends.emulated.cosimulated.cosim_process FD SEED FRAMING`. It answers the same
+requests as the process of a radio model, and two more: `simulate`, with simulators and policy, and `body`, with the
+body of a robot.
 
-A session is one run of the coordinator. Its time begins at 0 when the session starts, and its windows end in real
-time. Another set of stations or another relay needs a new session; packets on the air of the old one are lost.
+A session is one run of the coordinator. Its time is 0 when the session starts, and its windows end in real time. If
+the set of stations or the relay changes, a new session starts, and packets on the air of the old session are lost.
 """
 
 import gc
@@ -29,7 +29,7 @@ from sim_backends.emulated.cosimulated.real_agents import RealPacket
 from sim_backends.emulated.cosimulated.simulators import LabSettings, RobotBody, Simulators
 from sim_backends.emulated.cosimulated.steering import FlightSteering, GroundSteering, Steering
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
-from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, rounded_up
+from sim_backends.emulated.medium.ports import FlowDelays, MediumStats, Port, round_up
 from sim_backends.emulated.medium.server import (
     BURST,
     DEVICE_PACKETS,
@@ -43,11 +43,11 @@ from sim_backends.radio.links import PACKET, PROCESSING_NS, TRANSMISSION_NS, Lin
 from sim_backends.world.motion import STILL, State
 
 _MAX_SLEEP_NS: Final = 10_000_000
-"""Maximum sleep. If the process sleeps longer, packets may have waited for the additional time."""
+"""Maximum sleep. If the process wakes up later, packets may have waited for the additional time."""
 _END_NS: Final = 1 << 62
 _WINDOWS: Final = 1000
 """Number of windows after which the record of the coordinator is cleared."""
-_GIVE_UP_NS: Final = 1_000_000_000
+_MAX_LAG_NS: Final = 1_000_000_000
 """A simulation that lags behind real time by more than this does not catch up, so that its later results are usable.
 Packets that wait during the lag are delivered late, so their repeat is void."""
 
@@ -62,7 +62,7 @@ class _NewSession(BaseException):
 class CosimulatedMedium(MediumServer):
     """Moves packets between ports through the coordinator of a co-simulation.
 
-    It is the coordinator's observer and the devices of its agents. Arguments as `MediumServer`.
+    It implements the coordinator's observer and the devices of its agents. Arguments are those of `MediumServer`.
     """
 
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
@@ -76,7 +76,7 @@ class CosimulatedMedium(MediumServer):
         self._queue: deque[RealPacket] = deque()
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
         self._late_windows: Counter[int] = Counter()
-        self._added = FlowDelays()
+        self._added_delays = FlowDelays()
 
     def run(self) -> None:
         """Run one session after another until the owner closes the socket."""
@@ -96,7 +96,7 @@ class CosimulatedMedium(MediumServer):
         if self._session is not None:
             self._session.close()
 
-    # The devices of the agents.
+    # Methods of `Devices`.
 
     def wait(self, until_ns: int) -> None:
         """Implement `Devices.wait`."""
@@ -114,7 +114,7 @@ class CosimulatedMedium(MediumServer):
             self._sample()
 
     def wait_for_packet(self, until_ns: int) -> None:
-        """Implement `Devices.wait_for_packet`; the next event of the network ends the wait, too."""
+        """Implement `Devices.wait_for_packet`; the wait also ends at the next event of the network."""
         assert self._session is not None
         event_ns = self._session.network.next_event_ns()
         due_ns = self._clock.monotonic_ns(until_ns if event_ns is None else min(until_ns, event_ns))
@@ -127,15 +127,15 @@ class CosimulatedMedium(MediumServer):
 
     def pop_packets(self, last_ns: int) -> list[RealPacket]:
         """Implement `Devices.pop_packets`."""
-        packets, read = [], self._queue
-        while read and read[0].at_ns <= last_ns:
-            packets.append(read.popleft())
+        packets, queue = [], self._queue
+        while queue and queue[0].at_ns <= last_ns:
+            packets.append(queue.popleft())
         return packets
 
     def receivers(self, source: str) -> Sequence[str]:
         """Implement `Devices.receivers`."""
-        present, _ = self._routed
-        return sorted(present - {source})
+        robots_on_air, _ = self._routing_state
+        return sorted(robots_on_air - {source})
 
     def _poll(self, due_ns: int | None, *, answers: bool = True) -> None:
         """Wait until a time of the monotonic clock, a packet or a request; read the packets and answer the request.
@@ -167,7 +167,7 @@ class CosimulatedMedium(MediumServer):
         for _ in range(BURST):
             try:
                 content = os.read(port.fd, READ_BYTES)
-                carried = framing.carries(content)
+                is_carried = framing.carries(content)
             except BlockingIOError:
                 port.backlog = 0
                 return
@@ -176,16 +176,16 @@ class CosimulatedMedium(MediumServer):
                 self._epoll.unregister(port.fd)
                 return
             port.read += 1
-            if not carried:
+            if not is_carried:
                 port.not_ipv4 += 1
                 continue
             destination = framing.destination(content, routes)
             if destination == NO_ROBOT:
                 port.unroutable += 1
                 continue
-            if self._flows.counted and (inner := framing.ipv4(content)) is not None:
+            if self._flows.delays_by_flow and (inner := framing.ipv4(content)) is not None:
                 self._flows.note_first_fragment(inner)
-                self._added.note_first_fragment(inner)
+                self._added_delays.note_first_fragment(inner)
             now_ns = time.monotonic_ns()
             size_bytes = len(content) - framing.header_bytes
             waited_ns = now_ns - port.backlog_since_ns
@@ -193,7 +193,7 @@ class CosimulatedMedium(MediumServer):
             self._queue.append(RealPacket(at_ns, port.name, destination, content, size_bytes, waited_ns))
         port.backlog -= BURST
 
-    # The observer of the coordinator.
+    # Methods of `WindowObserver`.
 
     def begin(self, states: Mapping[str, State]) -> None:
         """Implement `WindowObserver.begin`."""
@@ -203,22 +203,22 @@ class CosimulatedMedium(MediumServer):
         session = self._session
         assert session is not None
         end_ns = self._clock.monotonic_ns(window.end_ns)
-        if window.ended:
+        if window.decided_fates:
             delivered = session.agents.delivered
-            arrived = [fate for fate in window.ended if fate.arrived_ns is not None]
+            arrived = [fate for fate in window.decided_fates if fate.arrived_ns is not None]
             for fate, packet in zip(arrived, delivered, strict=True):
                 self._write(session, fate, packet, window.end_ns, end_ns)
             delivered.clear()
-            for fate in window.ended:
+            for fate in window.decided_fates:
                 session.remove_packet(fate.packet)
         lag_ns = time.monotonic_ns() - end_ns
-        self._late_windows[rounded_up(max(lag_ns, 0))] += 1
-        if lag_ns > _GIVE_UP_NS:
-            self._give_up(lag_ns)
+        self._late_windows[round_up(max(lag_ns, 0))] += 1
+        if lag_ns > _MAX_LAG_NS:
+            self._skip_lag(lag_ns)
 
-    def _give_up(self, lag_ns: int) -> None:
+    def _skip_lag(self, lag_ns: int) -> None:
         """Delay simulated time, and the packets that were read and have not entered the network."""
-        self._clock.give_up(lag_ns)
+        self._clock.skip_lag(lag_ns)
         now_ns = self._clock.now_ns()
         self._queue = deque(
             packet._replace(at_ns=min(packet.at_ns, now_ns), waited_ns=packet.waited_ns + lag_ns)
@@ -241,12 +241,12 @@ class CosimulatedMedium(MediumServer):
         delay, undivided_ns = session.network_delay(fate)
         delay += late_ns * PROCESSING_NS
         port.delays[packet.source] += delay + undivided_ns * PROCESSING_NS
-        if self._flows.counted and (inner := self._framing.ipv4(packet.content)) is not None:
+        if self._flows.delays_by_flow and (inner := self._framing.ipv4(packet.content)) is not None:
             added_ns = end_ns - fate.arrived_ns + fate.packet.enters_ns - fate.packet.sent_ns
             self._flows.count(inner, delay, port.address.packed)
             extra = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS
-            self._added.count(inner, extra, port.address.packed)
-        self._late[rounded_up(late_ns)] += 1
+            self._added_delays.count(inner, extra, port.address.packed)
+        self._late[round_up(late_ns)] += 1
 
     # Requests of the lab.
 
@@ -277,7 +277,7 @@ class CosimulatedMedium(MediumServer):
     def _delays(self, request: Message) -> Message:
         source, destination = (self._ports[request[key]].address.ip for key in ("source", "destination"))
         flow = source, destination, request["protocol"], request["port"]
-        added = self._added.delay_parts(*flow)
+        added = self._added_delays.delay_parts(*flow)
         parts = self._flows.delay_parts(*flow)
         return vars(replace(parts, policy_ns=added.processing_ns, undivided_ns=added.transmission_ns))
 
@@ -287,8 +287,8 @@ class CosimulatedMedium(MediumServer):
 
     @override
     def _place_stations(self, positions_m: dict[str, Vector], relay: str | None) -> None:
-        """Place the robots that are on the air; without any, the session continues with all of them out of range."""
-        begin_ns = time.monotonic_ns()
+        """Place the robots that are on the air. If there are none, the session continues with all out of range."""
+        start_ns = time.monotonic_ns()
         session, stations = self._session, tuple(self._ports)
         if session is None or session.stations != stations or (positions_m and session.settings.relay != relay):
             if session is not None:
@@ -308,9 +308,9 @@ class CosimulatedMedium(MediumServer):
         }
         session.physics.place(states, frozenset(positions_m))
         self._session = session
-        if (spent_ns := time.monotonic_ns() - begin_ns) > _START_NS:
+        if (spent_ns := time.monotonic_ns() - start_ns) > _START_NS:
             # A simulator was started. The lab waits for this, so no measurement is in progress.
-            self._give_up(spent_ns)
+            self._skip_lag(spent_ns)
 
     @override
     def _log_attempts(self, log: AttemptLog | None) -> None:

@@ -47,7 +47,7 @@ class CosimSession:
         settings: Simulators and their settings.
         steerings: Steering of each robot that programs can drive.
         policy: Name and parameters of the sync policy.
-        clock: Real time.
+        clock: Simulated time as real time.
 
     Raises:
         ConfigurationError: A simulator cannot be used with these settings.
@@ -90,7 +90,7 @@ class CosimSession:
         )
 
     def close(self) -> None:
-        """End the simulators."""
+        """Stop the simulators."""
         self.physics.close()
         if close := getattr(self.network, "close", None):
             close()
@@ -110,7 +110,7 @@ class CosimSession:
         assert fate.arrived_ns is not None
         delay_ns = fate.arrived_ns - packet.enters_ns
         if (parts := self._arrival_delays.get(packet.packet_id)) is not None:
-            return _packed(packet, delay_ns, parts), 0
+            return _delay_of_parts(packet, delay_ns, parts), 0
         identity = packet.identity
         if packet.protocol == BROADCAST:
             identity = broadcast_flow(packet.source), identity[1]
@@ -146,8 +146,8 @@ class CosimSession:
         self._arrival_delays[arrival.packet_id] = parts
 
 
-def _packed(packet: Packet, delay_ns: int, parts: ArrivalDelay) -> Delay:
-    """Return a delay with its parts; the rest of it is processing."""
+def _delay_of_parts(packet: Packet, delay_ns: int, parts: ArrivalDelay) -> Delay:
+    """Return a delay with its parts; time that the network has not attributed to a part counts as processing."""
     processing_ns = delay_ns - sum(parts)
     if processing_ns < 0:
         raise FederateError(

@@ -1,7 +1,7 @@
 """The physics of a lab: moves the robots that programs drive; other robots stay where the lab has put them."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Final, Protocol, runtime_checkable
 
 from typing_extensions import override
@@ -55,8 +55,8 @@ StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
 class LabPhysics:
     """The physics of a session of the co-simulation; implements `PhysicsFederate`.
 
-    It starts when the lab has placed all robots that can be driven. It moves a robot from the robot's first command
-    on. Before that command, and after the lab has placed the robot again, the robot stays where the lab has put it. A
+    It starts when the lab has placed all robots that can be driven. It moves a robot after the robot's first command.
+    Before that command, and after the lab has placed the robot again, the robot stays where the lab has put it. A
     station without a body, such as the laptop, always stays there.
 
     Args:
@@ -65,7 +65,7 @@ class LabPhysics:
         bodies: Names of the robots, which have a body.
         stations: Names of all stations.
         step_ns: Step of the physics.
-        clock: Real time.
+        clock: Simulated time as real time.
 
     Attributes:
         step_ns: See `PhysicsFederate`.
@@ -92,18 +92,18 @@ class LabPhysics:
         self._started_ns = 0
         self._advanced_ns = 0
         self._now_ns = 0
-        self._pending: dict[str, Command] = {}
-        self._followed: dict[str, Command] = {}
-        self._assigned = dict.fromkeys(stations, State(OFF_AIR_M))
-        self._hidden: frozenset[str] = frozenset()
-        self._in_physics: dict[str, tuple[Vector, float]] = {}
+        self._pending_commands: dict[str, Command] = {}
+        self._active_commands: dict[str, Command] = {}
+        self._assigned_states = dict.fromkeys(stations, State(OFF_AIR_M))
+        self._hidden_stations: frozenset[str] = frozenset()
+        self._places_in_physics: dict[str, tuple[Vector, float]] = {}
         self._physics_states: Mapping[str, State] = {}
-        self._states: Mapping[str, State] = self._assigned
-        self._changed = True
+        self._states: Mapping[str, State] = self._assigned_states
+        self._has_changed = True
         self._polled_ns = 0
 
     def place(self, states: Mapping[str, State], present: frozenset[str]) -> None:
-        """Put stations at places; robots that are driven stay where they are.
+        """Put stations at places. Robots that are driven by their programs are not moved.
 
         Args:
             states: State of the antenna of each station that has a place.
@@ -114,9 +114,9 @@ class LabPhysics:
             FederateError: The physics failed.
         """
         self._poll_placements(self._clock.now_ns())
-        self._assigned |= states
-        self._hidden = frozenset(self._assigned) - present
-        self._changed = True
+        self._assigned_states |= states
+        self._hidden_stations = frozenset(self._assigned_states) - present
+        self._has_changed = True
         if self._steerings and all(steering.is_placed for steering in self._steerings.values()):
             self._place_bodies()
 
@@ -126,7 +126,7 @@ class LabPhysics:
         return self._combined()
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of a station; 0 if nothing drives it."""
+        """Return the acceleration limit of a station; 0 if no program drives it."""
         steering = self._steerings.get(name)
         if self._physics is None or steering is None or not steering.is_driven:
             return 0.0
@@ -142,13 +142,13 @@ class LabPhysics:
             self._advance(to_ns)
             self._report(to_ns)
         self._now_ns = to_ns
-        if self._changed:
-            self._changed = False
+        if self._has_changed:
+            self._has_changed = False
             self._states = self._combined()
         return self._states
 
     def close(self) -> None:
-        """End the physics."""
+        """Stop the physics."""
         if close := getattr(self._physics, "close", None):
             close()
 
@@ -159,26 +159,26 @@ class LabPhysics:
                 yield self._clock.simulated_ns(at_ns), name, command
 
     def _drive(self, name: str, at_ns: int, command: Command) -> None:
-        """Command a robot at a time; a command that the robot follows already needs no exchange with the physics."""
-        if self._followed.get(name) == command:
+        """Apply a command to a robot at a time. If the robot already follows this command, nothing is done."""
+        if self._active_commands.get(name) == command:
             return
-        self._followed[name] = command
+        self._active_commands[name] = command
         self._advance(at_ns)
-        self._pending[name] = command
+        self._pending_commands[name] = command
 
     def _advance(self, to_ns: int) -> None:
         """Advance the physics; its time does not advance while nothing moves in it."""
         physics = self._physics
         assert physics is not None
-        if not self._pending and all(steering.rests for steering in self._steerings.values()):
+        if not self._pending_commands and all(steering.is_at_rest for steering in self._steerings.values()):
             self._started_ns += (to_ns - self._advanced_ns) // self.step_ns * self.step_ns
             self._advanced_ns = to_ns
             return
         self._advanced_ns = to_ns
-        commands, self._pending = self._pending, {}
+        commands, self._pending_commands = self._pending_commands, {}
         states = physics.advance(max(to_ns - self._started_ns, 0), commands)
         if states is not self._physics_states:
-            self._physics_states, self._changed = states, True
+            self._physics_states, self._has_changed = states, True
 
     def _report(self, to_ns: int) -> None:
         at_ns = self._clock.monotonic_ns(to_ns - (to_ns - self._started_ns) % self.step_ns)
@@ -190,11 +190,11 @@ class LabPhysics:
                 steering.report(at_ns, self._physics_states[name], flight)
 
     def _combined(self) -> Mapping[str, State]:
-        states = dict(self._assigned)
+        states = dict(self._assigned_states)
         for name, steering in self._steerings.items():
             if steering.is_driven and self._physics is not None:
                 states[name] = self._physics_states[name]
-        for name in self._hidden:
+        for name in self._hidden_stations:
             states[name] = State(OFF_AIR_M)
         return states
 
@@ -204,43 +204,46 @@ class LabPhysics:
             state = self._physics_states.get(name)
             was_driven = steering.is_driven
             if steering.poll_placement(self._clock.monotonic_ns(now_ns)) is not None:
-                self._changed = True
-                self._followed.pop(name, None)
+                self._has_changed = True
+                self._active_commands.pop(name, None)
                 if was_driven and state is not None:
-                    self._assigned[name] = State(state.position_m)  # until the lab's request arrives
-                    self._pending[name] = steering.idle
+                    self._assigned_states[name] = State(state.position_m)  # until the lab's request arrives
+                    self._pending_commands[name] = steering.idle
 
     def _place_bodies(self) -> None:
         """Put the robots that the lab has moved at their places in the physics."""
         places = {
             name: (
-                self._assigned[name].position_m,
+                self._assigned_states[name].position_m,
                 self._steerings[name].heading_rad if name in self._steerings else 0.0,
             )
             for name in self._bodies
             if name not in self._steerings or not self._steerings[name].is_driven
         }
-        moved = {name: place for name, place in places.items() if _differs(place, self._in_physics.get(name))}
-        if self._physics is not None and not moved:
+        new_places = {
+            name: place for name, place in places.items() if _differs(place, self._places_in_physics.get(name))
+        }
+        if self._physics is not None and not new_places:
             return
-        self._in_physics |= moved
+        self._places_in_physics |= new_places
         if isinstance(self._physics, Placing):
-            for name, ((east_m, north_m, up_m), heading_rad) in moved.items():
-                self._followed.pop(name, None)
+            for name, ((east_m, north_m, up_m), heading_rad) in new_places.items():
+                self._active_commands.pop(name, None)
                 self._physics.put(name, (east_m, north_m, up_m - ANTENNA_M), heading_rad)
-            self._check_overlaps(moved)
+            self._check_overlaps(new_places)
             self._physics_states = self._physics.advance(max(self._now_ns - self._started_ns, 0), {})
         else:
             self._restart()
 
-    def _check_overlaps(self, moved: Mapping[str, object]) -> None:
-        """Raise ConfigurationError if a robot overlaps something, unless the lab moves it on a path."""
+    def _check_overlaps(self, names: Iterable[str]) -> None:
+        """Raise ConfigurationError if one of the robots overlaps something, unless the lab moves it on a path."""
         if not isinstance(self._physics, Bodies):
             return
-        for name in moved:
-            if self._assigned[name].velocity_m_s == STILL and (other := self._physics.overlap(name)):
+        for name in names:
+            state = self._assigned_states[name]
+            if state.velocity_m_s == STILL and (other := self._physics.overlap(name)):
                 raise ConfigurationError(
-                    f"{name} would be within {other}, at {coordinates_text(self._assigned[name].position_m)} m",
+                    f"{name} would be within {other}, at {coordinates_text(state.position_m)} m",
                     remedy="put it at a free place, or choose another world or distance",
                 )
 
@@ -248,9 +251,11 @@ class LabPhysics:
         """Start the physics with all robots at their present places; moving robots are at rest afterwards."""
         self.close()
         self._physics = None
-        self._followed.clear()
+        self._active_commands.clear()
         states = {name: self._body_state(name) for name in self._bodies}
-        self._in_physics = {name: (state.position_m, state.heading_rad or 0.0) for name, state in states.items()}
+        self._places_in_physics = {
+            name: (state.position_m, state.heading_rad or 0.0) for name, state in states.items()
+        }
         self._started_ns = self._now_ns - self._now_ns % self.step_ns
         self._advanced_ns = self._now_ns
         self._physics = self._start(states)
@@ -261,7 +266,9 @@ class LabPhysics:
         if steering is not None and steering.is_driven and name in self._physics_states:
             state = self._physics_states[name]
             return State(state.position_m, heading_rad=state.heading_rad)
-        return State(self._assigned[name].position_m, heading_rad=0.0 if steering is None else steering.heading_rad)
+        return State(
+            self._assigned_states[name].position_m, heading_rad=0.0 if steering is None else steering.heading_rad
+        )
 
 
 def _differs(place: tuple[Vector, float], other: tuple[Vector, float] | None) -> bool:
@@ -269,7 +276,7 @@ def _differs(place: tuple[Vector, float], other: tuple[Vector, float] | None) ->
 
 
 class _Limits(Mapping[str, float]):
-    """The limits of all stations, which change with their commands."""
+    """The acceleration limits of all stations, which change with their commands."""
 
     def __init__(self, physics: LabPhysics, stations: tuple[str, ...]) -> None:
         self._physics = physics

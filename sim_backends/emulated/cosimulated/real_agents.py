@@ -5,15 +5,15 @@ from typing import Final, NamedTuple, Protocol
 
 from typing_extensions import override
 
-from sim_backends.cosim.agents import Agents, Sent
+from sim_backends.cosim.agents import Agents, SentDatagram
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, broadcast_flow
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 _KEPT_PACKETS: Final = 5000
-"""Contents of recent packets, for recordings of the air: more than the queues of three radios hold."""
+"""Number of recent packets whose contents are kept for recordings of the air; larger than the queues of 3 radios."""
 
 
 class RealPacket(NamedTuple):
@@ -40,7 +40,7 @@ class Devices(Protocol):
     """The devices of all robots, in simulated time."""
 
     def wait(self, until_ns: int) -> None:
-        """Wait until this time; meanwhile packets are read and requests answered."""
+        """Wait until this time; meanwhile packets are read, and requests are answered."""
         ...
 
     def wait_for_packet(self, until_ns: int) -> None:
@@ -95,8 +95,8 @@ class RealAgents(Agents):
         return self._reached_ns
 
     @override
-    def deliver(self, receiver: str, received: Received) -> None:
-        self.delivered.append(received.payload)
+    def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
+        self.delivered.append(received_datagram.payload)
 
     @property
     @override
@@ -104,37 +104,37 @@ class RealAgents(Agents):
         return False
 
     @override
-    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[Sent], Mapping[str, State]]:
+    def advance(self, now_ns: int, last_ns: int, end_ns: int) -> tuple[list[SentDatagram], Mapping[str, State]]:
         self._devices.wait(end_ns)
         packets = self._devices.pop_packets(last_ns)
         states = self.states(end_ns)
         self._reached_ns = end_ns
-        return ([sent for packet in packets for sent in self._sent(packet, states)] if packets else []), states
+        return ([sent for packet in packets for sent in self._datagrams(packet, states)] if packets else []), states
 
     def content(self, identity: PacketIdentity) -> bytes:
-        """Return the content of a recent packet by the key of its random draws; empty if it is older."""
+        """Return the content of a packet by the key of its random draws; empty if the packet is not recent."""
         return self._contents.get(identity, b"")
 
-    def _keep(self, identity: PacketIdentity, content: bytes) -> None:
+    def _store_content(self, identity: PacketIdentity, content: bytes) -> None:
         contents = self._contents
         contents[identity] = content
         if len(contents) > _KEPT_PACKETS:
             del contents[next(iter(contents))]
 
-    def _sent(self, packet: RealPacket, states: Mapping[str, State]) -> list[Sent]:
+    def _datagrams(self, packet: RealPacket, states: Mapping[str, State]) -> list[SentDatagram]:
         """Return the datagram of a packet, or one per receiver of a broadcast."""
         source = packet.source
         if packet.destination is not None:
             flow = f"{source} > {packet.destination}"
             number = self._numbers[flow] = self._numbers.get(flow, -1) + 1
-            self._keep((flow, number), packet.content)
+            self._store_content((flow, number), packet.content)
             datagram = Datagram(packet.destination, packet.size_bytes, flow, number, packet, UNICAST)
-            return [Sent(packet.at_ns, source, datagram, states)]
+            return [SentDatagram(packet.at_ns, source, datagram, states)]
         flow = broadcast_flow(source)
         number = self._numbers[flow] = self._numbers.get(flow, -1) + 1
-        self._keep((flow, number), packet.content)
+        self._store_content((flow, number), packet.content)
         return [
-            Sent(
+            SentDatagram(
                 packet.at_ns,
                 source,
                 Datagram(name, packet.size_bytes, f"{flow}: {name}", number, packet, BROADCAST),

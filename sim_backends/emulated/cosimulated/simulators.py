@@ -13,7 +13,7 @@ from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.federates import remote
 from sim_backends.federates.frames import NETWORK, PHYSICS
 from sim_backends.federates.handshake import AgentStart, Hello
-from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.named import PythonFederate, named_federate
 from sim_backends.federates.protocols import PhysicsFederate
 from sim_backends.network.bare_ip import BROADCAST, UNICAST, BareBroadcast, BareIp
 from sim_backends.network.ip import Fragment
@@ -36,7 +36,7 @@ DEADLINE_S: Final = 10.0
 """Longest wait for an answer of a simulator. The lab waits for 15 s for an answer of the medium."""
 
 _END_NS: Final = 10**9 * 10**8
-"""Announced end of a run, which no run reaches: three years."""
+"""End of a run that is announced to the simulators; at three years, no run reaches it."""
 
 
 class Simulators(NamedTuple):
@@ -126,7 +126,7 @@ def start_physics(settings: LabSettings, states: Mapping[str, State]) -> Physics
         bodies = {robot: _body(settings.bodies[robot].limits, state) for robot, state in states.items()}
         return Bodies(bodies, settings.world, step_ns=step_ns)
     hello = _hello(settings, PHYSICS, states)
-    federate = named(name, PHYSICS)
+    federate = named_federate(name, PHYSICS)
     if isinstance(federate, PythonFederate):
         python_physics: PhysicsFederate = federate.load().make(hello)
         return python_physics
@@ -173,7 +173,7 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
 
 
 def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
-    """Start a network that is a program; arguments and errors as `start_physics`, with all stations."""
+    """Start the program of a network. Arguments and errors are those of `start_physics`, but with all stations."""
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
     supported = network.welcome.transports
     if supported and not {UNICAST, BROADCAST} <= {*supported}:

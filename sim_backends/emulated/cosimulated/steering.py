@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 from typing_extensions import override
 
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS, odometry
-from sim_backends.emulated.robot.commanded import CommandedRecord
+from sim_backends.emulated.robot.velocity_command import VelocityCommandRecord
 from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightMotion, FlightRecord
 from sim_backends.emulated.ros.own_motion import AT_REST, MotionReporter, OwnMotion
 from sim_backends.physics.body import Twist, Velocity
@@ -44,46 +44,46 @@ class Steering(ABC):
     """Commands and record of one robot. Times are those of the monotonic clock.
 
     Args:
-        steered: Descriptor of the record of its motion.
+        motion_record: Descriptor of the record of the robot's motion.
         paths: Descriptor of the file of its assigned paths.
         now_ns: The present time.
 
     Attributes:
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
-        is_driven: True if the robot was commanded since the lab put it at its place.
+        is_driven: True if the robot has received a command since the lab put it at its place.
         is_placed: True if the lab has put it at a place.
-        rests: True if it is at rest, no command is active, and this is recorded.
+        is_at_rest: True if it is at rest, no command is active, and this is recorded.
     """
 
     idle: Command
 
-    def __init__(self, steered: int, paths: int, now_ns: int) -> None:
-        self._seen_ns = now_ns
+    def __init__(self, motion_record: int, paths: int, now_ns: int) -> None:
+        self._last_command_ns = now_ns
         self._pending: deque[TimedCommand] = deque(maxlen=_PENDING_COMMANDS)
-        self._reporter = MotionReporter(_path(paths), _path(steered), now_ns)
+        self._reporter = MotionReporter(_path(paths), _path(motion_record), now_ns)
         self.is_driven = False
         self._start: OwnMotion = AT_REST
         self.is_placed = False
-        self._stops_ns: int | None = None
-        self._reported: tuple[int, float] | None = None
-        self.rests = True
+        self._stop_due_ns: int | None = None
+        self._last_report: tuple[int, float] | None = None
+        self.is_at_rest = True
 
     @abstractmethod
     def _read_command(self) -> TimedCommand | None:
         """Return the last command of the robot's programs, or None if there is none."""
 
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
-        """Return the place at which the lab has put the robot since the last call, or None if it has not.
+        """Return the place at which the lab has put the robot since the last call, or None if it has not moved it.
 
-        It is at rest there, and earlier commands are dropped.
+        The robot is at rest there, and earlier commands are dropped.
         """
-        placed = self._reporter.poll_placement(now_ns)
-        if placed is not None:
-            self._start, self.is_placed = placed, True
-            self._seen_ns = now_ns
+        placement = self._reporter.poll_placement(now_ns)
+        if placement is not None:
+            self._start, self.is_placed = placement, True
+            self._last_command_ns = now_ns
             self._pending.clear()
-            self.is_driven, self._stops_ns, self._reported, self.rests = False, None, None, True
-        return placed
+            self.is_driven, self._stop_due_ns, self._last_report, self.is_at_rest = False, None, None, True
+        return placement
 
     @property
     def heading_rad(self) -> float:
@@ -96,28 +96,28 @@ class Steering(ABC):
         A simulation that lags behind may read commands with later times; they are kept until it reaches them.
         """
         last = self._read_command()
-        if last is not None and self._seen_ns < last.time_ns and self.is_placed:
-            self._seen_ns = last.time_ns
+        if last is not None and self._last_command_ns < last.time_ns and self.is_placed:
+            self._last_command_ns = last.time_ns
             self._pending.append(last)
         while self._pending and self._pending[0].time_ns <= until_ns:
             time_ns, command, is_idle = self._pending.popleft()
             yield from self._stop_until(time_ns)
             if is_idle and not self.is_driven:
                 continue
-            self._stops_ns = None if is_idle else time_ns + TIMEOUT_NS
-            self.is_driven, self.rests = True, False
+            self._stop_due_ns = None if is_idle else time_ns + TIMEOUT_NS
+            self.is_driven, self.is_at_rest = True, False
             yield time_ns, command
         yield from self._stop_until(until_ns)
 
     def _stop_until(self, until_ns: int) -> Iterator[tuple[int, Command]]:
-        """Yield `idle` with its time if it is due by a time."""
-        if self._stops_ns is not None and self._stops_ns <= until_ns:
-            yield self._stops_ns, self.idle
-            self._stops_ns = None
+        """Yield `idle` with its time if it is due at or before a time."""
+        if self._stop_due_ns is not None and self._stop_due_ns <= until_ns:
+            yield self._stop_due_ns, self.idle
+            self._stop_due_ns = None
 
     def is_report_due(self, at_ns: int) -> bool:
-        """Return True if the motion at a time must be recorded; for a robot at rest it is recorded once."""
-        return not self.rests and (self._reported is None or at_ns - self._reported[0] >= _REPORT_NS)
+        """Return True if the motion at a time must be recorded. A robot at rest is recorded only once."""
+        return not self.is_at_rest and (self._last_report is None or at_ns - self._last_report[0] >= _REPORT_NS)
 
     def report(self, at_ns: int, state: State, flight: FlightStatus | None = None) -> None:
         """Record the motion of a robot that is driven, if a record is due.
@@ -129,16 +129,16 @@ class Steering(ABC):
         """
         if not self.is_report_due(at_ns):
             return
-        before_ns, before_rad = (at_ns, self._start.heading_rad) if self._reported is None else self._reported
+        before_ns, before_rad = (at_ns, self._start.heading_rad) if self._last_report is None else self._last_report
         heading_rad = before_rad + math.remainder((state.heading_rad or 0.0) - before_rad, math.tau)
         turn_rad_s = 0.0
         if at_ns > before_ns:
             turn_rad_s = (heading_rad - before_rad) * 1e9 / (at_ns - before_ns)
             if abs(turn_rad_s) < _NO_TURN_RAD_S:
                 turn_rad_s = 0.0
-        self._reported = at_ns, heading_rad
+        self._last_report = at_ns, heading_rad
         is_still = math.hypot(*state.velocity_m_s) < _STILL_M_S and (flight is None or flight.is_supported)
-        self.rests = is_still and not turn_rad_s and self._stops_ns is None
+        self.is_at_rest = is_still and not turn_rad_s and self._stop_due_ns is None
         if is_still:
             state = state._replace(velocity_m_s=STILL)
         self._write(at_ns, state, heading_rad, turn_rad_s, flight)
@@ -166,20 +166,20 @@ class GroundSteering(Steering):
 
     Args:
         descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
-            paths, and the record of its commanded velocity.
+            paths, and the record of its velocity commands.
         now_ns: The present time.
     """
 
     idle = Twist()
 
     def __init__(self, descriptors: Sequence[int], now_ns: int) -> None:
-        steered, paths, commanded = descriptors
-        super().__init__(steered, paths, now_ns)
-        self._commanded = CommandedRecord(commanded)
+        motion_record, paths, command_record = descriptors
+        super().__init__(motion_record, paths, now_ns)
+        self._command_record = VelocityCommandRecord(command_record)
 
     @override
     def _read_command(self) -> TimedCommand | None:
-        last = self._commanded.read()
+        last = self._command_record.read()
         return None if last is None else TimedCommand(last.time_ns, Twist(last.forward_m_s, last.turn_rad_s))
 
 
@@ -195,14 +195,14 @@ class FlightSteering(Steering):
     idle = ROTORS_OFF
 
     def __init__(self, descriptors: Sequence[int], now_ns: int) -> None:
-        steered, paths, commanded, flown = descriptors
-        super().__init__(steered, paths, now_ns)
-        self._commanded = FlightCommandRecord(commanded)
-        self._flown = FlightRecord(flown)
+        motion_record, paths, command_record, flight_record = descriptors
+        super().__init__(motion_record, paths, now_ns)
+        self._command_record = FlightCommandRecord(command_record)
+        self._flight_record = FlightRecord(flight_record)
 
     @override
     def _read_command(self) -> TimedCommand | None:
-        last = self._commanded.read()
+        last = self._command_record.read()
         if last is None or last.path_start_ns != self._reporter.path_start_ns:
             return None
         if not last.powered:
@@ -218,7 +218,7 @@ class FlightSteering(Steering):
         if flight is None:
             return
         place_m, roll_rad, pitch_rad, is_supported = flight
-        self._flown.write(
+        self._flight_record.write(
             FlightMotion(
                 at_ns,
                 self._reporter.path_start_ns,

@@ -34,7 +34,7 @@ table netdev fieldkit {{
     }}
 }}
 """
-"""As on robots (`wireless`), but for frames that the bridge forwards, which have no hook `output`."""
+"""The rules of robots (`wireless`), but for frames that the bridge forwards, which do not pass the hook `output`."""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
 """hwsim derives the times of beacons from one clock, so beacons of equal intervals would always collide."""
 _ENABLED: Final = "AP-ENABLED"
@@ -50,7 +50,7 @@ class AccessPoints:
 
     Args:
         radios: Radio of each access point, by its name.
-        wifi: Part of a station of the network, with its passphrase.
+        wifi: Wi-Fi settings of a station of the network, with the passphrase.
 
     Raises:
         RobotError: The kernel or hostapd refused a setting.

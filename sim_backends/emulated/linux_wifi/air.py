@@ -1,8 +1,8 @@
-"""The air between radios of Linux: each try of each frame, decided by the radio model.
+"""The air between radios of Linux: the radio model decides whether each try of a frame succeeds.
 
-Every channel in use has a separate radio model: frames on different channels do not interfere. hwsim does not report
-the channel to which a radio listens, so a radio is on the channel of its last frame, and on all channels before its
-first frame. On all channels the radio model uses the path loss of 2.4 GHz.
+Every channel in use has a separate radio model, because frames on different channels do not interfere. hwsim does not
+report the channel to which a radio listens. A radio is therefore assumed to be on the channel of its last frame, and
+on all channels before its first frame. On all channels the radio model uses the path loss of 2.4 GHz.
 """
 
 from collections.abc import Mapping
@@ -33,14 +33,14 @@ _ABSENT: Final = ""
 
 @dataclass(eq=False)
 class FrameOnAir:
-    """A frame from its transmission to its status.
+    """A frame, from its transmission until its status is reported.
 
     Attributes:
         sent: The frame.
         source: Name of its transmitter.
         receiver: Name of its receiver; None for a broadcast or multicast, `""` if no radio has the address.
-        chain: Its tries; one in the basic mode for a broadcast or multicast.
-        attempts: Tries made so far.
+        chain: Its tries; a broadcast or multicast has one, in the basic mode.
+        attempts: Number of tries that were made.
         acknowledged: True if an ACK was received.
         signal_dbm: Signal of that ACK, at the start of the try.
         mode: Mode of the last try that a receiver decoded.
@@ -125,7 +125,7 @@ class _ChannelGains(WorldChannel):
     channel: "_Channel"
 
     @override
-    def linked(self, transmitter: int, receiver: int) -> bool:
+    def are_linked(self, transmitter: int, receiver: int) -> bool:
         return True
 
     @override
@@ -240,7 +240,7 @@ class Air:
     def place(
         self, now_ns: int, places_m: Mapping[str, Vector], velocities_m_s: Mapping[str, Vector] | None = None
     ) -> None:
-        """Set the positions of the radios, metres east, north, up; a radio without one is out of range of all."""
+        """Set the positions of the radios, metres east, north, up; radios without a position are out of range."""
         self._places_m, self._velocities_m_s = dict(places_m), dict(velocities_m_s or {})
         for frequency_mhz in self._channels:
             self._place(now_ns, frequency_mhz)
@@ -259,12 +259,12 @@ class Air:
         if frequency_mhz not in self._channels:
             self._channels[frequency_mhz] = _Channel(*self._channel_arguments)
             self._place(now_ns, frequency_mhz)
-        left_mhz = self._tuned_mhz.get(source)
-        if left_mhz != frequency_mhz:
+        previous_mhz = self._tuned_mhz.get(source)
+        if previous_mhz != frequency_mhz:
             self._tuned_mhz[source] = frequency_mhz
-            others = self._channels if left_mhz is None else (left_mhz, frequency_mhz)
-            for other_mhz in others:
-                self._place(now_ns, other_mhz)
+            changed_mhz = self._channels if previous_mhz is None else (previous_mhz, frequency_mhz)
+            for channel_mhz in changed_mhz:
+                self._place(now_ns, channel_mhz)
         destination = None if sent.is_group else receiver if receiver not in {None, source} else _ABSENT
         if sent.is_group:
             chain = rate_chain((), frequency_mhz)
@@ -282,9 +282,9 @@ class Air:
         """Return the events up to `now_ns` that were not returned before; receptions of a channel are in order."""
         events = AirEvents()
         for channel in self._channels.values():
-            new = channel.pop_events(now_ns)
-            events.receptions += new.receptions
-            events.statuses += new.statuses
+            new_events = channel.pop_events(now_ns)
+            events.receptions += new_events.receptions
+            events.statuses += new_events.statuses
         return events
 
     def _place(self, now_ns: int, frequency_mhz: int) -> None:

@@ -37,7 +37,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
 
     Args:
         argv: The words after `fieldkit`.
-        results: Folder of the host that the command may change; it is created. Other changes are lost.
+        results: Folder of the host that the command may change, created if it is missing. Other changes are lost.
         radios: Number of radios.
 
     Returns:
@@ -52,7 +52,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
     # Ctrl-C interrupts the command in the machine, which finishes its repeat. A second Ctrl-C ends the machine.
     previous = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        ended = run_in_machine(
+        result = run_in_machine(
             kernel,
             prologue(Path.cwd()) + _COMMAND + shlex.join((*worker.command("fieldkit"), *argv)),
             Deadline.after(_LONGEST_S),
@@ -62,7 +62,7 @@ def run_command(argv: Sequence[str], results: Path, *, radios: int) -> int:
         )
     finally:
         signal.signal(signal.SIGINT, previous)
-    return ended.code
+    return result.code
 
 
 def prologue(folder: Path) -> str:

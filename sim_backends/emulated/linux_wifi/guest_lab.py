@@ -27,7 +27,7 @@ from sim_backends.emulated.robot.spec import USER
 Answer = TypeVar("Answer")
 
 _START_S: Final = 1800.0
-"""Time until the robots can be reached: boot, and their programs; with an emulated processor, 2 minutes if idle."""
+"""Maximum time until the robots can be reached. On an idle host with an emulated processor this takes 2 minutes."""
 _REPLY_S: Final = 15.0
 _POLL_S: Final = 0.5
 _MAX_ANSWER_BYTES: Final = 8 << 20
@@ -41,7 +41,7 @@ class GuestLab:
     """The robots of a lab in the machine.
 
     Args:
-        streams: ChannelStreams to `lab_relay` in the machine.
+        streams: Streams to `lab_relay` in the machine.
         members: The robots by name.
         check_alive: Raises an error if the machine has ended.
         draw: Returns the plan view for the positions of the robots.
@@ -157,24 +157,24 @@ def bring_up(
         site: Content of its site file.
         seed: Seed of all random numbers of the lab.
         radios: Number of radios.
-        draw: As for `GuestLab`.
+        draw: See `GuestLab`.
 
     Raises:
         ConfigurationError: A program, or the kernel of the machine, is not installed.
         TestbedLostError: The machine, or the lab in it, ended.
     """
     kernel = require_machine()
-    ours, of_machine = socket.socketpair()
-    with ours, of_machine:
+    host_end, machine_end = socket.socketpair()
+    with host_end, machine_end:
         script = _script(site, Path.cwd(), seed)
-        with started_machine(kernel, script, radios=radios, channel=of_machine) as machine:
-            streams = ChannelStreams(ours.fileno())
+        with started_machine(kernel, script, radios=radios, channel=machine_end) as machine:
+            streams = ChannelStreams(host_end.fileno())
             reader = threading.Thread(target=streams.run, name="machine", daemon=True)
             reader.start()
             try:
                 yield GuestLab(streams, members, lambda: _check(machine), draw, Deadline.after(_START_S))
             finally:
-                ours.shutdown(socket.SHUT_RDWR)
+                host_end.shutdown(socket.SHUT_RDWR)
                 reader.join()
 
 

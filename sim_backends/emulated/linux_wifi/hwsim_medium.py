@@ -63,7 +63,7 @@ class MediumCounts:
 
 
 class HwsimMedium:
-    """Decides the frames of all radios.
+    """Passes the frames of all radios through the air, and reports the results to the kernel.
 
     Args:
         air: The air.
@@ -85,7 +85,7 @@ class HwsimMedium:
         self._address_counts = Counter(self._by_address.values())
 
     def receive(self, now_ns: int, message: NetlinkMessage) -> None:
-        """Accept a message from the kernel at `now_ns`; a malformed one is counted."""
+        """Accept a message from the kernel at `now_ns`. Malformed messages are counted and ignored."""
         try:
             if message.type == NLMSG_ERROR:
                 self.counts.errors[message.error_number] += 1
@@ -103,8 +103,8 @@ class HwsimMedium:
     def replies(self, now_ns: int) -> list[bytes]:
         """Return the messages for the kernel that are due at `now_ns`, in order."""
         events = self.air.pop_events(now_ns)
-        messages = [self._received(reception) for reception in events.receptions]
-        messages += [self._status(frame) for frame in events.statuses]
+        messages = [self._reception_message(reception) for reception in events.receptions]
+        messages += [self._status_message(frame) for frame in events.statuses]
         return [message for message in messages if message is not None]
 
     def _transmit(self, now_ns: int, sent: SentFrame) -> None:
@@ -139,14 +139,14 @@ class HwsimMedium:
         if name is not None:
             self._address_counts[name] -= 1
 
-    def _received(self, reception: FrameReception) -> bytes | None:
+    def _reception_message(self, reception: FrameReception) -> bytes | None:
         frame = reception.frame
         self._totals(frame.source, reception.receiver).signal_dbm = reception.signal_dbm
         rate_index = legacy_index(reception.mode, frame.sent.frequency_mhz)
         radio = self._radio_of[reception.receiver]
         return encode_received(frame.sent, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
 
-    def _status(self, frame: FrameOnAir) -> bytes:
+    def _status_message(self, frame: FrameOnAir) -> bytes:
         tries = frame.chain.tries_made(frame.attempts)
         if frame.receiver:
             totals = self._totals(frame.source, frame.receiver)

@@ -106,12 +106,12 @@ class SentFrame:
 
 @dataclass(frozen=True)
 class InterfaceAddress:
-    """An interface of a radio that got an address, or lost it.
+    """An address that was added to, or removed from, an interface of a radio.
 
     Attributes:
         radio: The radio.
         address: MAC address of the interface.
-        added: False if it lost the address.
+        added: False if the address was removed.
     """
 
     radio: RadioAddress

@@ -5,10 +5,10 @@ from sim_backends.emulated.linux_wifi.netlink import FamilySocket
 
 
 def open_registered(fd: int | None = None) -> FamilySocket:
-    """Return a socket that is the medium of all radios in the network namespace.
+    """Return a socket that is registered as the medium of all radios in the network namespace.
 
     Args:
-        fd: Descriptor of a socket that is registered; None to open and register one.
+        fd: Descriptor of a socket that is already registered; None to open and register one.
 
     Raises:
         ConfigurationError: The kernel has no hwsim.

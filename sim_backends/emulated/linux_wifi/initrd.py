@@ -140,9 +140,9 @@ def without_signature(module: bytes) -> bytes:
 
 
 def shared_libraries(program: Path) -> list[Path]:
-    """Return the libraries of a program, including the dynamic linker, as `ldd` lists them; none if it is static."""
-    listed = subprocess.run(("/usr/bin/ldd", program), capture_output=True, text=True, check=False, timeout=60)
-    return [Path(match) for match in re.findall(r"(/\S+) \(0x", listed.stdout)]
+    """Return the libraries of a program, including the dynamic linker, as `ldd` lists them; empty if it is static."""
+    result = subprocess.run(("/usr/bin/ldd", program), capture_output=True, text=True, check=False, timeout=60)
+    return [Path(match) for match in re.findall(r"(/\S+) \(0x", result.stdout)]
 
 
 def cpio_archive(files: Mapping[str, tuple[int, bytes]], folders: Iterable[str]) -> bytes:

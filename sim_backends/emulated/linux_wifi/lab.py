@@ -1,4 +1,4 @@
-"""Wi-Fi of Linux in an emulated lab: the part of each robot in the network, its radio, and their medium."""
+"""Wi-Fi of Linux in an emulated lab: the Wi-Fi settings of each robot, its radio, and the medium of all radios."""
 
 import secrets
 from collections.abc import Iterable, Mapping
@@ -20,13 +20,13 @@ Key = TypeVar("Key")
 _PASSPHRASE_BYTES = 12
 
 
-def parts(
+def wifi_specs(
     robots: Mapping[Key, Robot | LabRobot], settings: LinuxWifiOptions, radio: RadioOptions
 ) -> dict[Key, WifiSpec]:
-    """Return the part of each robot.
+    """Return the Wi-Fi settings of each robot.
 
-    In a mesh, all are mesh points. With access points that are not robots, all are their stations. Otherwise the
-    relay of a trial runs the access point; without a relay, all are ad hoc.
+    In a mesh, all robots are mesh points. If there are access points that are not robots, all robots are stations of
+    these. Otherwise the relay of a trial runs the access point; without a relay, all robots are ad hoc.
     """
     if settings.mesh:
         return dict.fromkeys(robots, WifiSpec("mesh point", has_monitor=settings.monitor))
@@ -41,7 +41,7 @@ def parts(
 
 
 def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict[str, HwsimRadio]:
-    """Return the radio of each robot and access point by its name; errors as `require_radios`."""
+    """Return the radio of each robot and access point by its name; raises the errors of `require_radios`."""
     names = [*(robot.name for robot in robots), *options.access_points]
     return dict(zip(names, require_radios(len(names)), strict=True))
 
@@ -49,5 +49,5 @@ def radios_of(robots: Iterable[Robot | LabRobot], options: RadioOptions) -> dict
 def medium(
     options: RadioOptions, world: World, seed: int, radios: Mapping[str, HwsimRadio], wifi: Iterable[WifiSpec]
 ) -> WifiClient:
-    """Return the medium of the robots' radios, with the parts of the robots; errors as `WifiClient`."""
+    """Return the medium of the radios, for robots with these settings; raises the errors of `WifiClient`."""
     return WifiClient(options, world, seed=seed, radios=radios, station=next(iter(wifi)))

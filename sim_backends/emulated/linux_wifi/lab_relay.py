@@ -1,4 +1,4 @@
-"""In the virtual machine: connections of the host to the lab of a folder, `python -m ... PATTERN FOLDER`.
+"""Program in the virtual machine that connects the host to the lab of a folder: `python -m ... PATTERN FOLDER`.
 
 Each stream of the channel is one connection to the lab's socket: a request and its answer. The request `login` is
 answered from the lab's files. After `connect ROBOT` the stream is a connection to the SSH server of the robot.
@@ -42,7 +42,7 @@ class GuestLogin:
 
 
 def main(pattern: str, directory: str) -> None:
-    """Serve the channel, the first device that matches a pattern, until it ends."""
+    """Serve the channel, which is the first device that matches a pattern, until it ends."""
     lab = of_directory(Path(directory))
     _wait_for_login(lab)
     relay(os.open(glob.glob(pattern)[0], os.O_RDWR), lab)  # noqa: PTH207 (an absolute pattern)
@@ -76,7 +76,7 @@ def serve(stream: socket.socket, lab: LabFolder) -> None:
         with socket.socket(fileno=descriptors[0]) as robot:
             robot.settimeout(None)
             stream.sendall(CONNECTED)
-            _join(stream, robot)
+            _copy_both_ways(stream, robot)
 
 
 def _wait_for_login(lab: LabFolder) -> None:
@@ -103,12 +103,12 @@ def _read_line(stream: socket.socket) -> bytes:
     return line[:-1]
 
 
-def _join(first: socket.socket, second: socket.socket) -> None:
+def _copy_both_ways(first: socket.socket, second: socket.socket) -> None:
     """Copy the bytes of each socket to the other until both have ended."""
-    back = threading.Thread(target=_copy, args=(second, first), daemon=True)
-    back.start()
+    reverse = threading.Thread(target=_copy, args=(second, first), daemon=True)
+    reverse.start()
     _copy(first, second)
-    back.join()
+    reverse.join()
 
 
 def _copy(source: socket.socket, destination: socket.socket) -> None:

@@ -1,15 +1,15 @@
 """The medium as a process: `python -m sim_backends.emulated.linux_wifi.medium_program [CHANNEL] [--fd FD]`, as root.
 
-It becomes the medium of all radios of mac80211_hwsim in its network namespace. It reads requests, one JSON object per
-line, and answers each with one: on the socket with the descriptor CHANNEL, or on standard input and output. The first
-one is `MediumSetup`; then
+It registers as the medium of all radios of mac80211_hwsim in its network namespace. It reads requests from the socket
+with the descriptor CHANNEL, or from standard input, and writes the replies to that socket or to standard output.
+Requests and replies are JSON objects, one per line. The first request is `MediumSetup`. Later requests are
 
     {"do": "place", "positions": {"r1": [0, 0, 1]}, "velocities": {}}
     {"do": "totals"}
 
-It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim delivers all
-frames again without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open,
-and passes its descriptor with `--fd`: if the medium is killed, no frame is delivered, and a new medium continues.
+It exits when the requests end. When the last descriptor of the registered socket is closed, hwsim again delivers all
+frames without loss. A supervisor therefore opens the socket with `hwsim_socket.open_registered`, keeps it open, and
+passes its descriptor with `--fd`. If the medium is then killed, no frame is delivered until a new medium continues.
 """
 
 import argparse
@@ -127,7 +127,7 @@ class RequestLines:
         self._buffer = b""
 
     def read(self) -> Iterator[bytes]:
-        """Read once, which blocks if nothing is there, and yield the complete lines.
+        """Wait for data, read once, and yield the complete lines.
 
         Raises:
             ValueError: A line is too long.
@@ -141,7 +141,7 @@ class RequestLines:
 
 
 def serve(kernel: KernelSocket, requests: RequestLines, reply_fd: int) -> None:
-    """Decide frames and answer requests until there are no more requests."""
+    """Carry frames and answer requests until there are no more requests."""
     medium: HwsimMedium | None = None
     timer = Timer()
     epoll = select.epoll()

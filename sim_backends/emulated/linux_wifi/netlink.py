@@ -167,7 +167,7 @@ class FamilySocket:
 
     Attributes:
         overruns: Number of times that the kernel dropped messages because the socket was full.
-        foreign: Datagrams from other processes than the kernel, which are ignored.
+        foreign: Number of datagrams that other processes than the kernel sent; they are ignored.
 
     Raises:
         ConfigurationError: The kernel does not have the family.

@@ -41,10 +41,10 @@ class HwsimRadio:
     monitors: tuple[str, ...] = ()
 
     def move_to_namespace(self, pid: int) -> None:
-        """Move the radio into the network namespace of a process; it returns when the namespace ends.
+        """Move the radio into the network namespace of a process; the kernel moves it back when the namespace ends.
 
         Raises:
-            RobotError: The kernel refused it.
+            RobotError: The kernel refused the move.
         """
         for monitor in self.monitors:
             self._run("dev", monitor, "del")
@@ -52,9 +52,9 @@ class HwsimRadio:
 
     def _run(self, *words: str) -> None:
         argv = (shutil.which("iw", path=PATH) or "iw", *words)
-        ended = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
-        if ended.returncode:
-            cause = ended.stderr.strip()
+        result = subprocess.run(argv, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+        if result.returncode:
+            cause = result.stderr.strip()
             raise RobotError(f"cannot move {self.phy} to a robot: {cause}", remedy="start the lab again")
 
 
@@ -84,10 +84,10 @@ def runs_here() -> bool:
 
 
 def require_radios(count: int, wait_s: float = _RETURN_S) -> list[HwsimRadio]:
-    """Return this number of radios.
+    """Return the first `count` radios.
 
     Args:
-        count: The number.
+        count: Number of radios.
         wait_s: Maximum time to wait for radios of a lab that has just ended.
 
     Raises:

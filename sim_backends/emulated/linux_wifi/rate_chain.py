@@ -37,39 +37,40 @@ class RateChain:
         modes: Mode of each try.
         stages: For each try, the number of its stage.
         skipped: For each stage, True if its mode is not in the radio model.
-        declared: Number of tries of each stage in the chain.
+        max_tries: For each stage, the number of tries that the chain has for it.
     """
 
     modes: tuple[WifiMode, ...]
     stages: tuple[int, ...]
     skipped: tuple[bool, ...]
-    declared: tuple[int, ...]
+    max_tries: tuple[int, ...]
 
     def tries_made(self, attempts: int) -> list[int]:
         """Return the number of tries in each stage, after this number of attempts on the air.
 
-        Skipped stages before the last attempt count as tried and failed; all stages do if none is in the radio model.
+        Skipped stages before the last attempt count as tried and failed. If no stage is in the radio model, all
+        stages count as tried and failed.
         """
         last = self.stages[attempts - 1] if attempts else len(self.skipped) - 1
         on_air = Counter(self.stages[:attempts])
-        return [self.declared[stage] if self.skipped[stage] else on_air[stage] for stage in range(last + 1)]
+        return [self.max_tries[stage] if self.skipped[stage] else on_air[stage] for stage in range(last + 1)]
 
 
 def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: int = SHORT_RETRY_LIMIT) -> RateChain:
-    """Return the tries of a chain of stages, at most `max_tries`; without a stage there is one in the basic mode."""
-    used = list(stages) or [RateStage(0, 1)]
+    """Return the tries of a chain of stages, at most `max_tries`; without stages, one try in the basic mode."""
+    used_stages = list(stages) or [RateStage(0, 1)]
     modes: list[WifiMode] = []
     numbers: list[int] = []
     skipped = []
-    for number, stage in enumerate(used):
+    for number, stage in enumerate(used_stages):
         mode = mode_of(stage, frequency_mhz)
         skipped.append(mode is None)
         if mode is not None:
             tries = min(max(stage.tries, 1), max_tries - len(modes))
             modes += [mode] * tries
             numbers += [number] * tries
-    declared = tuple(max(stage.tries, 1) for stage in used)
-    return RateChain(tuple(modes), tuple(numbers), tuple(skipped), declared)
+    max_stage_tries = tuple(max(stage.tries, 1) for stage in used_stages)
+    return RateChain(tuple(modes), tuple(numbers), tuple(skipped), max_stage_tries)
 
 
 def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
@@ -86,7 +87,10 @@ def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:
 
 
 def legacy_index(mode: WifiMode, frequency_mhz: int) -> int:
-    """Return a mode's index in the list of the band; for an MCS, of the rate with equal modulation and code rate."""
+    """Return the index of a mode in the rate list of the band.
+
+    For an MCS this is the index of the rate with the same modulation and code rate.
+    """
     coding = (mode.modulation, mode.code_rate)
     indices = [index for index, g_mode in enumerate(G_MODES) if (g_mode.modulation, g_mode.code_rate) == coding]
     index = indices[0] if indices else len(G_MODES) - 1

@@ -1,4 +1,4 @@
-"""Many byte streams over one: a lab's connections to a virtual machine over its only channel.
+"""Multiplexing: the connections of a lab to a virtual machine, as many byte streams over the machine's only channel.
 
 A frame has the number of its stream, its kind and its length, then data. The host opens streams; a stream ends when
 both sides have sent END. Frames with an invalid header end the channel: the other side is not trusted.
@@ -20,11 +20,11 @@ _OPEN, _DATA, _END = range(3)
 _CHUNK_BYTES: Final = 1 << 15
 _MAX_STREAMS: Final = 256
 _MAX_PENDING: Final = 2048
-"""Frames that wait for a slow reader; with more, its stream is cut."""
+"""Maximum number of frames that wait for a slow reader; if there are more, its stream is closed."""
 
 
 class _ChannelStream:
-    """One stream: a socket pair, whose near end other code uses, and the waiting frames for it."""
+    """One stream: a socket pair, whose near end is given to the user of the stream, and received frames."""
 
     def __init__(self) -> None:
         self.near, self.far = socket.socketpair()

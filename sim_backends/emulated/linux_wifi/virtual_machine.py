@@ -37,7 +37,7 @@ PACKAGE_OF: Final = {
     "hostapd": "hostapd",
     "wpa_supplicant": "wpasupplicant",
 }
-"""Debian package per program."""
+"""Debian package of each program."""
 
 ROOT_VARIABLE: Final = "FIELDKIT_WIFI_ROOT"
 """Environment variable with a folder in which packages were extracted instead of being installed."""
@@ -140,7 +140,7 @@ def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
         roots: Folders with `boot/`, `lib/modules/` and programs; None for the folders of `kernel_roots`.
 
     Raises:
-        ConfigurationError: The kernel or a program is missing; the message names all that is.
+        ConfigurationError: The kernel or a program is missing; the message lists everything that is missing.
     """
     roots = kernel_roots() if roots is None else roots
     missing = {name: package for name, package in PACKAGE_OF.items() if find_program(name, roots) is None}
@@ -150,7 +150,7 @@ def require_machine(roots: Sequence[Path] | None = None) -> Kernel:
     if kernel is None or missing:
         packages = " ".join(sorted(missing.values()))
         raise ConfigurationError(
-            f"Linux's Wi-Fi needs what is not installed: {', '.join(missing)}",
+            f"Linux's Wi-Fi needs programs that are not installed: {', '.join(missing)}",
             remedy=f"on Debian, as root: apt-get install --no-install-recommends {packages}",
         )
     return kernel
@@ -180,24 +180,24 @@ class Machine:
 
         Raises:
             TestbedLostError: The machine did not run the script to its end before the deadline.
-            KeyboardInterrupt: Raised for the second time.
+            KeyboardInterrupt: A second KeyboardInterrupt arrived.
         """
         is_interrupted = False
         while not self._has_ended(min(_POLL_S, deadline.remaining_s), is_interrupted=is_interrupted):
             on_output(self.new_output())
             if deadline.expired:
-                raise self.lost("did not switch off in time")
+                raise self.lost_error("did not switch off in time")
             is_interrupted = is_interrupted or (self._folder / "shared" / Path(INTERRUPT).name).exists()
         on_output(self.new_output())
         code = self._folder / "shared" / f"{_OUTPUT}.code"
         if not code.exists():
-            raise self.lost("ended before its script")
+            raise self.lost_error("ended before its script")
         return JobResult(int(code.read_text(encoding="ascii")), _read_text(self._folder / "shared" / _OUTPUT))
 
     def check_alive(self) -> None:
         """Raise TestbedLostError if the machine has ended."""
         if self._process.poll() is not None:
-            raise self.lost("ended")
+            raise self.lost_error("ended")
 
     def new_output(self) -> bytes:
         """Return the output of the script since the last call."""
@@ -210,7 +210,7 @@ class Machine:
         self._reported_bytes += len(data)
         return data
 
-    def lost(self, cause: str) -> TestbedLostError:
+    def lost_error(self, cause: str) -> TestbedLostError:
         """Return the error for a machine that cannot be used, with the last line of its output."""
         texts = [_read_text(self._folder / name).strip() for name in (f"shared/{_OUTPUT}", "console", "errors")]
         last_line = next((text.rsplit("\n", 1)[-1] for text in texts if text), "")
@@ -253,8 +253,8 @@ def started_machine(
         script: The script.
         radios: Number of radios of hwsim.
         memory_mib: Memory of the machine.
-        results: An existing folder of the host in which the machine writes files; None for none.
-        channel: A stream socket that is the device `CHANNEL` in the machine; None for none.
+        results: An existing folder of the host in which the machine writes files, or None.
+        channel: A stream socket that becomes the device `CHANNEL` in the machine, or None.
 
     Raises:
         ConfigurationError: A file of the machine is missing.
@@ -299,15 +299,15 @@ def run_in_machine(
 ) -> JobResult:
     """Run a shell script as root in a new machine, and return its result.
 
-    Args and errors as `started_machine` and `Machine.wait`.
+    Arguments and errors are those of `started_machine` and `Machine.wait`.
     """
     with started_machine(kernel, script, radios=radios, memory_mib=memory_mib, results=results) as machine:
         return machine.wait(deadline, on_output)
 
 
 def _mount_command(results: Path) -> str:
-    place = shlex.quote(str(results))
-    return f"mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 {_RESULTS} {place} || exit\n"
+    folder = shlex.quote(str(results))
+    return f"mount -t 9p -o trans=virtio,version=9p2000.L,msize=524288 {_RESULTS} {folder} || exit\n"
 
 
 def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[str]:

@@ -21,13 +21,14 @@ from sim_backends.world.world import World
 
 
 class WifiClient(MediumClient):
-    """Starts the medium of hwsim's radios, and access points that are not robots. Arguments as `MediumClient`.
+    """Starts the medium of hwsim's radios, and access points that are not robots.
 
-    This object keeps the registered socket open. If the medium is killed or suspended, no frame is delivered.
+    Arguments that are not described are those of `MediumClient`. This object keeps the registered socket open. If the
+    medium is killed or suspended, no frame is delivered.
 
     Args:
         radios: Radio of each robot and access point, by its name.
-        station: Part of the robots that are stations of these access points.
+        station: Wi-Fi settings of the robots that are stations of these access points.
 
     Raises:
         ConfigurationError: The kernel has no hwsim, or a program of util-linux is missing.
@@ -88,7 +89,7 @@ class WifiClient(MediumClient):
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
     ) -> None:
-        """Implement `MediumClient.place`; access points that are not named are at their own positions."""
+        """Implement `MediumClient.place`; other access points are at their positions in the site file."""
         self._robots |= self._access_points_m.keys()
         super().place({**self._access_points_m, **positions_m}, relay=relay, velocities_m_s=velocities_m_s)
 

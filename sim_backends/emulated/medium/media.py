@@ -21,8 +21,8 @@ class Media:
     radio: MediumClient
     links: Mapping[str, MediumClient]
 
-    def of(self, link: str) -> MediumClient:
-        """Return the medium of a link; of the radio under test if it is not a further link."""
+    def medium_of(self, link: str) -> MediumClient:
+        """Return the medium of a further link, or of the radio under test if no further link has this name."""
         return self.links.get(link, self.radio)
 
     def place(
@@ -32,20 +32,24 @@ class Media:
         relay: str | None = None,
         velocities_m_s: Mapping[str, Vector] = MappingProxyType({}),
     ) -> None:
-        """Place the robots in all media; arguments and errors as `MediumClient.place`. Only the radio has a relay."""
+        """Place the robots in all media. Only the radio under test has a relay.
+
+        Arguments and errors are those of `MediumClient.place`.
+        """
         self.radio.place(positions_m, relay=relay, velocities_m_s=velocities_m_s)
         for medium in self.links.values():
-            here_m = {name: place_m for name, place_m in positions_m.items() if name in medium.attached}
+            attached_m = {name: place_m for name, place_m in positions_m.items() if name in medium.robot_names}
             medium.place(
-                here_m, velocities_m_s={name: velocities_m_s[name] for name in here_m if name in velocities_m_s}
+                attached_m,
+                velocities_m_s={name: velocities_m_s[name] for name in attached_m if name in velocities_m_s},
             )
 
-    def late(self) -> Mapping[int, int]:
-        """Return the late packets in all media by lateness in nanoseconds. Errors as `MediumClient.stats`."""
-        late: Counter[int] = Counter()
+    def lateness_counts(self) -> Mapping[int, int]:
+        """Return the number of packets of all media by lateness in ns. Raises the errors of `MediumClient.stats`."""
+        counts: Counter[int] = Counter()
         for medium in (self.radio, *self.links.values()):
-            late.update(medium.stats().late)
-        return late
+            counts.update(medium.stats().late)
+        return counts
 
     def check_alive(self) -> None:
         """Raise the errors of `Worker.check_alive` if a medium does not run."""

@@ -44,7 +44,7 @@ class MediumClient:
     ) -> None:
         self._options = options
         self._world = world
-        self._configured = False
+        self._is_configured = False
         self._words = str(seed), framing.name
         self._worker = self._start()
         self._robots: set[str] = set()
@@ -64,7 +64,7 @@ class MediumClient:
         return self._worker.pid
 
     @property
-    def attached(self) -> Set[str]:
+    def robot_names(self) -> Set[str]:
         """Names of the attached robots."""
         return self._robots
 
@@ -86,11 +86,11 @@ class MediumClient:
             fd: Descriptor of its device, or of a packet socket: each read returns one framed packet, and each write
                 accepts one. The medium gets a copy; the caller closes this descriptor. None for a radio of the
                 kernel, which has no device.
-            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics; others ignore it.
+            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics; other media ignore them.
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: A robot with that name or address is attached already.
+            RobotError: A robot with this name or address is already attached.
         """
         antenna = asdict(antenna_of(radio))
         self._worker.request(
@@ -125,9 +125,9 @@ class MediumClient:
                 f"robots without a radio or a place: {', '.join(sorted(map(str, unknown)))}",
                 remedy="attach every robot, and give the relay a position",
             )
-        if not self._configured:
+        if not self._is_configured:
             self._configure()
-            self._configured = True
+            self._is_configured = True
         velocities = dict(velocities_m_s)
         self._worker.request({"do": "place", "positions": positions_m, "relay": relay, "velocities": velocities})
 
@@ -167,7 +167,7 @@ class MediumClient:
 
         Raises:
             LinkError: The medium ended or did not answer.
-            RobotError: No robot of that name is attached.
+            RobotError: No robot with this name is attached.
         """
         request = {"do": "delays", "source": source, "destination": destination, "protocol": protocol, "port": port}
         reply, _ = self._worker.request(request)

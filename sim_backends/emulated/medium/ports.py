@@ -19,16 +19,16 @@ FlowKey = bytes
 
 
 class FlowDelays:
-    """Delay sums of the flows that were requested, each since its first request.
+    """Sums of the delays of each requested flow since the first request for it.
 
-    For other flows the cost is one lookup in `counted`, which is empty until the first request.
+    For other flows the cost is one lookup in `delays_by_flow`, which is empty until the first request.
 
     Attributes:
-        counted: Sum of the delays of each requested flow.
+        delays_by_flow: Sum of the delays of each requested flow.
     """
 
     def __init__(self) -> None:
-        self.counted: dict[FlowKey, Delay] = {}
+        self.delays_by_flow: dict[FlowKey, Delay] = {}
         # Only the first fragment has a port: it maps the identification of its datagram to the flow.
         self._datagrams: dict[bytes, FlowKey] = {}
 
@@ -42,7 +42,7 @@ class FlowDelays:
             port: Destination port.
         """
         key = bytes((protocol,)) + source.packed + destination.packed + port.to_bytes(2, "big")
-        return delay_parts(self.counted.setdefault(key, 0))
+        return delay_parts(self.delays_by_flow.setdefault(key, 0))
 
     def note_first_fragment(self, packet: bytes) -> None:
         """Store the flow of a datagram when its first fragment is sent; other packets are ignored.
@@ -51,7 +51,7 @@ class FlowDelays:
         """
         if packet[6] & _MORE_FRAGMENTS and not (packet[6] & _OFFSET or packet[7]):
             key, datagram = _key(packet), _datagram(packet)
-            if key in self.counted:
+            if key in self.delays_by_flow:
                 self._datagrams[datagram] = key
             else:
                 # The identification is reused after 65,536 datagrams.
@@ -63,10 +63,10 @@ class FlowDelays:
         The packet is counted if `receiver`, an address, is its destination. Any other receiver forwards it: the delay
         of that hop is added, even if the packet is lost on a later hop.
         """
-        is_later = packet[6] & _OFFSET or packet[7]
-        key = self._datagrams.get(_datagram(packet)) if is_later else _key(packet)
-        if key in self.counted:
-            self.counted[key] += delay if packet[16:20] == receiver else delay - PACKET
+        is_later_fragment = packet[6] & _OFFSET or packet[7]
+        key = self._datagrams.get(_datagram(packet)) if is_later_fragment else _key(packet)
+        if key in self.delays_by_flow:
+            self.delays_by_flow[key] += delay if packet[16:20] == receiver else delay - PACKET
 
 
 def _key(packet: bytes) -> FlowKey:
@@ -106,13 +106,13 @@ class MediumStats:
 
     Attributes:
         scheduling: `fifo 1`, or the reason why the process has no real-time priority.
-        late: Number of packets per lateness in ns, rounded by `rounded_up`. Lateness is the longest time that the
+        late: Number of packets per lateness in ns, rounded by `round_up`. Lateness is the longest time that the
             packet can have waited to be read, plus the time from its arrival by the model until it was written.
         links: Counters per directed link.
         ports: Counters per robot.
         delays: Delays of the packets written to a robot, per pair of sender and receiver; lateness is counted as
             processing delay.
-        late_windows: Number of windows of a co-simulation per lateness in ns, rounded by `rounded_up`: the time from
+        late_windows: Number of windows of a co-simulation per lateness in ns, rounded by `round_up`: the time from
             the end of the window until its packets were written. Empty for a medium without windows.
     """
 
@@ -148,9 +148,9 @@ def unpack_stats(message: Message) -> MediumStats:
     )
 
 
-def pack_links(sampled: Iterable[Mapping[str, LinkSample]]) -> Message:
-    """Return the message for link samples, each a mapping by robot."""
-    return {"links": [[name, astuple(sample)] for samples in sampled for name, sample in samples.items()]}
+def pack_links(samples: Iterable[Mapping[str, LinkSample]]) -> Message:
+    """Return the message for link samples; each item of `samples` maps robots to their samples at one time."""
+    return {"links": [[name, astuple(sample)] for by_robot in samples for name, sample in by_robot.items()]}
 
 
 def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
@@ -162,7 +162,7 @@ def unpack_links(message: Message) -> dict[str, list[LinkSample]]:
     return links
 
 
-def rounded_up(late_ns: int) -> int:
+def round_up(late_ns: int) -> int:
     """Return the smallest number above `late_ns` with at most 4 significant bits; it is at most 1/8 larger."""
     shift = late_ns.bit_length() - _KEPT_BITS
     return late_ns + 1 if shift <= 0 else ((late_ns >> shift) + 1) << shift
@@ -185,10 +185,10 @@ class Port:
         self.refused = 0
         self.unroutable = 0
         self.not_ipv4 = 0
-        # How many of the packets that are read next may have waited in the device since `backlog_since_ns`.
+        # Number of the next packets that may have waited in the device since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
-        # Delays of the written packets, by the robot that sent them; packets not written are counted by `refused`.
+        # Delays of the written packets, by the robot that sent them. `refused` counts packets that were not written.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
         self.routes: Routes = {}
 
@@ -198,6 +198,6 @@ class Port:
 
     @property
     def counters(self) -> PortCounters:
-        """The counters so far."""
+        """The current counters."""
         written = sum(delay.packets for delay in self.delay_parts().values())
         return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)

@@ -17,7 +17,7 @@ from typing_extensions import override
 
 from fieldkit.core.model import LinkSample, Vector
 from sim_backends.emulated.medium.framing import FRAMINGS, NO_ROBOT, Framing
-from sim_backends.emulated.medium.ports import Port, rounded_up
+from sim_backends.emulated.medium.ports import Port, round_up
 from sim_backends.emulated.medium.server import (
     BURST,
     DEVICE_PACKETS,
@@ -35,16 +35,17 @@ _MAX_SLEEP_NS: Final = 10_000_000
 
 
 class Medium(MediumServer):
-    """Moves packets between ports through a radio model. Arguments as `MediumServer`."""
+    """Moves packets between ports through a radio model. Arguments are those of `MediumServer`."""
 
     def __init__(self, seed: int, framing: Framing, channel: socket.socket) -> None:
         super().__init__(seed, framing, channel)
         self._model: RadioModel[bytes] = UniformLinks(seed, self._options)
-        self._modelled_ports = 0
-        self._prioritized = False
-        # A device with packets was empty at the earlier time, if the previous round read all of them.
+        self._ports_in_model = 0
+        self._has_priorities = False
+        # A device that has packets now was still empty at `_arrived_after_ns`, if the previous round read all
+        # packets.
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
-        self._armed_ns: int | None = None
+        self._timer_ns: int | None = None
 
     def run(self) -> None:
         """Carry packets and answer requests until the owner closes the socket."""
@@ -64,7 +65,7 @@ class Medium(MediumServer):
                 self._sample()
 
     def _wait(self) -> list[tuple[int, int]]:
-        """Wait for packets, requests or the timer, and note the earliest time at which the packets can have arrived.
+        """Wait for packets, requests or the timer; store the earliest time at which the packets can have arrived.
 
         Packets that are ready immediately arrived after the previous poll. Packets that wake the process have not
         waited, unless it slept longer than the poll's timeout.
@@ -83,15 +84,16 @@ class Medium(MediumServer):
         fd, name, routes, send, clock_ns = port.fd, port.name, port.routes, self._model.send, time.monotonic_ns
         if port.backlog <= 0:
             port.backlog, port.backlog_since_ns = DEVICE_PACKETS, self._arrived_after_ns
-        flows, requested = self._flows, self._flows.counted
-        framing, prioritized = self._framing, self._prioritized
+        flows, requested_flows = self._flows, self._flows.delays_by_flow
+        framing, has_priorities = self._framing, self._has_priorities
         carries, destination_of, header_bytes = framing.carries, framing.destination, framing.header_bytes
-        # Added to the time of reading, this is the delay of one packet that has waited since `backlog_since_ns`.
-        waited = PACKET - port.backlog_since_ns
+        # The sum of this value and the time of reading is the delay of one packet that has waited since
+        # `backlog_since_ns`.
+        delay_offset = PACKET - port.backlog_since_ns
         for _ in range(BURST):
             try:
                 packet = os.read(fd, READ_BYTES)
-                carried = carries(packet)
+                is_carried = carries(packet)
             except BlockingIOError:
                 port.backlog = 0
                 return
@@ -100,31 +102,32 @@ class Medium(MediumServer):
                 self._epoll.unregister(fd)
                 return
             port.read += 1
-            if not carried:
+            if not is_carried:
                 port.not_ipv4 += 1
                 continue
             destination = destination_of(packet, routes)
             if destination == NO_ROBOT:
                 port.unroutable += 1
                 continue
-            if requested and (inner := framing.ipv4(packet)) is not None:
+            if requested_flows and (inner := framing.ipv4(packet)) is not None:
                 flows.note_first_fragment(inner)
             now_ns = clock_ns()
-            if prioritized and (inner := framing.ipv4(packet)) is not None:
+            delay = delay_offset + now_ns
+            if has_priorities and (inner := framing.ipv4(packet)) is not None:
                 dscp = inner[1] >> 2
-                send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns, dscp=dscp)
+                send(now_ns, name, packet, len(packet) - header_bytes, destination, before=delay, dscp=dscp)
                 continue
-            send(now_ns, name, packet, len(packet) - header_bytes, destination, before=waited + now_ns)
+            send(now_ns, name, packet, len(packet) - header_bytes, destination, before=delay)
         port.backlog -= BURST
 
     def _deliver(self) -> None:
         """Write arrived packets to the robots, and set the timer to the next arrival."""
         now_ns = time.monotonic_ns()
-        arrived = self._model.deliveries(now_ns)
-        if arrived:
+        deliveries = self._model.deliveries(now_ns)
+        if deliveries:
             ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
-            flows, requested = self._flows, self._flows.counted
-            for at_ns, name, packet, source, delayed in arrived:
+            flows, requested_flows = self._flows, self._flows.delays_by_flow
+            for at_ns, name, packet, source, delay in deliveries:
                 port = ports[name]
                 try:
                     write(port.fd, packet)
@@ -133,22 +136,22 @@ class Medium(MediumServer):
                     port.refused += 1
                     continue
                 late_ns = clock_ns() - at_ns
-                port.delays[source] += delayed + late_ns
-                if requested and (inner := self._framing.ipv4(packet)) is not None:
-                    flows.count(inner, delayed + late_ns, port.address.packed)
-                late[rounded_up(late_ns + processing_ns(delayed))] += 1
+                port.delays[source] += delay + late_ns
+                if requested_flows and (inner := self._framing.ipv4(packet)) is not None:
+                    flows.count(inner, delay + late_ns, port.address.packed)
+                late[round_up(late_ns + processing_ns(delay))] += 1
         next_ns = self._model.next_event_ns()
-        if next_ns is not None and next_ns != self._armed_ns:
+        if next_ns is not None and next_ns != self._timer_ns:
             self._timer.set(next_ns)
-            self._armed_ns = next_ns
+            self._timer_ns = next_ns
 
     @override
     def _place_stations(self, positions_m: dict[str, Vector], relay: str | None) -> None:
-        if len(self._ports) != self._modelled_ports:
-            # A robot that is attached later gets a new model; packets on the air of the old model are lost.
-            self._modelled_ports = len(self._ports)
+        if len(self._ports) != self._ports_in_model:
+            # A robot that is attached later needs a new model; packets on the air of the old model are lost.
+            self._ports_in_model = len(self._ports)
             self._model = self._new_model()
-            self._prioritized = any(
+            self._has_priorities = any(
                 antenna.phy is not None and antenna.phy.access_categories for antenna in self._antennas.values()
             )
             self._model.use_meter()

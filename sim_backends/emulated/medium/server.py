@@ -1,7 +1,7 @@
 """Common part of media: devices of robots, requests of the lab, interfaces, link samples and recordings of the air.
 
-A medium is a process that carries the packets of the robots' TUN or TAP devices. `process` has the medium of a radio
-model, `sim_backends.emulated.cosimulated` the one of a co-simulation.
+A medium is a process that carries the packets of the robots' TUN or TAP devices. `process` contains the medium of a
+radio model, and `sim_backends.emulated.cosimulated` contains the medium of a co-simulation.
 """
 
 import os
@@ -30,11 +30,11 @@ from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.world.world import World
 
 BURST: Final = 64
-"""Packets read from one robot before other robots and the timer are served: they take about half a millisecond."""
+"""Maximum number of packets read from one robot before other robots and the timer are served, in about 0.5 ms."""
 READ_BYTES: Final = 2048
-"""Longer than any packet of an interface with the MTU 1500 of Wi-Fi; each read allocates this much."""
+"""Size of a read, which is longer than any packet of an interface with the MTU 1500 of Wi-Fi."""
 DEVICE_PACKETS: Final = 500
-"""A TUN device holds this many packets: its default queue length, TUN_READQ_SIZE of the kernel's tun.c."""
+"""Default queue length of a TUN device, TUN_READQ_SIZE of the kernel's tun.c."""
 INTERFACE_POLL_NS: Final = 1_000_000
 """Polling interval of the robots' interfaces; a poll takes 0.6 us for three robots."""
 
@@ -88,13 +88,14 @@ class MediumServer(ABC):
         self._air_log: AirLog | None = None
         # Time of the next link sample, None if links are not sampled; and the samples since the last request.
         self._sample_ns: int | None = None
-        self._sampled: deque[Mapping[str, LinkSample]] = deque(maxlen=_MAX_SAMPLES)
+        self._samples: deque[Mapping[str, LinkSample]] = deque(maxlen=_MAX_SAMPLES)
         self._layout = Layout()
-        self._routed: tuple[Set[str], int] = frozenset(), 0
+        self._routing_state: tuple[Set[str], int] = frozenset(), 0
         self._on_air_robots: set[str] = set()
         self._polled_ns = 0
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
+        # Number of packets by lateness.
         self._late: Counter[int] = Counter()
         self._flows = FlowDelays()
         self._scheduling = _raise_priority()
@@ -124,10 +125,10 @@ class MediumServer(ABC):
     def _serve(self) -> bool:
         """Answer one request; return False if the owner has closed the socket."""
         deadline = Deadline.after(_OWNER_TIMEOUT_S)
-        received = worker.receive(self._channel, deadline)
-        if received is None:
+        message = worker.receive(self._channel, deadline)
+        if message is None:
             return False
-        request, descriptors = received
+        request, descriptors = message
         try:
             reply = self._answer(request, descriptors)
         except (KeyError, TypeError, ValueError) as error:
@@ -164,7 +165,7 @@ class MediumServer(ABC):
     def _attach(self, name: str, address: IPv4Interface, fd: int) -> None:
         if name in self._ports or address.ip in {port.address.ip for port in self._ports.values()}:
             os.close(fd)
-            raise ValueError(f"{name} or {address.ip} is attached already")
+            raise ValueError(f"{name} or {address.ip} is already attached")
         os.set_blocking(fd, False)
         self._ports[name] = self._by_fd[fd] = Port(name, address, fd)
         self._epoll.register(fd, select.EPOLLIN)
@@ -191,15 +192,15 @@ class MediumServer(ABC):
         if relay is not None and relay not in positions_m:
             positions_m, relay = {}, None
         self._place_stations(positions_m, relay)
-        if (positions_m.keys(), len(self._ports)) != self._routed:
+        if (positions_m.keys(), len(self._ports)) != self._routing_state:
             self._route(positions_m.keys())
 
-    def _route(self, present: Set[str]) -> None:
-        """Give each robot that is present routes to the others that are present; absent robots have no routes."""
-        self._routed = frozenset(present), len(self._ports)
+    def _route(self, robots_on_air: Set[str]) -> None:
+        """Give each robot on the air routes to the others that are on the air; other robots have no routes."""
+        self._routing_state = frozenset(robots_on_air), len(self._ports)
         for port in self._ports.values():
-            is_present = port.name in present
-            others = [name for name in present if name != port.name] if is_present else []
+            is_on_air = port.name in robots_on_air
+            others = [name for name in robots_on_air if name != port.name] if is_on_air else []
             port.routes = self._framing.routes(port.address, {name: self._ports[name].address for name in others})
 
     def _record(self, descriptors: list[int]) -> None:
@@ -214,13 +215,13 @@ class MediumServer(ABC):
         """Sample the links of all radios; packets that arrive during the sampling are delivered in the next round."""
         now_ns = time.monotonic_ns()
         self._sample_ns = now_ns + _SAMPLE_NS
-        self._sampled.append(self._sample_links(now_ns))
+        self._samples.append(self._sample_links(now_ns))
 
     def _links(self, *, continue_sampling: bool) -> Message:
         """Return the link samples since the last request, including one taken now."""
         self._sample()
-        reply = pack_links(self._sampled)
-        self._sampled.clear()
+        reply = pack_links(self._samples)
+        self._samples.clear()
         if not continue_sampling:
             self._sample_ns = None
         return reply
@@ -243,8 +244,8 @@ class MediumServer(ABC):
 def _raise_priority() -> str:
     """Request the lowest real-time priority, so that other processes delay no packet; return the result as text.
 
-    The kernel pauses a medium that fills its core for 50 ms per second (sched_rt_runtime_us), which increases the
-    lateness.
+    If the medium uses all time of its core, the kernel pauses it for 50 ms in each second (sched_rt_runtime_us),
+    which increases the lateness.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))

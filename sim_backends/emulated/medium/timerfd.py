@@ -26,8 +26,9 @@ class _Itimerspec(ctypes.Structure):
 class Timer:
     """A one-shot timer whose descriptor becomes readable at a time of `time.monotonic_ns`.
 
-    The timeout of epoll has a resolution of 1 ms, too coarse for the delay of a link. Setting the timer makes the
-    descriptor unreadable again, so that with EPOLLET it need not be read.
+    The timeout of epoll has a resolution of 1 ms, which is too coarse for the delay of a link. Setting the timer
+    makes the descriptor unreadable again, so with EPOLLET the descriptor need not be read.
+
 
     Raises:
         OSError: The kernel cannot create a timer.

@@ -12,9 +12,11 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.process.worker import PATH
 
 _NAMESPACES: Final = ("--net", "--mount", "--propagation", "private", "--pid", "--uts", "--ipc")
-# Root inside is this user outside; other accounts inside (of sshd and tcpdump) are the user's subordinate ids.
+# Root in the namespaces is this user outside of them; other accounts in them (of sshd and tcpdump) are subordinate
+# ids.
 _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
-# The first attempt uses no subordinate ids: if the kernel refuses it, unshare leaves a process that maps such ids.
+# The first attempt uses no subordinate ids, because `unshare --map-auto` leaves a process behind if the kernel
+# refuses.
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534
@@ -31,7 +33,7 @@ _KERNEL_SETTINGS: Final = {
     "kernel.apparmor_restrict_unprivileged_userns": ("1", "0"),
     "user.max_user_namespaces": ("0", "10000"),
 }
-"""Kernel settings of Debian, of Ubuntu and of any system, each with a value that forbids user namespaces and one that
+"""Kernel settings (of Debian, of Ubuntu, of any system) with the value that forbids user namespaces, and a value that
 allows them."""
 
 _TIMEOUT_S: Final = 10.0
@@ -53,7 +55,7 @@ class IdRange:
 
 
 def command() -> tuple[str, ...]:
-    """Return the prefix that runs a command as root in new namespaces, whose processes stop with the command."""
+    """Return the prefix that runs a command as root in new namespaces; their processes exit with the command."""
     return _command(() if is_root() else _AS_ROOT_INSIDE)
 
 

@@ -64,8 +64,8 @@ def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[i
     descriptors: list[int] = []
     while not line.endswith(b"\n"):
         channel.settimeout(deadline.remaining_s)
-        data, received, _, _ = socket.recv_fds(channel, 1 << 16, DESCRIPTORS, socket.MSG_CMSG_CLOEXEC)
-        descriptors += received
+        data, new_descriptors, _, _ = socket.recv_fds(channel, 1 << 16, DESCRIPTORS, socket.MSG_CMSG_CLOEXEC)
+        descriptors += new_descriptors
         if not data:
             return None
         line += data
@@ -79,7 +79,7 @@ REPLY_S: Final = 15.0
 
 _EXIT_S: Final = 2.0
 _EXIT_STATUS_S: Final = 0.5
-"""Maximum time from when a process has closed its descriptors until its exit status is available."""
+"""Maximum time after a process has closed its descriptors until its exit status is available."""
 _EXITED: Final = "it exited"
 PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
@@ -87,16 +87,16 @@ PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 class Worker:
     """Process that runs a module of this package and serves requests over a socket pair.
 
-    The process exits when this object is closed or this process exits for any reason: the control socket closes, and
-    the kernel kills the process when the thread that created this object ends. Create it in a thread that exists as
-    long as the lab. The methods may be called from any thread.
+    The worker process exits when this object is closed. It also exits when the process that created this object exits
+    for any reason: the control socket closes, and the kernel kills the worker when the thread that created this
+    object ends. Create it in a thread that exists as long as the lab. The methods may be called from any thread.
 
     Args:
         name: Name for messages.
         module: The module; its arguments are the descriptor number of its socket, then `words`.
         words: More arguments.
         descriptors: Descriptors of this process that the process inherits, with the same numbers.
-        within: Command prefix that runs the interpreter, for example `unshare ... --`.
+        command_prefix: Command prefix that runs the interpreter, for example `unshare ... --`.
         home: Value of `HOME`.
 
     Raises:
@@ -110,7 +110,7 @@ class Worker:
         *,
         words: Sequence[str] = (),
         descriptors: Sequence[int] = (),
-        within: Sequence[str] = (),
+        command_prefix: Sequence[str] = (),
         home: str = "/",
     ) -> None:
         self.name = name
@@ -118,7 +118,7 @@ class Worker:
         self._channel, worker_end = socket.socketpair()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process; `close` closes it)
         python = command(module)
-        argv = ["setpriv", "--pdeathsig", "KILL", "--", *within, *python, str(worker_end.fileno()), *words]
+        argv = ["setpriv", "--pdeathsig", "KILL", "--", *command_prefix, *python, str(worker_end.fileno()), *words]
         try:
             self._process = subprocess.Popen(
                 argv,
@@ -161,34 +161,34 @@ class Worker:
         """
         if not self._lock.acquire(timeout=timeout_s):
             raise LinkError("is busy with another request", where=self.name, remedy="try again")
-        # The wait is never shorter than REPLY_S: a late reply would be taken for the reply to the next request.
+        # The wait is never shorter than REPLY_S, because a late reply would look like the reply to the next request.
         deadline = Deadline.after(max(timeout_s, REPLY_S))
         try:
             send(self._channel, message, deadline, descriptors)
-            received = receive(self._channel, deadline)
+            answer = receive(self._channel, deadline)
         except (OSError, ValueError) as error:
             self._channel.close()
             raise self._exit_error(_EXITED if isinstance(error, ConnectionError) else str(error)) from error
         finally:
             self._lock.release()
-        if received is None:
+        if answer is None:
             raise self._exit_error(_EXITED)
-        reply, _ = received
+        reply, _ = answer
         if "error" in reply:
             raise RobotError(reply["error"], where=self.name, remedy=reply.get("remedy", ""))
-        return received
+        return answer
 
     def check_alive(self) -> None:
-        """Raise if the process cannot serve requests.
+        """Check that the process can serve requests.
 
         Raises:
-            TestbedLostError: It has exited, or did not answer a request in time.
+            TestbedLostError: The process has exited, or did not answer a request in time.
         """
         if self._channel.fileno() == -1 or self._process.poll() is not None:
             raise self._exit_error(_EXITED)
 
     def request_exit(self) -> None:
-        """Request that the process exits, without waiting for it; requests under way fail immediately."""
+        """Request that the process exits, without waiting for it; pending requests fail immediately."""
         if self._channel.fileno() != -1:
             self._channel.shutdown(socket.SHUT_RDWR)
 

@@ -1,7 +1,7 @@
 """Base controller of an emulated ground robot: computes its pose from commanded velocities, within limits.
 
-Like ROS's `diff_drive_controller` and the firmware of a TurtleBot3 it limits the commanded velocity, and stops if no
-command arrived for `TIMEOUT_NS`. It uses the differential drive of the co-simulation's physics, without collisions.
+Like ROS's `diff_drive_controller` and the firmware of a TurtleBot3, it limits the commanded velocity, and stops if no
+command arrives for `TIMEOUT_NS`. It uses the differential drive of the co-simulation's physics, without collisions.
 """
 
 import math
@@ -15,7 +15,8 @@ from sim_backends.physics.differential_drive import DifferentialDrive, DrivePose
 from sim_backends.physics.robot_limits import DriveLimits
 
 TIMEOUT_NS: Final = 500_000_000
-"""The base stops this long after a velocity: CONTROL_MOTOR_TIMEOUT of OpenCR's turtlebot3_core, and ROS's default."""
+"""Time from the last commanded velocity until the base stops: CONTROL_MOTOR_TIMEOUT of OpenCR's turtlebot3_core, and
+ROS's default."""
 
 STEP_NS: Final = 10_000_000
 _TURN_RISE_S: Final = 0.5
@@ -23,16 +24,16 @@ _TURN_RISE_S: Final = 0.5
 
 
 def odometry(start: OwnMotion, place_m: Vector, heading_rad: float) -> Vector:
-    """Return the odometry of a robot after a motion; see `Steered.odometry`.
+    """Return the odometry of a robot after a motion; see `RecordedMotion.odometry`.
 
     Args:
-        start: Its state of motion before.
+        start: State of motion of the robot at the start of the motion.
         place_m: Its position, metres east, north, up.
         heading_rad: Its heading, continuous over full turns.
     """
     x_m, y_m = place_m[0] - start.place_m[0], place_m[1] - start.place_m[1]
-    turned_rad = start.yaw_rad - start.heading_rad
-    cos, sin = math.cos(turned_rad), math.sin(turned_rad)
+    rotation_rad = start.yaw_rad - start.heading_rad
+    cos, sin = math.cos(rotation_rad), math.sin(rotation_rad)
     yaw_rad = start.yaw_rad + heading_rad - start.heading_rad
     return start.x_m + cos * x_m - sin * y_m, start.y_m + sin * x_m + cos * y_m, yaw_rad
 
@@ -72,7 +73,7 @@ class BaseController:
 
     @property
     def odometry(self) -> tuple[float, float, float]:
-        """Odometry; see `Steered.odometry`."""
+        """Odometry; see `RecordedMotion.odometry`."""
         return odometry(self._start, self._pose.place_m, self._pose.heading_rad)
 
     def reset(self, motion: OwnMotion) -> None:

@@ -13,8 +13,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NoReturn
 
-from sim_backends.emulated.robot.commanded import COMMANDED, Commanded, CommandedRecord
 from sim_backends.emulated.robot.spec import STATE, Base
+from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND, VelocityCommand, VelocityCommandRecord
 from sim_backends.emulated.ros.own_motion import MotionReporter
 
 if TYPE_CHECKING:
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 _TICK_S: Final = 0.02
 
 
-def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
+def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path) -> None:
     """Serve until the process is killed; while the robot is idle, the process sleeps.
 
     Args:
         base: Settings of the robot's base.
-        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which the robot records its motion (`own_motion.MotionReporter`).
-        ready: Created when the base serves.
+        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
+        motion_record: The file in which the robot records its motion (`own_motion.MotionReporter`).
+        ready: File that is created when the base accepts velocities.
 
     Raises:
         OSError: The socket cannot be created.
@@ -42,7 +42,7 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
             ready.touch()
             _record_velocities(channel)
         channel.setblocking(False)
-        reporter = MotionReporter(motion, steered, time.monotonic_ns())
+        reporter = MotionReporter(assigned_paths, motion_record, time.monotonic_ns())
         ready.touch()
         select.select([channel], [], [])
         # The physics need numpy, which uses 20 MB; most robots of most trials are never driven.
@@ -61,11 +61,11 @@ def serve(base: Base, *, motion: Path, steered: Path, ready: Path) -> None:
 
 def _record_velocities(channel: socket.socket) -> NoReturn:
     """Record each velocity for the physics, which limits it and stops the robot after the last one."""
-    record = CommandedRecord.open(COMMANDED)
+    record = VelocityCommandRecord.open(VELOCITY_COMMAND)
     while True:
         velocity = unpack(channel.recv(BYTES + 1))
         if velocity is not None and all(map(math.isfinite, velocity)):
-            record.write(Commanded(time.monotonic_ns(), *velocity))
+            record.write(VelocityCommand(time.monotonic_ns(), *velocity))
 
 
 def _receive_velocities(channel: socket.socket, controller: "BaseController", now_ns: int) -> None:

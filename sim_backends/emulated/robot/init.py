@@ -22,9 +22,9 @@ from fieldkit.core.errors import FieldkitError, RobotError
 from sim_backends.emulated.process import worker
 from sim_backends.emulated.process.worker import Message
 from sim_backends.emulated.robot import mounts, network, rootfs, services, wireless
-from sim_backends.emulated.robot.commanded import COMMANDED
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, LOOPBACK_INTERFACE, STATE, RobotSpec, WifiSpec
+from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND
 from sim_backends.emulated.ros import own_motion
 from sim_backends.emulated.ros.laser import Neighbourhood
 from sim_backends.emulated.ros.own_motion import AssignedPath
@@ -57,7 +57,7 @@ class Supervisor:
         """Return when a service is ready.
 
         Raises:
-            RobotError: It exited, or was not ready by the deadline; the message has the end of its log.
+            RobotError: It exited, or was not ready by the deadline; the message contains the end of its log.
         """
         while not service.ready():
             self.reap()
@@ -134,7 +134,7 @@ START_S: Final = 30.0
 _MESSAGE_S: Final = 10.0
 
 VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (the robot's own)
-"""Folders in the robot's memory; all other folders are on its SD card."""
+"""Folders whose content is in the robot's memory, and is lost without power; other folders are on its SD card."""
 
 
 class Init:
@@ -157,22 +157,23 @@ class Init:
         """Serve requests; return when the lab has closed the control socket."""
         is_connected = True
         while is_connected:
-            watched = [self._channel.fileno(), self._wake_fd]
-            readable, _, _ = select.select(watched, [], [], self._supervisor.restart())
+            descriptors = [self._channel.fileno(), self._wake_fd]
+            readable, _, _ = select.select(descriptors, [], [], self._supervisor.restart())
             if self._wake_fd in readable:
                 os.read(self._wake_fd, 4096)
                 self._supervisor.reap()
             if self._channel.fileno() in readable:
                 is_connected = self._serve()
-        # hwsim keeps frames without a status, and these keep this network namespace, until the interface is down.
+        # Until the interface is down, hwsim stores frames without a status, and these prevent that the kernel removes
+        # this network namespace.
         if self._wifi is not None:
             network.switch_off(self._interface)
 
     def _serve(self) -> bool:
-        received = worker.receive(self._channel, Deadline.after(_MESSAGE_S))
-        if received is None:
+        message = worker.receive(self._channel, Deadline.after(_MESSAGE_S))
+        if message is None:
             return False
-        request, received_fds = received
+        request, received_fds = message
         descriptors: list[int] = []
         try:
             descriptors = self._answer(request, received_fds)
@@ -202,7 +203,7 @@ class Init:
             case "open wifi" | "switch off" | "switch on" | "switch link on":
                 self._change_radio(request)
             case "move":
-                own_motion.append_path(services.MOTION, AssignedPath(**request["path"]))
+                own_motion.append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":
@@ -221,11 +222,11 @@ class Init:
             self._supervisor.wait_ready(service, deadline)
 
     def _halt(self, interfaces: Sequence[str]) -> None:
-        # Its links are switched off first, because a robot that loses power closes no connection.
+        # The robot's links are switched off first, because a robot that loses power closes no connection.
         for interface in interfaces:
             network.switch_off(interface)
         self._supervisor.halt()
-        lose_memory()
+        discard_memory()
 
     def _boot(self, interfaces: Sequence[str], spec: RobotSpec) -> None:
         radio, *links = interfaces
@@ -254,10 +255,10 @@ class Init:
     def _spawn(self, spec: RobotSpec) -> list[Service]:
         """Start the robot's services without waiting for them, because requests are served one at a time."""
         Path(services.READY_FOLDER).mkdir(exist_ok=True)
-        started = services.services(spec, self._neighbourhood)
-        for service in started:
+        robot_services = services.services(spec, self._neighbourhood)
+        for service in robot_services:
             self._supervisor.start(service)
-        return started
+        return robot_services
 
 
 def _open_devices(request: Message) -> list[int]:
@@ -276,7 +277,7 @@ def _open_devices(request: Message) -> list[int]:
 
 def _build(spec: RobotSpec) -> None:
     socket.sethostname(spec.name)
-    mounts.isolate(replaced=spec.setup)
+    mounts.isolate(replaced_files=spec.setup)
     rootfs.write_files(spec)
     os.chdir(HOME)
 
@@ -285,12 +286,12 @@ def _motion_files(spec: RobotSpec) -> list[int]:
     """Return descriptors of the record of the robot's motion, and of the inputs of a simulated physics, if any."""
     inputs: list[tuple[Path, int]] = []
     if spec.simulated_flight:
-        inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLOWN, os.O_RDWR)]
+        inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLIGHT, os.O_RDWR)]
     elif spec.base is not None and spec.base.simulated:
-        inputs = [(COMMANDED, os.O_RDONLY)]
+        inputs = [(VELOCITY_COMMAND, os.O_RDONLY)]
     if not inputs:
-        return [os.open(services.STEERED, os.O_RDONLY | os.O_CREAT, 0o600)]
-    files = [(services.STEERED, os.O_RDWR), (services.MOTION, os.O_RDONLY), *inputs]
+        return [os.open(services.MOTION_RECORD, os.O_RDONLY | os.O_CREAT, 0o600)]
+    files = [(services.MOTION_RECORD, os.O_RDWR), (services.ASSIGNED_PATHS, os.O_RDONLY), *inputs]
     return [os.open(path, flags | os.O_CREAT, 0o600) for path, flags in files]
 
 
@@ -322,7 +323,7 @@ def kill_processes(process: str) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
-def lose_memory() -> None:
+def discard_memory() -> None:
     """Discard the state that a robot loses with its power: the content of its memory, and its boot id."""
     for folder in VOLATILE:
         mounts.clear(Path(folder), keep=(STATE, rootfs.SSHD_FOLDER))

@@ -1,4 +1,4 @@
-"""File system of an emulated robot: the host's, read-only, with separate folders for all that a robot changes."""
+"""File system of an emulated robot: the host's files, read-only, and separate folders that a robot can change."""
 
 import contextlib
 import ctypes
@@ -38,39 +38,39 @@ OWN_FOLDERS: Final = {
 """Folders that each robot has separately, with their modes; their content is lost when the robot stops."""
 
 
-def isolate(*, replaced: Iterable[str] = ()) -> None:
+def isolate(*, replaced_files: Iterable[str] = ()) -> None:
     """Mount the robot's own folders in this process's mount namespace, and make everything of the host read-only.
 
     All that the robot needs from the host remains visible: this Python, this package, and everything in `/opt`.
 
     Args:
-        replaced: Files that the robot writes itself. Children of `/opt` that contain them are hidden; a top-level
-            folder that this machine does not have is created for the robot.
+        replaced_files: Files that the robot writes itself. Children of `/opt` that contain them are hidden; a
+            top-level folder that this machine does not have is created for the robot.
 
     Raises:
         OSError: The kernel refused a mount.
     """
-    replaced = tuple(replaced)
-    missing = {top for path in replaced if not Path(top := f"/{Path(path).parts[1]}").exists()}
+    replaced_files = tuple(replaced_files)
+    missing = {top for path in replaced_files if not Path(top := f"/{Path(path).parts[1]}").exists()}
     _make_read_only("/")
     if missing:
         _pivot_root(missing)
     else:
         _mount_proc(Path("/proc"))
-    replaced_in_opt = {Path(path).parts[2] for path in replaced if path.startswith("/opt/")}
+    replaced_in_opt = {Path(path).parts[2] for path in replaced_files if path.startswith("/opt/")}
     visible = [*_python_folders(), *(child for child in Path("/opt").glob("*") if child.name not in replaced_in_opt)]
     open_fds = {path: _open_path(path) for path in _outermost(visible) if path.exists()}
     for folder, mode in {**OWN_FOLDERS, **dict.fromkeys(missing, "0755")}.items():
         if Path(folder).is_dir():
             _mount("tmpfs", folder, "tmpfs", _MS_NOSUID | _MS_NODEV, f"mode={mode}")
     for path, fd in open_fds.items():
-        _bind_back(path, fd)
+        _bind_again(path, fd)
     _mount("devpts", "/dev/pts", "devpts", _MS_NOSUID | _MS_NOEXEC, "newinstance,ptmxmode=0666,mode=620,gid=5")
     _mount("/dev/pts/ptmx", "/dev/ptmx", "", _MS_BIND)
 
 
 def mount_overlay(source: Path, target: Path) -> None:
-    """Mount the files of the folder `source` over the folder `target`, whose other files stay visible.
+    """Mount the files of the folder `source` over the folder `target`; other files of `target` stay visible.
 
     Raises:
         OSError: The kernel refused, or has no overlay file system.
@@ -94,9 +94,9 @@ def clear(folder: Path, keep: Iterable[str] = ()) -> None:
     Raises:
         OSError: A file could not be removed.
     """
-    own_device = folder.stat().st_dev
+    device = folder.stat().st_dev
     for path in folder.iterdir():
-        if path.lstat().st_dev != own_device or str(path) in keep:
+        if path.lstat().st_dev != device or str(path) in keep:
             continue
         if path.is_symlink() or not path.is_dir():
             path.unlink()
@@ -107,7 +107,7 @@ def clear(folder: Path, keep: Iterable[str] = ()) -> None:
 
 
 def _pivot_root(folders: Iterable[str]) -> None:
-    """Change to a new root with the content of the old one, a new `/proc`, and `folders`, which the old one lacks.
+    """Change to a new root with the content of the old root, a new `/proc`, and `folders`, which the old root lacks.
 
     The new root is built at `/proc`, so that it hides nothing else until the change.
     """
@@ -119,7 +119,8 @@ def _pivot_root(folders: Iterable[str]) -> None:
     # fs/namespace.c).
     _mount_proc(root / "proc")
     os.chdir(root)
-    # With one folder for both arguments the old root is stacked on the new one, and then unmounted (pivot_root(2)).
+    # If both arguments are the same folder, the old root is mounted over the new one; then it is unmounted
+    # (pivot_root(2)).
     _check(_LIBC.pivot_root(b".", b"."), "change to the new root")
     _check(_LIBC.umount2(b".", _MNT_DETACH), "unmount the old root")
     os.chdir("/")
@@ -143,10 +144,11 @@ def _mirror(folder: Path, at: Path, without: Container[str]) -> None:
 
 
 @contextlib.contextmanager
-def rewritten(folder: Path, at: Path, *, without: Container[str] = ()) -> Iterator[Path]:
-    """Yield a writable mirror of the host's `folder`, which is mounted over it, read-only, when the context is left.
+def writable_mirror(folder: Path, at: Path, *, without: Container[str] = ()) -> Iterator[Path]:
+    """Yield a writable mirror of the host's `folder`; when the context is left, mount it over `folder`, read-only.
 
-    It uses bind mounts only: a user namespace may not overlay a folder with mounts in it, as Docker has in `/etc`.
+    The mirror consists of bind mounts, because a user namespace may not overlay a folder that contains mounts, as
+    `/etc` does in Docker.
 
     Args:
         folder: A folder of the host.
@@ -177,7 +179,7 @@ def _python_folders() -> list[Path]:
 
 
 def _outermost(paths: Iterable[Path]) -> list[Path]:
-    """Return the paths that the robot's own folders hide, without paths inside another of them."""
+    """Return the paths that the robot's own folders hide; a path inside another of these paths is omitted."""
     hidden = {path for path in paths if any(Path(folder) in path.parents for folder in OWN_FOLDERS)}
     return [path for path in hidden if not any(parent in hidden for parent in path.parents)]
 
@@ -186,8 +188,8 @@ def _open_path(path: Path) -> int:
     return os.open(path, os.O_PATH | os.O_CLOEXEC)
 
 
-def _bind_back(path: Path, fd: int) -> None:
-    """Bind-mount the file or folder open as `fd` to its old path, which is now hidden."""
+def _bind_again(path: Path, fd: int) -> None:
+    """Bind-mount the file or folder that is open as `fd` at its path, where another mount hides it now."""
     source = f"/proc/self/fd/{fd}"
     path.parent.mkdir(parents=True, exist_ok=True)
     if Path(source).is_dir():

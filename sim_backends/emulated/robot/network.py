@@ -26,31 +26,31 @@ _LONG_TERM_STATE: Final = f"{STATE}/babel-state"
 
 
 def command(interface: str, address: str, hello_s: float, links: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the command of the routing daemon of a robot; other settings are babeld's defaults.
+    """Return the command of a robot's routing daemon. Settings that are not in it have babeld's defaults.
 
     Args:
         interface: The radio interface. It is declared wireless, because a TAP device has no wireless extensions.
         address: The robot's address with the prefix length; each robot announces its own address as a host route.
         hello_s: Hello interval.
-        links: Address with the prefix length by the interface of each further link. If `LOOPBACK_INTERFACE` has one,
-            the daemon also uses the other links, each at `LINK_COST`, and announces that address over all of them.
-            It announces the address on the radio only over the radio.
+        links: Address with the prefix length of each further link, by its interface. If `LOOPBACK_INTERFACE` is one
+            of them, the daemon also uses the other links, each with the cost `LINK_COST`, and announces the address
+            of `LOOPBACK_INTERFACE` over all links. It announces the address on the radio only over the radio.
     """
-    either = links.get(LOOPBACK_INTERFACE)
-    others = [name for name in links if name != LOOPBACK_INTERFACE] if either else []
-    more = [f"out if {name} ip {IPv4Interface(address).network} deny" for name in others]
-    more += [f"interface {name} type tunnel rxcost {LINK_COST} hello-interval {hello_s:g}" for name in others]
-    if either is not None:
-        own = IPv4Interface(either).ip
-        more += [f"redistribute local ip {own}/32 allow", f"install ip {SHARED_NETWORK} pref-src {own}"]
-    settings = _settings(interface, address, hello_s, *more)
-    return (*_program(str(PID), _LONG_TERM_STATE), *settings, interface, *others)
+    shared_address = links.get(LOOPBACK_INTERFACE)
+    tunnels = [name for name in links if name != LOOPBACK_INTERFACE] if shared_address else []
+    rules = [f"out if {name} ip {IPv4Interface(address).network} deny" for name in tunnels]
+    rules += [f"interface {name} type tunnel rxcost {LINK_COST} hello-interval {hello_s:g}" for name in tunnels]
+    if shared_address is not None:
+        ip = IPv4Interface(shared_address).ip
+        rules += [f"redistribute local ip {ip}/32 allow", f"install ip {SHARED_NETWORK} pref-src {ip}"]
+    settings = _settings(interface, address, hello_s, *rules)
+    return (*_program(str(PID), _LONG_TERM_STATE), *settings, interface, *tunnels)
 
 
 def guest_command(interface: str, address: str, hello_s: float) -> tuple[str, ...]:
     """Return the command of a node that uses the robots' routes, and announces only the route to itself.
 
-    The daemon writes no files. Arguments as `command`.
+    The daemon writes no files. Arguments are those of `command`.
     """
     filters = (f"out ip {IPv4Interface(address).ip}/32 allow", "out deny")
     return (*_program("", ""), *_settings(interface, address, hello_s, *filters), interface)
@@ -60,12 +60,12 @@ def _program(pid: str, long_term_state: str) -> tuple[str, ...]:
     return (shutil.which("babeld") or "/usr/sbin/babeld", "-I", pid, "-S", long_term_state)
 
 
-def _settings(interface: str, address: str, hello_s: float, *more: str) -> tuple[str, ...]:
-    # The first filter that matches decides, so the general one comes last.
+def _settings(interface: str, address: str, hello_s: float, *rules: str) -> tuple[str, ...]:
+    # The first filter that matches is applied, so the general filter is the last one.
     settings = (
         f"interface {interface} type wireless hello-interval {hello_s:g}",
         f"redistribute local ip {IPv4Interface(address).network} allow",
-        *more,
+        *rules,
         "redistribute local deny",
     )
     return tuple(word for setting in settings for word in ("-C", setting))
@@ -168,8 +168,8 @@ def bring_up(interface: str, address: str, *, mesh: bool = False) -> int:
     Args:
         interface: Name of the interface.
         address: Its address with the prefix length.
-        mesh: True if robots forward for each other; the interface then has a MAC address, by which frames name the
-            next hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
+        mesh: True if robots forward packets for each other. The interface then has a MAC address, with which frames
+            address the next hop, and IPv6, whose link-local addresses the routing daemon uses (RFC 8966, section 4).
 
     Returns:
         The device's descriptor, for the medium.
@@ -199,7 +199,7 @@ def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
     Args:
         interface: Name of the interface.
         address: Its address with the prefix length.
-        mesh: As for `bring_up`.
+        mesh: See `bring_up`.
 
     Returns:
         The device's descriptor, for the medium of the link.
@@ -214,17 +214,17 @@ def add_link(interface: str, address: str, *, mesh: bool = False) -> int:
 
 
 def add_loopback_address(address: str) -> None:
-    """Give the robot an address that it has on no link; errors as `run_ip`."""
+    """Give the robot an address that belongs to no link. Raises the errors of `run_ip`."""
     run_ip(f"address add {address} dev {LOOPBACK_INTERFACE}")
 
 
 def switch_on_link(interface: str) -> None:
-    """Bring the interface of a further link up again; errors as `switch_on`."""
+    """Bring the interface of a further link up again. Raises the errors of `switch_on`."""
     run_ip(f"link set {interface} up")
 
 
 def configure(interface: str, address: str) -> None:
-    """Bring up loopback and an interface with its address and routes. Errors as `run_ip`."""
+    """Bring up loopback and an interface with its address and routes. Raises the errors of `run_ip`."""
     run_ip(
         "link set lo up",
         f"link set {interface} mtu {MTU_BYTES} up",
@@ -234,7 +234,7 @@ def configure(interface: str, address: str) -> None:
 
 
 def switch_off(interface: str) -> None:
-    """Take the radio interface down; it keeps its address. Errors as `switch_on`."""
+    """Take the radio interface down; it keeps its address. Raises the errors of `switch_on`."""
     run_ip(f"link set {interface} down")
 
 
@@ -271,8 +271,8 @@ def run_ip(*commands: str) -> None:
             raise RobotError(f"ip rejected a setting: {result.stderr.strip()}", remedy="update iproute2")
 
 
-def listens(port: int) -> bool:
-    """Return True if a TCP socket listens on `port`; reads the kernel's table, so the server gets no connection."""
+def has_listener(port: int) -> bool:
+    """Return True if a TCP socket listens on `port`, as the kernel's table shows; no connection is made."""
     local = f":{port:04X} "
     listening = "0A"
     lines = Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]
@@ -283,7 +283,7 @@ def _prepare_mesh(interface: str) -> None:
     """Enable forwarding, and link-local addresses without duplicate detection, since no other robot has this MAC."""
     settings = {
         "ipv4/conf/all/forwarding": 1,
-        # Every packet leaves by the interface it came from; that must not cause ICMP redirects.
+        # Every forwarded packet leaves through the interface on which it arrived; this must not cause ICMP redirects.
         "ipv4/conf/all/send_redirects": 0,
         f"ipv4/conf/{interface}/send_redirects": 0,
         f"ipv6/conf/{interface}/disable_ipv6": 0,

@@ -17,7 +17,7 @@ from sim_backends.emulated.robot.spec import HOME, NETCATS, STATE, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
-"""Mounted over the kernel's boot id, which all robots of this machine share and a robot's reboot does not change."""
+"""File that is mounted over the kernel's boot id, which is the same for all robots and never changes."""
 
 _RECORDERS: Final = {
     1: ("rosbag", "sim_backends.emulated.ros.rosbag"),
@@ -38,8 +38,8 @@ _PASSWORDS: Final = "root:*:20000:0:99999:7:::\n"
 OWN_FILES: Final = tuple(f"/etc/{name}" for name in ("passwd", "group", "shadow", "hostname", "hosts"))
 """System files that each robot has separately."""
 
-# On a real robot `python3` is Debian's, which searches this folder after PYTHONPATH. It is appended, so that the
-# packages of the Python that runs fieldkit come first.
+# On a real robot `python3` is Debian's, which searches this folder after PYTHONPATH. The folder is appended, so that
+# the packages of the Python that runs fieldkit are found first.
 _SITE_CUSTOMIZE: Final = """\
 import sys
 
@@ -54,7 +54,7 @@ _BIN: Final = "/usr/bin"
 _SCRIPTS: Final = f"{STATE}/scripts"
 _PROGRAM_FOLDERS: Final = (_BIN, "/usr/sbin")
 
-_ANY_NETCAT: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
+_ALL_NETCATS: Final = ("nc", "netcat", "nc.traditional", "nc.openbsd", "ncat")
 # Programs that a robot with a busybox userland keeps: bash sources ROS's setup files, Python runs its recorder, and
 # OpenWrt routers have a package of babeld.
 _KEPT_WITH_BUSYBOX: Final = (
@@ -94,8 +94,9 @@ def write_files(spec: RobotSpec) -> None:
     files = _etc_files(spec)
     for name, content in files.items():
         _write(state / "etc" / name, content, mode=0o640 if name == "shadow" else 0o644)
-    # Mounted file by file, because a user namespace may not mount over a folder with mounts in it, as Docker has. If
-    # this machine lacks one of the files, as a bare Debian lacks hosts, an overlay of the whole folder adds them.
+    # The files are mounted separately, because a user namespace may not mount over a folder that contains mounts, as
+    # `/etc` does in Docker. If this machine lacks one of the files (a minimal Debian has no `hosts`), an overlay of
+    # the folder adds them.
     if all(Path(path).exists() for path in OWN_FILES):
         for name in files:
             mounts.bind(state / "etc" / name, Path("/etc", name))
@@ -119,7 +120,7 @@ def write_setup(spec: RobotSpec) -> None:
     files = {}
     for path in map(Path, spec.setup):
         files[path] = setup_script(spec, path), 0o644
-        # A robot with ROS has middlewares; here they come from the Python that runs fieldkit.
+        # A robot with ROS has middlewares. An emulated robot uses those of the Python that runs fieldkit.
         files[_ros_programs(path) / "python3"] = f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n', 0o755
         files[_ros_programs(path) / "fieldkit"] = module_command("fieldkit"), 0o755
         if spec.ros == "builtin":
@@ -131,21 +132,21 @@ def write_setup(spec: RobotSpec) -> None:
         folder = next(parent for parent in path.parents if parent.is_dir())
         paths_by_folder.setdefault(folder, []).append(path)
     for folder, paths in paths_by_folder.items():
-        with _writable(folder, {path.relative_to(folder).parts[0] for path in paths}) as writable:
+        with _writable_folder(folder, {path.relative_to(folder).parts[0] for path in paths}) as writable_folder:
             for path in paths:
                 content, mode = files[path]
-                _write(writable / path.relative_to(folder), content, mode=mode)
+                _write(writable_folder / path.relative_to(folder), content, mode=mode)
 
 
 @contextmanager
-def _writable(folder: Path, replaced: set[str]) -> Iterator[Path]:
+def _writable_folder(folder: Path, replaced_names: set[str]) -> Iterator[Path]:
     """Yield a writable folder for the files of `folder`: the folder itself, or a mirror of a folder of the host."""
     if os.access(folder, os.W_OK):
         yield folder
         return
     mirror = Path(STATE, "copy")
     mirror.mkdir(parents=True)
-    with mounts.rewritten(folder, mirror, without=replaced):
+    with mounts.writable_mirror(folder, mirror, without=replaced_names):
         yield mirror
     mirror.rmdir()
 
@@ -222,14 +223,14 @@ def mount_programs(spec: RobotSpec) -> None:
 
 def program_layers(spec: RobotSpec) -> dict[str, Layer]:
     """Return the changes to each folder of programs; empty for a robot with the tools of this machine."""
-    busybox = spec.userland == "busybox"
-    layers = {folder: _removed_programs(folder) if busybox else {} for folder in _PROGRAM_FOLDERS}
+    has_busybox = spec.userland == "busybox"
+    layers = {folder: _removed_programs(folder) if has_busybox else {} for folder in _PROGRAM_FOLDERS}
     programs = layers[_BIN]
-    if busybox:
+    if has_busybox:
         programs |= dict.fromkeys(_applets(), BUSYBOX)
     if spec.netcat is not None:
         program = NETCATS[spec.netcat]
-        programs |= dict.fromkeys((name for name in _ANY_NETCAT if Path(_BIN, name).exists()), None)
+        programs |= dict.fromkeys((name for name in _ALL_NETCATS if Path(_BIN, name).exists()), None)
         programs.pop(program, None)
         programs["nc"] = f"{_BIN}/{program}"
     if spec.ping == "busybox":
@@ -243,7 +244,7 @@ def program_layers(spec: RobotSpec) -> dict[str, Layer]:
 
 
 def _removed_programs(folder: str) -> Layer:
-    """Return the removal of each program that a robot with a busybox userland does not have."""
+    """Return the layer that removes the programs that a robot with a busybox userland does not have."""
     names = os.listdir(folder)  # noqa: PTH208 (only names are needed)
     return {name: None for name in names if not any(fnmatch(name, pattern) for pattern in _KEPT_WITH_BUSYBOX)}
 

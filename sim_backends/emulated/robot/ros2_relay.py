@@ -3,8 +3,8 @@
 Arguments: `route` and the robot's address; or `relay`, the address, the node's name, the topic of velocities for the
 base (may be empty), and as JSON the ROS 2 settings (`Ros2Spec`) and the type of each topic. The sensors process
 creates each message. The relay converts it to CDR as the robot's distribution defines the type, and publishes it
-while the topic has subscribers anywhere on the radio; `/tf_static` always, for late subscribers. Velocities go in the
-other direction. The node logs on `/rosout`.
+while the topic has subscribers anywhere on the radio. It always publishes `/tf_static`, for late subscribers.
+Velocities go in the other direction. The node logs on `/rosout`.
 """
 
 import contextlib
@@ -61,9 +61,9 @@ class Ros2Relay:
         self._subscribed: set[str] = set()
         self._rosout = self._middleware.publisher(self._topic("/rosout", _LOG, offered_qos.ROSOUT))
         for topic, kind in types.items():
-            described = self._topic(topic, kind, offered_qos.of_topic(topic, kind))
-            self._publishers[topic] = self._middleware.publisher(described)
-            self._conversions[topic] = self._conversion(described.type)
+            description = self._topic(topic, kind, offered_qos.of_topic(topic, kind))
+            self._publishers[topic] = self._middleware.publisher(description)
+            self._conversions[topic] = self._conversion(description.type)
 
     def _topic(self, name: str, kind: str, quality: QosProfile) -> Topic:
         """Return the description of a topic, with the number of this endpoint."""
@@ -104,7 +104,7 @@ class Ros2Relay:
     def run(self) -> None:
         """Relay messages until a signal stops the process."""
         listener, next_poll_s = self._listener, 0.0
-        while listener.stopped_by is None:
+        while listener.stop_signal is None:
             if time.monotonic() >= next_poll_s:
                 next_poll_s = time.monotonic() + _POLL_S
                 self._update_subscriptions()
@@ -114,7 +114,7 @@ class Ros2Relay:
         self._middleware.close()
 
     def _update_subscriptions(self) -> None:
-        """Request from the sensors process the topics that have subscribers, and `/tf_static`."""
+        """Subscribe at the sensors process to the topics that have subscribers, and to `/tf_static`."""
         listener = self._listener
         for topic, publisher in self._publishers.items():
             has_subscriber = publisher.matched() > 0
@@ -122,17 +122,17 @@ class Ros2Relay:
                 self.log(f"{topic} has {'a subscriber' if has_subscriber else 'no subscribers'}")
                 self._subscribed ^= {topic}
             if topic == static_frames.TOPIC or has_subscriber:
-                listener.wanted.add(topic)
+                listener.wanted_topics.add(topic)
             else:
-                listener.wanted.discard(topic)
+                listener.wanted_topics.discard(topic)
                 listener.unsubscribe(topic)
         listener.subscribe()
 
 
 def _network(address: str, node: str, spec: Ros2Spec) -> Network:
     """Return the settings of a robot's node in the ROS 2 network."""
-    # With peers the node must use the default port, which the peers use. Otherwise it uses any free port, because
-    # another program of the robot may have the default one.
+    # With peers, the node must use the default port, to which the peers connect. Otherwise it uses any free port,
+    # because another program of the robot may use the default port.
     settings = (
         {"listen/endpoints": json.dumps([f"tcp/{address}:0"])}
         if spec.middleware == "zenoh" and not spec.peers
@@ -150,17 +150,17 @@ def _network(address: str, node: str, spec: Ros2Spec) -> Network:
     )
 
 
-def _route(address: str) -> None:
+def _run_router(address: str) -> None:
     from fieldkit.agent.messaging import zenoh  # noqa: PLC0415 (only this command needs it)
 
     services.name_process(services.ZENOH_ROUTER)
-    running = zenoh.route(Network(address, discovery="none"))
+    router = zenoh.route(Network(address, discovery="none"))
     services.ready_file(services.ZENOH_ROUTER).touch()
     signal.pause()
-    running.close()
+    router.close()
 
 
-def _relay(address: str, node: str, velocities: str, ros2_json: str, types_json: str) -> None:
+def _run_relay(address: str, node: str, velocities: str, ros2_json: str, types_json: str) -> None:
     services.name_process(services.ROS2_RELAY)
     types = json.loads(types_json)
     spec = Ros2Spec.from_json(json.loads(ros2_json))
@@ -176,9 +176,9 @@ def main(argv: Sequence[str]) -> None:
     """Run a Zenoh router, or relay topics; returns only after a signal."""
     command, *words = argv
     if command == "route":
-        _route(*words)
+        _run_router(*words)
     else:
-        _relay(*words)
+        _run_relay(*words)
 
 
 if __name__ == "__main__":

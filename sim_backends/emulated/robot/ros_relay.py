@@ -31,7 +31,7 @@ _CHUNK: Final = 1 << 16
 
 
 class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no types
-    """Publishes one topic of the sensors process: while it has subscribers, or always if it is latched.
+    """Publishes one topic of the sensors process while the topic has subscribers, or always if it is latched.
 
     Args:
         topic: Name of the topic.
@@ -47,12 +47,12 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
         with stream:
             header = framing.unpack_header(_next_packet(stream, packets))
         self._message = _message_class(header)
-        self._latched = header["latching"] == "1"
+        self._is_latched = header["latching"] == "1"
         with self._lock:
             self._publisher = rospy.Publisher(
-                topic, self._message, subscriber_listener=self, queue_size=_QUEUE_MESSAGES, latch=self._latched
+                topic, self._message, subscriber_listener=self, queue_size=_QUEUE_MESSAGES, latch=self._is_latched
             )
-        if self._latched:
+        if self._is_latched:
             self._start()
 
     def peer_subscribe(self, *_: object) -> None:
@@ -70,7 +70,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
     def peer_unsubscribe(self, _topic: str, subscribers: int) -> None:
         """Stop when the last subscriber disconnects, unless the topic is latched; called by rospy."""
         with self._lock:
-            if subscribers == 0 and self._stream is not None and not self._latched:
+            if subscribers == 0 and self._stream is not None and not self._is_latched:
                 with contextlib.suppress(OSError):  # the sensors process has exited
                     self._stream.shutdown(socket.SHUT_RDWR)
                 self._stream = None
@@ -178,7 +178,7 @@ def main() -> None:
     services.name_process("ros_relay")
     node, velocities, *topics = sys.argv[1:]
     _wait("the sensors do not publish", services.ready_file("sensors").exists)
-    _wait("no ROS master", master_answers)
+    _wait("the ROS master does not answer", master_answers)
     rospy.init_node(node, disable_signals=True)
     relays = [Relay(topic) for topic in topics]
     if velocities:

@@ -23,16 +23,16 @@ from sim_backends.emulated.ros.laser import Neighbourhood
 _LOG_FLAGS: Final = os.O_WRONLY | os.O_CREAT | os.O_APPEND
 _LOG_MODE: Final = 0o600
 
-MOTION: Final = Path(STATE, "motion")
+ASSIGNED_PATHS: Final = Path(STATE, "motion")
 """The file of the paths on which the lab moves the robot."""
 
-STEERED: Final = Path(STATE, "steered")
+MOTION_RECORD: Final = Path(STATE, "steered")
 """The file in which a robot that steers itself records its motion."""
 
 FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
 """The file in which an autopilot records its command for a physics that flies the drone."""
 
-FLOWN: Final = Path(STATE, "flown")
+FLIGHT: Final = Path(STATE, "flown")
 """The file in which that physics records the flight."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
@@ -64,14 +64,15 @@ def spawn(argv: tuple[str, ...], environment: Mapping[str, str], log: Path) -> i
         ],
         setsid=True,
         setsigmask=[],
-        setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # which Python ignores
+        setsigdef=[signal.SIGPIPE, signal.SIGXFSZ],  # Python ignores these signals
     )
 
 
 def fork(name: str, work: Callable[[], None], log: Path) -> int:
-    """Call `work` in a forked process of this name, in a new session, its output in `log`; return the process id.
+    """Call `work` in a forked process of this name and in a new session; return the process id.
 
-    The fork inherits the memory of this process, but no descriptors. Call it from a process with one thread.
+    Its output is written to `log`. The fork inherits the memory of this process, but no descriptors. Call it from a
+    process with one thread.
     """
     gc.freeze()  # a garbage collection in the fork would write to, and so copy, every page of inherited objects
     pid = os.fork()
@@ -135,9 +136,9 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
     frames = static_frames.links(spec.sensors)
     publish = partial(sensors.publish, spec.sensors, spec.definitions, frames=frames, targets=spec.laser_targets)
     if neighbourhood is not None and spec.neighbours:
-        publish = partial(publish, moving=partial(neighbourhood.targets, spec.neighbours))
+        publish = partial(publish, moving_targets=partial(neighbourhood.targets, spec.neighbours))
     result = [
-        _program("sshd", ssh_server.command(spec), {}, lambda: network.listens(ssh_server.SSH_PORT)),
+        _program("sshd", ssh_server.command(spec), {}, lambda: network.has_listener(ssh_server.SSH_PORT)),
         _motion_service("sensors", publish),
     ]
     if spec.mavlink_port is not None:
@@ -146,7 +147,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
         result.append(_motion_service("base", partial(base_process.serve, spec.base)))
     result += _network_services(spec)
     if spec.ros == "debian":
-        result += _debian_ros(spec, (*spec.registered, *([static_frames.TOPIC] if frames else [])))
+        result += _debian_ros(spec, (*spec.registered_topics, *([static_frames.TOPIC] if frames else [])))
     if spec.bridge:
         argv = ("/usr/bin/env", *with_environment(spec.bridge, setup=spec.setup))
         result.append(_program(BRIDGE, argv, {}, _bridge_is_up))
@@ -156,7 +157,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
         types = {sensor.topic: sensor.type for sensor in spec.sensors}
         if frames:
             types[static_frames.TOPIC] = static_frames.TYPE
-        words = (spec.ip, ros_node(spec), _velocities(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
+        words = (spec.ip, ros_node(spec), _velocity_topic(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
         result.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return result
 
@@ -175,22 +176,22 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
 def _motion_service(name: str, serve: Callable[..., None]) -> Service:
     """Return a service that reads or records the robot's motion; it is a fork of this process."""
     ready = ready_file(name)
-    work = partial(serve, motion=MOTION, steered=STEERED, ready=ready)
+    work = partial(serve, assigned_paths=ASSIGNED_PATHS, motion_record=MOTION_RECORD, ready=ready)
     return Service(name, partial(fork, name, work), ready.exists)
 
 
 def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
     """Yield the robot's ROS master, if it runs one, and the node that publishes `topics` there."""
-    # Debian's interpreter, because rospy is installed for it.
+    # The relay runs under Debian's interpreter, because rospy is installed for it.
     variables = spec.ros1_environment | {"PYTHONPATH": str(worker.PROJECT)}
     if spec.runs_master:
         yield _master(spec, variables)
-    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocities(spec), *topics)
+    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocity_topic(spec), *topics)
     yield _program("ros_relay", relay, variables, ready_file("ros_relay").exists)
 
 
-def _velocities(spec: RobotSpec) -> str:
-    """Return the topic of velocities that the robot's base subscribes to, empty without a base."""
+def _velocity_topic(spec: RobotSpec) -> str:
+    """Return the topic of velocities that the robot's base subscribes to; empty if it has no base."""
     return spec.base.topic if spec.base else ""
 
 
@@ -206,7 +207,7 @@ def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:
         antenna_m=ANTENNA_M,
         world=spec.world,
         boot_s=spec.boot_s,
-        physics=autopilot.PhysicsFiles(FLIGHT_COMMAND, FLOWN) if spec.simulated_flight else None,
+        physics=autopilot.PhysicsFiles(FLIGHT_COMMAND, FLIGHT) if spec.simulated_flight else None,
     )
 
 
@@ -223,7 +224,7 @@ def _master(spec: RobotSpec, variables: Mapping[str, str]) -> Service:
     """Return the robot's ROS master: roscore if it serves other robots too, otherwise only the master process."""
     port = ("-p", str(ROS_MASTER_PORT))
     name, argv = ("roscore", (ROSCORE, *port)) if spec.shares_master else ("rosmaster", (_ROSMASTER, "--core", *port))
-    return _program(name, argv, variables, lambda: network.listens(ROS_MASTER_PORT))
+    return _program(name, argv, variables, lambda: network.has_listener(ROS_MASTER_PORT))
 
 
 def _program(name: str, argv: tuple[str, ...], variables: Mapping[str, str], ready: Callable[[], bool]) -> Service:
@@ -242,5 +243,5 @@ def _ros2_program(name: str, *words: str) -> Service:
 
 
 def ready_file(name: str) -> Path:
-    """Return the file that the service `name` creates when it serves."""
+    """Return the file that the service `name` creates when it is ready."""
     return Path(READY_FOLDER, name)

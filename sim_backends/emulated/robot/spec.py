@@ -27,7 +27,7 @@ STATE: Final = "/run/robot"
 """Folder in the robot that its init process writes to: files mounted over `/etc`, logs, readiness files."""
 
 LOOPBACK_INTERFACE: Final = "lo"
-"""Interface of the link whose address is reached over any other link of the robots."""
+"""Interface of the link whose address can be reached over every other link of the robots."""
 SHARED_NETWORK: Final = IPv4Network("10.42.255.0/24")
 """Addresses of the robots on that link."""
 LOOPBACK: Final = "127.0.0.1"
@@ -95,7 +95,7 @@ class WifiSpec:
         passphrase: Passphrase of the access point; empty without one.
         security: Security of the access point.
         has_monitor: True if the robot has a monitor interface.
-        background_scan: `bgscan` of wpa_supplicant by which a station finds other access points; empty for none.
+        background_scan: Setting `bgscan` of wpa_supplicant, with which a station finds other access points; or empty.
         channels: Number of channels of the 2.4 GHz band, from the first, that a station scans.
     """
 
@@ -122,9 +122,9 @@ class RobotSpec:
         ros_version: 1 or 2.
         distribution: ROS distribution that its profile names.
         setup: Setup files that its profile names.
-        ros_master: Address of its ROS master: `LOOPBACK`, or a radio address, its own or another robot's.
+        ros_master: Address of its ROS master: `LOOPBACK`, or the radio address of this or of another robot.
         sensors: Its sensors, one per published topic.
-        registered: Published topics that it registers at that master.
+        registered_topics: Published topics that it registers at that master.
         definitions: Definitions of the message types of its sensors.
         mavlink_port: UDP port of its autopilot; None without an autopilot.
         simulated_flight: True if the physics of a co-simulation flies it: the autopilot records its commands only.
@@ -138,7 +138,7 @@ class RobotSpec:
         world: World that a drone flies in, as JSON; empty for other robots.
         laser_targets: Shapes of its world that its laser detects; empty without a laser.
         neighbours: The bodies of the other robots, which reflect its laser; empty without a laser.
-        base: Its base controller; None if no program in it drives it.
+        base: Its base controller; None if no program on the robot drives it.
         ssh: Its SSH server.
         sftp: True if that server offers SFTP.
         userland: Source of `sh`, `tar`, `ip` and similar tools.
@@ -165,7 +165,7 @@ class RobotSpec:
     setup: tuple[str, ...]
     ros_master: str
     sensors: tuple[Sensor, ...]
-    registered: tuple[str, ...]
+    registered_topics: tuple[str, ...]
     definitions: dict[str, Definition]
     mavlink_port: int | None
     max_speed_m_s: float
@@ -210,18 +210,18 @@ class RobotSpec:
 
     @property
     def steers(self) -> bool:
-        """True if a program in it may steer it."""
+        """True if a program on the robot may steer it."""
         return self.mavlink_port is not None or self.base is not None
 
     @property
     def waits_for_another(self) -> bool:
         """True if its startup waits for another robot: its ROS master, its Zenoh router or its access point."""
-        joins = self.wifi is not None and self.wifi.mode == "station"
-        return self.shares_master or bool(self.ros2 and self.ros2.router) or joins
+        is_station = self.wifi is not None and self.wifi.mode == "station"
+        return self.shares_master or bool(self.ros2 and self.ros2.router) or is_station
 
     @property
     def ros1_environment(self) -> dict[str, str]:
-        """The environment variables by which ROS 1 programs reach the master, and peers reach them."""
+        """Environment variables with the addresses of the ROS master and of this robot, for ROS 1 programs."""
         address = self.ip if self.shares_master else LOOPBACK
         return {"ROS_MASTER_URI": f"http://{self.ros_master}:{ROS_MASTER_PORT}", "ROS_IP": address}
 
@@ -230,7 +230,7 @@ class RobotSpec:
         """Return the specification from the JSON of its `dataclasses.asdict`."""
         sensors = tuple(_sensor(sensor) for sensor in data["sensors"])
         definitions = {kind: Definition(**definition) for kind, definition in data["definitions"].items()}
-        words = {name: tuple(data[name]) for name in ("setup", "registered", "bridge")}
+        words = {name: tuple(data[name]) for name in ("setup", "registered_topics", "bridge")}
         base = data["base"] and Base(**data["base"])
         ros2 = data["ros2"] and Ros2Spec.from_json(data["ros2"])
         wifi = data["wifi"] and WifiSpec(**data["wifi"])

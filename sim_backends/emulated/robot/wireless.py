@@ -1,6 +1,6 @@
 """Wi-Fi of Linux on an emulated robot.
 
-It is in an ad hoc cell or an 802.11s mesh, has an access point of hostapd, or is a station of wpa_supplicant.
+The robot joins an ad hoc cell or an 802.11s mesh, runs an access point (hostapd), or is a station (wpa_supplicant).
 """
 
 import shutil
@@ -18,8 +18,8 @@ _CHANNEL: Final = 1
 _FREQUENCY_MHZ: Final = 2412
 _CHANNEL_STEP_MHZ: Final = 5
 _MAX_CHANNELS: Final = 11
-"""Channels on which every regulatory domain permits to send probe requests."""
-# Two radios that search for a cell at the same time would create two cells, so all of them join a fixed one.
+"""Number of channels on which every regulatory domain permits probe requests."""
+# Two radios that search for a cell at the same time would create two cells, so all radios join this fixed cell.
 _CELL: Final = "02:66:69:65:6c:64"
 _JOIN: Final = {
     "ad hoc": ("ibss", "join", SSID, str(_FREQUENCY_MHZ), "HT20", "fixed-freq", _CELL),
@@ -67,7 +67,7 @@ _PROTECTION: Final = {"wpa2": 0, "wpa3": 2}
 """Protected management frames, 802.11w: none, or required as in WPA3."""
 
 MONITOR: Final = "mon0"
-"""Monitor interface: all frames that the radio sends, with their tries, and all that it receives."""
+"""Name of the monitor interface, which captures all frames that the radio sends, with their tries, or receives."""
 _INTERFACE_TYPES: Final = {"ad hoc": "ibss", "mesh point": "mp"}
 
 _CONFIGURATION: Final = Path(STATE, "wifi.conf")
@@ -144,6 +144,6 @@ def is_connected(wifi: WifiSpec) -> bool:
 
 
 def _run(*argv: str, text: str = "") -> None:
-    ended = subprocess.run(argv, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
-    if ended.returncode:
-        raise RobotError(f"{argv[0]} rejected a setting: {ended.stderr.strip()}", remedy=f"update {argv[0]}")
+    result = subprocess.run(argv, input=text, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    if result.returncode:
+        raise RobotError(f"{argv[0]} rejected a setting: {result.stderr.strip()}", remedy=f"update {argv[0]}")

@@ -11,11 +11,11 @@ _FLIGHT_LAYOUT: Final = "3q10d"
 
 
 class FlightCommand(NamedTuple):
-    """Command of an autopilot.
+    """A command of an autopilot.
 
     Attributes:
         time_ns: Its time, by the monotonic clock.
-        path_start_ns: Start of the assigned path (`AssignedPath.began_ns`) that put the drone at the start of this
+        path_start_ns: Start of the assigned path (`AssignedPath.start_ns`) that put the drone at the start of this
             flight. If the lab has assigned another path since, the command is invalid.
         powered: False if the rotors are off.
         velocity_m_s: Target velocity, east, north, up.
@@ -77,12 +77,12 @@ class FlightCommandRecord(Record):
 
 
 class FlightMotion(NamedTuple):
-    """Motion of a drone, as its sensors measure it.
+    """Motion of a drone that a physics flies, for its autopilot.
 
     Attributes:
         time_ns: Its time, by the monotonic clock.
         path_start_ns: See `FlightCommand`.
-        is_supported: True if the ground or an obstacle carries the drone.
+        is_supported: True if the drone rests on the ground or on an obstacle.
         place_m: Position of its lowest point, metres east, north, up.
         velocity_m_s: Velocity, east, north, up.
         heading_rad: Heading, from east towards north.

@@ -1,8 +1,8 @@
 """Ranges of a planar laser scanner, and the shared memory with the positions of the robots that it detects.
 
 Horizontal beams end at the first surface. Only the standard library is used, as in all modules of the sensors
-process. Each surface is intersected only with the beams in its direction, so computing a scan takes about as long as
-its noise.
+process. Each surface is intersected only with the beams in its direction, so computing the ranges of a scan takes
+about as long as computing their noise.
 
 The lab writes the positions to anonymous shared memory, which each robot maps read-only before it starts its
 programs. Two slots are written alternately, each with its CRC, so that a reader always finds a complete one.
@@ -48,7 +48,7 @@ def ranges_m(
 
 
 class _Scan:
-    """Distance to the nearest surface added so far, per beam; arguments as `ranges_m`."""
+    """Distance to the nearest added surface, per beam. Arguments are those of `ranges_m`."""
 
     def __init__(self, place_m: Vector, heading_rad: float, beams: int, reach_m: float) -> None:
         self.ranges_m = [math.inf] * beams
@@ -64,7 +64,7 @@ class _Scan:
         length_m = math.hypot(along_x, along_y)
         across = x * along_y - y * along_x
         if across == 0.0 or abs(across) > self._reach_m * length_m:
-            return  # edge-on, or the whole line is out of range
+            return  # The scanner is on the line, or the whole line is out of range.
         if (x * x + y * y) ** 0.5 > self._reach_m + length_m:
             return
         first_rad = math.atan2(y, x)
@@ -73,7 +73,7 @@ class _Scan:
         for beam, angle_rad in self._beams(min(first_rad, first_rad + arc_rad), abs(arc_rad)):
             divisor = math.cos(angle_rad) * along_y - math.sin(angle_rad) * along_x
             if divisor:
-                self._hit(beam, across / divisor)
+                self._record_hit(beam, across / divisor)
 
     def add_circle(self, centre: tuple[float, float], radius_m: float) -> None:
         """Add an upright cylinder: t = m - sqrt(r^2 - d^2); its centre is m along the beam and d beside it."""
@@ -86,7 +86,7 @@ class _Scan:
         for beam, angle_rad in self._beams(centre_rad - half_rad, 2 * half_rad):
             offset_m = distance_m * math.sin(angle_rad - centre_rad)
             nearest_m = distance_m * math.cos(angle_rad - centre_rad)
-            self._hit(beam, nearest_m - math.sqrt(max(radius_m**2 - offset_m**2, 0.0)))
+            self._record_hit(beam, nearest_m - math.sqrt(max(radius_m**2 - offset_m**2, 0.0)))
 
     def _beams(self, from_rad: float, arc_rad: float) -> Iterator[tuple[int, float]]:
         """Yield number and direction of each beam within an arc."""
@@ -96,7 +96,7 @@ class _Scan:
         for number in range(first, last + 1):
             yield number % len(self.ranges_m), self._heading_rad + number * self._step_rad
 
-    def _hit(self, beam: int, range_m: float) -> None:
+    def _record_hit(self, beam: int, range_m: float) -> None:
         if 0.0 <= range_m < self.ranges_m[beam]:
             self.ranges_m[beam] = range_m
 
@@ -108,7 +108,7 @@ _ABSENT: Final = (math.nan, math.nan, math.nan)
 
 
 class _Slots:
-    """Layout of the memory for a number of robots."""
+    """Layout of the two slots for a number of robots."""
 
     def __init__(self, robots: int) -> None:
         self.places = struct.Struct(f"<{_AXES * robots}d")
@@ -117,7 +117,7 @@ class _Slots:
 
 
 class PlacesWriter:
-    """The lab's end of the memory; call `close` when every robot has stopped.
+    """Writes the positions to the memory, in the lab. Call `close` when every robot has stopped.
 
     Args:
         names: Names of all robots, in the order of `Neighbour.number`.
@@ -150,15 +150,15 @@ class PlacesWriter:
 
 
 class Neighbourhood:
-    """A robot's end of the memory.
+    """Reads the positions from the memory, in a robot.
 
     Args:
         fd: Descriptor of the memory; the caller closes it.
         robots: Number of robots in the lab.
 
     Raises:
-        OSError: It cannot be mapped.
-        ValueError: It is too small for that many robots.
+        OSError: The memory cannot be mapped.
+        ValueError: The memory is too small for this number of robots.
     """
 
     def __init__(self, fd: int, robots: int) -> None:
@@ -179,7 +179,7 @@ class Neighbourhood:
         return targets
 
     def _read(self) -> None:
-        """Read the newest complete slot; without a newer one the last positions remain."""
+        """Read the newest complete slot; if there is no newer slot, keep the last positions."""
         for start in (0, self._slots.slot_bytes):
             slot = self._memory[start : start + self._slots.slot_bytes]
             body, crc = slot[: self._slots.body_bytes], slot[self._slots.body_bytes :]

@@ -5,9 +5,9 @@ bytes before it (wiki.ros.org/msg). Each generator packs the fields of its type 
 because the libraries that support all types would cost each robot 20 MB of memory.
 
 The motion of the robot comes from `own_motion`. Frames and units follow REP 103 and REP 105: metres, radians, x
-ahead, y to the left; in frames fixed to the world x is east and y north, as in the orientation of an IMU by REP 145.
-Covariances are the values that drivers of such robots report. The laser ranges follow from the world. Numbers that
-vary in a real sensor contain noise, so that they compress no better than real data.
+ahead, y to the left. In frames that are fixed to the world, x is east and y is north, as in the orientation of an IMU
+(REP 145). Covariances are the values that drivers of such robots report. The laser ranges are computed from the
+world. Numbers that vary in a real sensor contain noise, so that they compress no better than real data.
 """
 
 import math
@@ -40,7 +40,7 @@ FIELD_T: Final = (20e-6, -44e-6)
 """Magnetic field to the north and up: about 48 uT, inclined as in mid-latitudes (IGRF)."""
 
 FIX_NOISE_M: Final = (0.1, 0.5)
-"""Standard deviation of a GNSS fix, horizontal and vertical, of a receiver that averages."""
+"""Standard deviation of the fixes of a GNSS receiver that averages, horizontal and vertical."""
 
 # The world's origin is at latitude 0, longitude 0, where WGS 84 has these radii.
 EAST_RADIUS_M: Final = 6_378_137.0
@@ -60,28 +60,31 @@ class Source:
     Args:
         sensor: The sensor.
         targets: Laser targets in the robot's world.
-        moving: Returns the laser targets that move: the other robots at their current positions.
+        moving_targets: Returns the laser targets that move: the other robots at their current positions.
 
     Raises:
         ConfigurationError: There is no generator for its type, or a property that its type needs is missing.
     """
 
     def __init__(
-        self, sensor: Sensor, targets: Sequence[LaserTarget] = (), moving: Callable[[], Sequence[LaserTarget]] = tuple
+        self,
+        sensor: Sensor,
+        targets: Sequence[LaserTarget] = (),
+        moving_targets: Callable[[], Sequence[LaserTarget]] = tuple,
     ) -> None:
         check(sensor)
         self._sensor = sensor
         self._generate = _template_generator(sensor.template) if sensor.template else GENERATORS[sensor.type]
         if sensor.type == LASER_SCAN:
-            self._generate = partial(_laser_scan, targets=targets, moving=moving)
-        self._stamped = sensor.template is None or sensor.template.stamped
+            self._generate = partial(_laser_scan, targets=targets, moving_targets=moving_targets)
+        self._has_header = sensor.template is None or sensor.template.has_header
         self._prefix = _ONE_TRANSFORM if sensor.type == "tf2_msgs/TFMessage" else b""
-        # Seeded by the topic, so that equal robots publish equal values whenever they start.
+        # The seed is the topic, so that equal robots publish equal values, independently of their start time.
         self._noise = Random(sensor.topic)  # noqa: S311 (no secret)
 
     def message(self, number: int, stamp_ns: int, motion: OwnMotion = AT_REST) -> bytes:
         """Return message `number`, serialized, for a motion and a time stamp in nanoseconds since the epoch."""
-        if not self._stamped:
+        if not self._has_header:
             return self._generate(self._sensor, self._noise, motion)
         stamp = struct.pack("<3I", number & 0xFFFFFFFF, *divmod(stamp_ns, 10**9))
         return (
@@ -130,12 +133,12 @@ def _gaussian(noise: Random, deviation: float, *means: float) -> list[float]:
     return [noise.gauss(mean, deviation) for mean in means]
 
 
-def _heading(yaw_rad: float) -> tuple[float, float, float, float]:
+def _heading_quaternion(yaw_rad: float) -> tuple[float, float, float, float]:
     """Return the quaternion x, y, z, w of a rotation to the left."""
     return (0.0, 0.0, math.sin(yaw_rad / 2), math.cos(yaw_rad / 2))
 
 
-def _within(value_m: float, low_m: float, high_m: float) -> float:
+def _reported_range_m(value_m: float, low_m: float, high_m: float) -> float:
     """Return a distance as a sensor of this range reports it (REP 117)."""
     if value_m < low_m:
         return -math.inf
@@ -147,16 +150,16 @@ def _laser_scan(
     noise: Random,
     motion: OwnMotion,
     targets: Sequence[LaserTarget] = (),
-    moving: Callable[[], Sequence[LaserTarget]] = tuple,
+    moving_targets: Callable[[], Sequence[LaserTarget]] = tuple,
 ) -> bytes:
     points = sensor.points or 0
     step = 2 * math.pi / points
     low_m, high_m = LASER_RANGE_M
-    true_m = ranges_m(chain(targets, moving()), motion.place_m, motion.heading_rad, points, high_m)
+    true_ranges_m = ranges_m(chain(targets, moving_targets()), motion.place_m, motion.heading_rad, points, high_m)
     turn_s = 1 / sensor.rate_hz
     angles = (0.0, step * (points - 1), step)
     scalars = struct.pack("<7f", *angles, turn_s / points, turn_s, low_m, high_m)
-    ranges = [_within(noise.gauss(range_m, LASER_NOISE_M), low_m, high_m) for range_m in true_m]
+    ranges = [_reported_range_m(noise.gauss(range_m, LASER_NOISE_M), low_m, high_m) for range_m in true_ranges_m]
     intensities = noise.choices(LASER_INTENSITIES, k=points)
     echoes = [0 if range_m == math.inf else echo for range_m, echo in zip(ranges, intensities, strict=True)]
     return scalars + _float32s(ranges) + _float32s(echoes)
@@ -167,27 +170,27 @@ def _imu(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     orientation_covariance, angular_covariance, acceleration_covariance = (
         _diagonal(*[variance] * 3) for variance in IMU_VARIANCES
     )
-    orientation = _float64s(_heading(motion.heading_rad), orientation_covariance)
+    orientation = _float64s(_heading_quaternion(motion.heading_rad), orientation_covariance)
     angular_velocity = _float64s(_gaussian(noise, 0.002, 0.0, 0.0, motion.turn_rad_s), angular_covariance)
     acceleration = _float64s(_gaussian(noise, 0.02, 0.0, 0.0, GRAVITY_M_S2), acceleration_covariance)
     return orientation + angular_velocity + acceleration
 
 
-def _child(sensor: Sensor) -> bytes:
+def _child_frame(sensor: Sensor) -> bytes:
     return packed_string(sensor.child_frame or "base_link")
 
 
 def _odometry(sensor: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     covariance = _diagonal(*ODOMETRY_VARIANCES)
     angular = (0.0, 0.0, noise.gauss(motion.turn_rad_s, 1e-3))
-    pose = _float64s((motion.x_m, motion.y_m, 0.0), _heading(motion.yaw_rad), covariance)
+    pose = _float64s((motion.x_m, motion.y_m, 0.0), _heading_quaternion(motion.yaw_rad), covariance)
     twist = _float64s((motion.speed_m_s, 0.0, 0.0), angular, covariance)
-    return _child(sensor) + pose + twist
+    return _child_frame(sensor) + pose + twist
 
 
 def _transforms(sensor: Sensor, _: Random, motion: OwnMotion) -> bytes:
     """Return one transform, from the odometry frame to the robot's frame: the robot's pose in odometry (REP 105)."""
-    return _child(sensor) + _float64s((motion.x_m, motion.y_m, 0.0), _heading(motion.yaw_rad))
+    return _child_frame(sensor) + _float64s((motion.x_m, motion.y_m, 0.0), _heading_quaternion(motion.yaw_rad))
 
 
 def _battery_state(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
@@ -204,7 +207,7 @@ def _range(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
     infrared = 1  # sensor_msgs/Range.INFRARED
     low_m, high_m = 0.02, 4.0
     down_m = max(STANDING_M, motion.place_m[2]) + abs(noise.gauss(0.0, 0.005))
-    return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _within(down_m, low_m, high_m))
+    return struct.pack("<B4f", infrared, math.radians(25.0), low_m, high_m, _reported_range_m(down_m, low_m, high_m))
 
 
 def _nav_sat_fix(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:
@@ -235,7 +238,9 @@ def _temperature(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
 
 
 def _pose_stamped(_: Sensor, __: Random, motion: OwnMotion) -> bytes:
-    return _float64s(motion.place_m, _heading(motion.heading_rad))  # in the world's frame, `map` of REP 105
+    return _float64s(
+        motion.place_m, _heading_quaternion(motion.heading_rad)
+    )  # in the world's frame, `map` of REP 105
 
 
 GENERATORS: Final[dict[str, Generator]] = {

@@ -1,4 +1,4 @@
-"""Quality of service that an emulated robot with ROS 2 offers per topic, used by its publishers and in its bags."""
+"""Quality of service (QoS) that an emulated robot with ROS 2 offers for each topic, in publishers and in bags."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -11,7 +11,7 @@ BY_TYPE: Final[Mapping[str, QosProfile]] = {
     f"sensor_msgs/{name}": PROFILES["sensor_data"]
     for name in ("LaserScan", "Image", "CompressedImage", "PointCloud2")
 }
-"""QoS by ROS 1 type, for types whose drivers do not use ROS 2's default QoS because of large messages."""
+"""QoS by ROS 1 type, for types with large messages, whose drivers do not use ROS 2's default QoS."""
 
 LATCHED: Final = replace(PROFILES["default"], depth=1, durability=Durability.TRANSIENT_LOCAL)
 """QoS of `/tf_static` (tf2_ros, qos.hpp, StaticBroadcasterQoS)."""

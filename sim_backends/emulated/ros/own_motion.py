@@ -1,12 +1,12 @@
 """Motion of an emulated robot for its sensors: wheel odometry and position, also of a robot that steers itself.
 
 The lab sends each path when it starts, and the robot computes its motion on it, so that no message can be late. The
-wheels do not turn when the lab puts a robot back to its place: its odometry continues from its last value.
+wheels do not turn when the lab puts a robot back at its place, so the odometry continues from its last value.
 
 For a robot that steers itself, the process that steers it (a base controller or an autopilot) uses a
-`MotionReporter`: it reads where the lab put the robot last, computes the motion from there, and writes it to a
-record, which the lab passes to the medium and the robot's sensors read. The lab may put the robot elsewhere at any
-time; records that refer to an earlier path are then ignored.
+`MotionReporter`. It reads the last place at which the lab has put the robot, computes the motion from there, and
+writes it to a record. The robot's sensors read this record, and the lab passes it to the medium. The lab may put the
+robot at another place at any time; records that refer to an earlier path are then ignored.
 """
 
 import json
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from fieldkit.core.model import Vector
-from sim_backends.emulated.ros.steered import Steered, SteeredRecord
+from sim_backends.emulated.ros.motion_record import MotionRecord, RecordedMotion
 from sim_backends.world.motion import STILL, WayPoints
 
 
@@ -27,13 +27,13 @@ class AssignedPath:
     """Path on which the lab moves a robot, which stops at its end; a path of one point is a place.
 
     Attributes:
-        began_ns: Start of the motion, by the monotonic clock, which all robots of a machine share.
+        start_ns: Start of the motion, by the monotonic clock, which all robots of a machine share.
         points_m: Points of the path, metres east, north, up.
         speed_m_s: Speed along the path.
         facing_rad: Heading of the robot before the start, from east towards north.
     """
 
-    began_ns: int
+    start_ns: int
     points_m: Sequence[Vector]
     speed_m_s: float
     facing_rad: float
@@ -44,9 +44,9 @@ class OwnMotion:
     """State of motion of a robot at one time.
 
     Attributes:
-        x_m: Odometry: distance ahead from where the robot was switched on, along its heading at that time.
-        y_m: Odometry: distance to the left of that.
-        yaw_rad: Odometry: angle turned to the left since then.
+        x_m: Odometry: distance ahead of the place where the robot was switched on, along its heading at that time.
+        y_m: Odometry: distance to the left of that heading.
+        yaw_rad: Odometry: angle to the left of that heading.
         speed_m_s: Forward speed.
         place_m: Position, metres east, north, up.
         heading_rad: Heading, from east towards north.
@@ -77,14 +77,15 @@ class Odometer:
     Args:
         path: The file of assigned paths, which may be missing.
         now_ns: Time of the start, by the monotonic clock.
-        steered: The file in which a robot that steers itself records its motion; None for other robots.
+        motion_record: The file in which a robot that steers itself records its motion; None for other robots.
     """
 
-    def __init__(self, path: Path, now_ns: int, steered: Path | None = None) -> None:
+    def __init__(self, path: Path, now_ns: int, motion_record: Path | None = None) -> None:
         self._file_path = path
-        self._record = None if steered is None else SteeredRecord.open(steered)
+        self._record = None if motion_record is None else MotionRecord.open(motion_record)
         self._read_bytes = 0
         self._path: AssignedPath | None = None
+        # Motion of the robot when its last path started.
         self._base = AT_REST
         self._read_paths(now_ns)
         self._base = AT_REST
@@ -97,23 +98,24 @@ class Odometer:
     def at(self, now_ns: int) -> OwnMotion:
         """Return the robot's motion at a time; times must not decrease from call to call."""
         self._read_paths(now_ns)
-        return self._steered(now_ns) or self._assigned(now_ns)
+        return self._recorded_motion(now_ns) or self._assigned_motion(now_ns)
 
     @property
     def path_start_ns(self) -> int:
         """Start of the last assigned path, 0 if there is none."""
-        return 0 if self._path is None else self._path.began_ns
+        return 0 if self._path is None else self._path.start_ns
 
-    def _steered(self, now_ns: int) -> OwnMotion | None:
+    def _recorded_motion(self, now_ns: int) -> OwnMotion | None:
         """Return the recorded motion, or None if the robot has not steered itself since its last assigned path."""
         last = None if self._record is None else self._record.read()
         if last is None or last.path_start_ns != self.path_start_ns:
             return None
         current = last.at(now_ns)
-        speed_m_s = last.speed_m_s if current.moves else 0.0  # `at` turns the heading and not the velocity
+        # `RecordedMotion.at` changes the heading, but not the velocity, so the speed is that of the record.
+        speed_m_s = last.speed_m_s if current.is_moving else 0.0
         return OwnMotion(*current.odometry, speed_m_s, current.place_m, current.heading_rad, current.turn_rad_s)
 
-    def _assigned(self, now_ns: int) -> OwnMotion:
+    def _assigned_motion(self, now_ns: int) -> OwnMotion:
         """Return the motion on the last assigned path."""
         return self._base if self._path is None else _motion_on(self._path, self._base, now_ns)
 
@@ -131,14 +133,14 @@ class Odometer:
         self._read_bytes += len(complete)
         for line in complete.splitlines():
             path = AssignedPath(**json.loads(line))
-            change_ns = min(path.began_ns, now_ns)
-            self._base = self._steered(change_ns) or self._assigned(change_ns)
+            change_ns = min(path.start_ns, now_ns)
+            self._base = self._recorded_motion(change_ns) or self._assigned_motion(change_ns)
             self._path = path
 
 
 def _motion_on(path: AssignedPath, base: OwnMotion, now_ns: int) -> OwnMotion:
     """Return a robot's motion on a path at a time; `base` is its motion when the path started."""
-    elapsed_ns = now_ns - path.began_ns
+    elapsed_ns = now_ns - path.start_ns
     points_m = [(point_m[0], point_m[1], 0.0) for point_m in path.points_m]  # the speed is horizontal
     (east_m, north_m, _), velocity_m_s, _ = WayPoints("", points_m, path.speed_m_s).at(elapsed_ns)[""]
     heading_rad = path.facing_rad
@@ -160,12 +162,12 @@ def _motion_on(path: AssignedPath, base: OwnMotion, now_ns: int) -> OwnMotion:
 
 def _height_m(path: AssignedPath, elapsed_ns: int) -> float:
     """Return the height of a robot, interpolated between the points of its path."""
-    left_m = max(elapsed_ns, 0) / 1e9 * path.speed_m_s
+    remaining_m = max(elapsed_ns, 0) / 1e9 * path.speed_m_s
     for start_m, end_m in pairwise(path.points_m):
         length_m = math.dist(start_m[:2], end_m[:2])
-        if left_m < length_m:
-            return start_m[2] + left_m / length_m * (end_m[2] - start_m[2])
-        left_m -= length_m
+        if remaining_m < length_m:
+            return start_m[2] + remaining_m / length_m * (end_m[2] - start_m[2])
+        remaining_m -= length_m
     return path.points_m[-1][2]
 
 
@@ -189,7 +191,7 @@ class MotionReporter:
     """
 
     def __init__(self, paths: Path, record: Path, now_ns: int) -> None:
-        self._record = SteeredRecord.open(record)
+        self._record = MotionRecord.open(record)
         self._odometer = Odometer(paths, now_ns, record)
         self._path_start_ns: int | None = None
 
@@ -199,7 +201,7 @@ class MotionReporter:
         return self._path_start_ns or 0
 
     def poll_placement(self, now_ns: int) -> OwnMotion | None:
-        """Return the place at which the lab has put the robot since the last call, or None if it has not.
+        """Return the place at which the lab has put the robot since the last call, or None if it has not moved it.
 
         The first call returns the place of the robot, also after the process has been restarted.
 
@@ -222,14 +224,14 @@ class MotionReporter:
         turn_rad_s: float = 0.0,
         odometry: Vector = (0.0, 0.0, 0.0),
     ) -> None:
-        """Record the robot's position and motion; see `Steered`.
+        """Record the robot's position and motion; see `RecordedMotion`.
 
-        Call it ten times a second or more while the robot moves, because a robot without a record for
-        `steered.SILENT_NS` stops; and once after it has stopped.
+        Call it at least ten times a second while the robot moves, because a robot without a new record for
+        `motion_record.SILENT_NS` counts as stopped. Call it once after the robot has stopped.
 
         Raises:
             OSError: There is no space for it.
         """
         self._record.write(
-            Steered(now_ns, self.path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
+            RecordedMotion(now_ns, self.path_start_ns, place_m, velocity_m_s, heading_rad, turn_rad_s, odometry)
         )

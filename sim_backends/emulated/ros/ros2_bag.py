@@ -1,8 +1,9 @@
 """The `ros2` command of an emulated robot without ROS: `ros2 bag record` writes bags like ROS 2's own.
 
-It uses no DDS: it reads the robot's sensors as the built-in `rosbag` does, converts each message to CDR, and stores
-it with the requested rosbag2 plugin and the quality of service that the publisher offers. Like the original it has no
-duration and stops on SIGINT or SIGTERM; options of the original that no trial uses are rejected as unknown.
+It does not use DDS. It reads the robot's sensors as the built-in `rosbag` does, converts each message to CDR, and
+stores it with the requested rosbag2 plugin and the quality of service that the publisher offers. Like the original,
+it has no option for a duration, and stops on SIGINT or SIGTERM. Options of the original that no trial uses are
+rejected as unknown.
 """
 
 import argparse
@@ -66,7 +67,8 @@ class Rosbag2Recorder:
         self._sensors, self._types = types.ros1, types.ros2
         self._defaults: dict[str, object] = {}
         self._connections: dict[str, Connection] = {}
-        self._reported: set[str] = set()  # topics whose messages are not of their type
+        # Topics for which a message of another type was reported.
+        self._reported_topics: set[str] = set()
 
     def run(self) -> int:
         """Record; return the number of the signal that stopped it.
@@ -79,26 +81,26 @@ class Rosbag2Recorder:
         with Writer(self._folder, version=self._format, storage_plugin=self._storage) as writer:
             _log("rosbag2_storage", f"Opened database '{_rename_file(writer)}' for READ_WRITE.")
             _log("rosbag2_recorder", "Listening for topics...")
-            complete = False
-            while listener.stopped_by is None:
-                listener.wanted |= self._topics or set(tcpros.topics())
+            is_complete = False
+            while listener.stop_signal is None:
+                listener.wanted_topics |= self._topics or set(tcpros.topics())
                 listener.subscribe()
                 for header, message in listener.events(_TICK_S):
                     self._write(writer, header, message)
-                if not complete and self._topics and self._connections.keys() >= self._topics:
-                    complete = True
+                if not is_complete and self._topics and self._connections.keys() >= self._topics:
+                    is_complete = True
                     _log("rosbag2_recorder", "All requested topics are subscribed. Stopping discovery...")
             _log("rosbag2_cpp", "Writing remaining messages from cache to the bag. It may take a while")
-        return listener.stopped_by
+        return listener.stop_signal
 
     def _write(self, writer: Writer, header: Header, message: bytes | None) -> None:
         topic, kind = header["topic"], type_of(header)
         if kind not in self._types.fielddefs or kind not in self._sensors.fielddefs:
             return  # the package of the type is not installed; the original logs this and continues
         if topic not in self._connections:
-            offered = (_discovered(offered_qos.of_topic(topic, header["type"])),)
+            profiles = (_discovered_qos(offered_qos.of_topic(topic, header["type"])),)
             self._connections[topic] = writer.add_connection(
-                topic, kind, typestore=self._types, offered_qos_profiles=offered
+                topic, kind, typestore=self._types, offered_qos_profiles=profiles
             )
             _log("rosbag2_recorder", f"Subscribed to topic '{topic}'")
         if message is not None:
@@ -107,15 +109,15 @@ class Rosbag2Recorder:
                     self._sensors, self._types, kind, kind, self._defaults, message, src_is2=False, dst_is2=True
                 )
             except Exception as error:  # noqa: BLE001 (on any error the publisher's bytes are not a message of this type)
-                if topic not in self._reported:
-                    self._reported.add(topic)
+                if topic not in self._reported_topics:
+                    self._reported_topics.add(topic)
                     reason = f"{type(error).__name__}: {error}"
                     _log("rosbag2_recorder", f"Messages of topic '{topic}' are not of type '{kind}': {reason}")
                 return
             writer.write(self._connections[topic], time.time_ns(), data)
 
 
-def _discovered(profile: QosProfile) -> Qos:
+def _discovered_qos(profile: QosProfile) -> Qos:
     """Return a QoS profile as a recorder discovers it by DDS: without the history, which DDS does not announce.
 
     Unlimited times are RMW_DURATION_INFINITE, and `automatic` is DDS's default liveliness (rmw/types.h).

@@ -1,8 +1,8 @@
 """The `rosbag` command of an emulated robot without ROS: `record` and `info`, with the behaviour of ROS's own (1.15).
 
-Like the original it is a wrapper around a recorder process: the wrapper rejects wrong options with exit code 2,
-forwards SIGINT and SIGTERM, and always returns 0; after SIGKILL of the wrapper alone the recorder continues. Options
-of the original that no trial uses are rejected as unknown.
+Like the original, it is a wrapper around a recorder process. The wrapper rejects wrong options with exit code 2,
+forwards SIGINT and SIGTERM, and always returns 0. If only the wrapper is killed with SIGKILL, the recorder continues.
+Options of the original that no trial uses are rejected as unknown.
 """
 
 import errno
@@ -22,8 +22,8 @@ from rosbags.typesys.msg import denormalize_msgtype
 
 from sim_backends.emulated.ros.rosbag_record import Options, RecorderError, Rosbag1Recorder
 
-# Time that the original waits for its recorder after it forwarded a signal: subprocess.Popen.wait in Python 3 waits a
-# quarter of a second for a child after KeyboardInterrupt.
+# Time that the original waits for its recorder after it has forwarded a signal: after KeyboardInterrupt,
+# subprocess.Popen.wait in Python 3 waits a quarter of a second for the child.
 _AFTER_SIGNAL_S: Final = 0.25
 
 _SECONDS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0}
@@ -32,14 +32,14 @@ _SECONDS: Final = {"s": 1.0, "m": 60.0, "h": 3600.0}
 def record(argv: Sequence[str]) -> int:
     """Record a bag."""
     options = _record_options(argv)
-    forwarded = {signal.SIGINT, signal.SIGTERM}
-    signal.pthread_sigmask(signal.SIG_BLOCK, {*forwarded, signal.SIGCHLD})
+    forwarded_signals = {signal.SIGINT, signal.SIGTERM}
+    signal.pthread_sigmask(signal.SIG_BLOCK, {*forwarded_signals, signal.SIGCHLD})
     sys.stdout.flush()
     recorder = os.fork()
     if recorder == 0:
         os._exit(_record_in_child(options))
-    number = signal.sigwait({*forwarded, signal.SIGCHLD})
-    if number in forwarded:
+    number = signal.sigwait({*forwarded_signals, signal.SIGCHLD})
+    if number in forwarded_signals:
         os.kill(recorder, number)
         signal.sigtimedwait({signal.SIGCHLD}, _AFTER_SIGNAL_S)
     return 0
@@ -200,9 +200,9 @@ def _compression(reader: Reader) -> str:
 def _duration(seconds: float) -> str:
     if seconds < 60:
         return f"{seconds:.1f}s"
-    minutes, rest = divmod(int(seconds), 60)
+    minutes, remainder_s = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
-    clock = f"{hours}hr {minutes}:{rest:02d}s" if hours else f"{minutes}:{rest:02d}s"
+    clock = f"{hours}hr {minutes}:{remainder_s:02d}s" if hours else f"{minutes}:{remainder_s:02d}s"
     return f"{clock} ({int(seconds)}s)"
 
 

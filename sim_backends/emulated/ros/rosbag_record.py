@@ -26,7 +26,7 @@ class Options:
         topics: Names of the topics.
         all_topics: Record every published topic.
         prefix: Prefix of the bag's name, before the date.
-        name: Name of the bag; without prefix and name it is the date.
+        name: Name of the bag; None for a name from the prefix and the date.
         duration_s: Stop after this time.
         limit: Stop each topic after this number of messages; 0 for no limit.
         chunk_bytes: Size of a chunk of the bag.
@@ -70,8 +70,8 @@ class Rosbag1Recorder:
     def __init__(self, options: Options) -> None:
         self._options = options
         self._listener = Listener()
-        self._messages: Counter[str] = Counter()
-        self._exhausted: set[str] = set()
+        self._message_counts: Counter[str] = Counter()
+        self._complete_topics: set[str] = set()
 
     def run(self) -> None:
         """Record.
@@ -82,40 +82,40 @@ class Rosbag1Recorder:
         for topic in self._options.topics:
             self._add_topic(topic)
         bag = self._options.bag()
-        active = bag.with_name(f"{bag.name}.active")
-        writer = self._open(active)
+        active_bag = bag.with_name(f"{bag.name}.active")
+        writer = self._open(active_bag)
         _print(f"Recording to '{bag}'.")
         start_ns = time.time_ns()
         while not self._is_over(start_ns):
             if self._options.all_topics:
                 for topic in tcpros.topics():
-                    if topic not in self._listener.wanted | self._exhausted:
+                    if topic not in self._listener.wanted_topics | self._complete_topics:
                         self._add_topic(topic)
             self._listener.subscribe()
             self._write(writer, start_ns)
         writer.close()
-        active.rename(bag)
+        active_bag.rename(bag)
 
-    def _open(self, active: Path) -> Writer:
-        active.unlink(missing_ok=True)
-        writer = Writer(active)
+    def _open(self, active_bag: Path) -> Writer:
+        active_bag.unlink(missing_ok=True)
+        writer = Writer(active_bag)
         writer.chunk_threshold = self._options.chunk_bytes
         try:
             writer.open()
         except OSError as error:
-            raise RecorderError(f"Error writing: Error opening file: {active}") from error
+            raise RecorderError(f"Error writing: Error opening file: {active_bag}") from error
         return writer
 
     def _is_over(self, start_ns: int) -> bool:
-        limit_reached = bool(self._exhausted) and not self._listener.wanted and not self._options.all_topics
-        return self._listener.stopped_by is not None or limit_reached or self._is_past(start_ns, time.time_ns())
+        is_limited = bool(self._complete_topics) and not self._listener.wanted_topics and not self._options.all_topics
+        return self._listener.stop_signal is not None or is_limited or self._is_past(start_ns, time.time_ns())
 
     def _is_past(self, start_ns: int, now_ns: int) -> bool:
         duration_s = self._options.duration_s
         return duration_s is not None and now_ns - start_ns > duration_s * 1e9
 
     def _add_topic(self, topic: str) -> None:
-        self._listener.wanted.add(topic)
+        self._listener.wanted_topics.add(topic)
         _print(f"Subscribing to {topic}")
 
     def _write(self, writer: Writer, start_ns: int) -> None:
@@ -128,15 +128,15 @@ class Rosbag1Recorder:
             if self._is_past(start_ns, now_ns):
                 return
             writer.write(connection, now_ns, message)
-            self._messages[topic := header["topic"]] += 1
-            if self._messages[topic] == self._options.limit:
-                self._exhausted.add(topic)
-                self._listener.wanted.discard(topic)
+            self._message_counts[topic := header["topic"]] += 1
+            if self._message_counts[topic] == self._options.limit:
+                self._complete_topics.add(topic)
+                self._listener.wanted_topics.discard(topic)
                 self._listener.unsubscribe(topic)
 
 
 def _connection(writer: Writer, header: Header) -> Connection:
-    """Return the bag's connection of a topic; a publisher that returns gets the same one."""
+    """Return the bag's connection of a topic; a publisher that connects again gets the same connection."""
     for connection in writer.connections:
         if connection.topic == header["topic"]:
             return connection

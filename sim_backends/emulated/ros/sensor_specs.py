@@ -27,17 +27,17 @@ GENERATED_TYPES: Final = (
 
 @dataclass(frozen=True)
 class Template:
-    """Serialized parts of messages of a type without a generator.
+    """Serialized parts of the messages of a type that has no generator.
 
     Attributes:
-        stamped: True if the message starts with a header.
+        has_header: True if the message starts with a header.
         head: Content between the header and the list that is filled, serialized, in hexadecimal digits.
         tail: Content after the list, in the same form.
         size_bytes: Size of the list.
         floats: True if the list holds 4-byte floats; otherwise any bytes.
     """
 
-    stamped: bool
+    has_header: bool
     head: str
     tail: str
     size_bytes: int
@@ -73,7 +73,7 @@ class Definition:
 
     Attributes:
         text: Fields of the type and of all types in it.
-        md5: MD5 sum of the definition, by which ROS compares types.
+        md5: MD5 sum of the definition, with which ROS compares types.
     """
 
     text: str

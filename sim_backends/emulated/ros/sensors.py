@@ -107,16 +107,18 @@ class TopicSocket:
         topic: Name of the topic.
         header: Fields of the connection header.
         selector: Selector of the process; each key's data is the function to call with the events.
-        latched: The message for each new subscriber; empty for a topic that is not latched.
+        latched_message: The message for each new subscriber; empty for a topic that is not latched.
 
     Raises:
         OSError: The socket cannot be created.
     """
 
     def __init__(
-        self, topic: str, header: Mapping[str, str], selector: selectors.BaseSelector, latched: bytes = b""
+        self, topic: str, header: Mapping[str, str], selector: selectors.BaseSelector, latched_message: bytes = b""
     ) -> None:
-        self._greeting = framing.pack(framing.pack_header(header)) + (framing.pack(latched) if latched else b"")
+        self._greeting = framing.pack(framing.pack_header(header))
+        if latched_message:
+            self._greeting += framing.pack(latched_message)
         self._selector = selector
         self._subscribers: list[Subscriber] = []
         path = tcpros.socket_path(topic)
@@ -147,7 +149,7 @@ class Publication:
         odometer: Source of the robot's motion.
         selector: Selector of the process; each key's data is the function to call with the events.
         targets: Laser targets in the robot's world.
-        moving: Returns the laser targets that move: the other robots at their current positions.
+        moving_targets: Returns the laser targets that move: the other robots at their current positions.
     """
 
     def __init__(
@@ -159,17 +161,17 @@ class Publication:
         selector: selectors.BaseSelector,
         *,
         targets: Sequence[LaserTarget] = (),
-        moving: Callable[[], Sequence[LaserTarget]] = tuple,
+        moving_targets: Callable[[], Sequence[LaserTarget]] = tuple,
     ) -> None:
         self._odometer = odometer
         self._sensor = sensor
-        self._source = Source(sensor, targets, moving)
+        self._source = Source(sensor, targets, moving_targets)
         self._start_s = start_s
         self._number: int | None = None
         self._topic_socket = TopicSocket(sensor.topic, _header(sensor.topic, sensor.type, definition), selector)
 
     def publish(self) -> float:
-        """Publish the next message if it is due; return the seconds until the next, infinite without subscribers."""
+        """Publish the next message if it is due; return the seconds until the next (infinite without subscribers)."""
         subscribers = self._topic_socket.subscribers()
         if not subscribers:
             self._number = None
@@ -178,8 +180,8 @@ class Publication:
         if self._number is None:
             self._number = math.ceil(elapsed_s * rate_hz)
         elif self._number <= elapsed_s * rate_hz:
-            now = self._odometer.at(time.monotonic_ns())
-            packet = framing.pack(self._source.message(self._number, time.time_ns(), now))
+            current_motion = self._odometer.at(time.monotonic_ns())
+            packet = framing.pack(self._source.message(self._number, time.time_ns(), current_motion))
             for subscriber in subscribers:
                 subscriber.send(packet)
             self._number += 1
@@ -192,9 +194,9 @@ def publish(
     *,
     frames: Sequence[static_frames.Link],
     targets: Sequence[LaserTarget] = (),
-    moving: Callable[[], Sequence[LaserTarget]] = tuple,
-    motion: Path,
-    steered: Path,
+    moving_targets: Callable[[], Sequence[LaserTarget]] = tuple,
+    assigned_paths: Path,
+    motion_record: Path,
     ready: Path,
 ) -> None:
     """Publish until the process is killed.
@@ -202,12 +204,12 @@ def publish(
     Args:
         sensors: The sensors.
         definitions: Definitions of their message types, and of `static_frames.TYPE` if there are frames.
-        frames: Links in `/tf_static`, published once and latched; empty for a robot without them.
+        frames: Links in `/tf_static`, which is published once and latched; empty for a robot without it.
         targets: Laser targets in the robot's world.
-        moving: Returns the laser targets that move: the other robots at their current positions.
-        motion: The file of the paths that the lab assigns (`own_motion.append_path`).
-        steered: The file in which a robot that steers itself records its motion (`own_motion.MotionReporter`).
-        ready: Created when every topic can be subscribed to.
+        moving_targets: Returns the laser targets that move: the other robots at their current positions.
+        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
+        motion_record: The file in which a robot that steers itself records its motion (`own_motion.MotionReporter`).
+        ready: File that is created when every topic can be subscribed to.
 
     Raises:
         OSError: A socket cannot be created.
@@ -215,9 +217,17 @@ def publish(
     start_s = time.monotonic()
     Path(tcpros.FOLDER).mkdir(exist_ok=True)
     selector = selectors.DefaultSelector()
-    odometer = Odometer(motion, time.monotonic_ns(), steered)
+    odometer = Odometer(assigned_paths, time.monotonic_ns(), motion_record)
     publications = [
-        Publication(sensor, definitions[sensor.type], start_s, odometer, selector, targets=targets, moving=moving)
+        Publication(
+            sensor,
+            definitions[sensor.type],
+            start_s,
+            odometer,
+            selector,
+            targets=targets,
+            moving_targets=moving_targets,
+        )
         for sensor in sensors
     ]
     if frames:

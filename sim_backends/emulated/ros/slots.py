@@ -1,7 +1,7 @@
-"""A record in a file, with one writer and any number of readers, which find a complete record at any time.
+"""A record in a file, with one writer and any number of readers.
 
-Two slots are written alternately, each with a number and a CRC, so that a reader finds a complete record while one is
-being written, and after the writer was killed.
+Two slots are written alternately, each with a number and a CRC. A reader therefore finds a complete record at any
+time: while another record is being written, and after the writer was killed.
 """
 
 import os
@@ -68,7 +68,7 @@ class Slots:
 
 
 class Record:
-    """A record with a fixed layout in a file; its classes add `write` and `read`.
+    """A record with a fixed layout in a file; subclasses add `write` and `read`.
 
     Args:
         fd: Descriptor of the file, which this object closes.
@@ -87,7 +87,7 @@ class Record:
         """Return the record in a file, which is created if it is missing.
 
         Raises:
-            OSError: It cannot be created.
+            OSError: The file cannot be created.
         """
         return cls(os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
 

@@ -1,6 +1,6 @@
 """Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-All its sensors measure at the robot's position, with any frame name, so every transform is the identity.
+All its sensors measure at the robot's position, whatever their frame is named, so every transform is the identity.
 """
 
 import struct
@@ -24,17 +24,17 @@ _IDENTITY: Final = struct.pack("<7d", *[0.0] * 6, 1.0)
 def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
     """Return the links from the child frame of odometry via `base_link` to the frames of the sensors.
 
-    Empty for a robot whose profile lists `/tf_static` among its topics.
+    The result is empty for a robot whose profile lists `/tf_static` among its topics.
     """
     sensors = tuple(sensors)
     if any(sensor.topic == TOPIC for sensor in sensors):
         return ()
-    moving = [sensor.child_frame for sensor in sensors if sensor.child_frame]
-    base = moving[0] if moving else BASE
+    child_frames = [sensor.child_frame for sensor in sensors if sensor.child_frame]
+    base = child_frames[0] if child_frames else BASE
     excluded = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
     frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded)
-    joined = [(base, BASE)] if base != BASE else []
-    return (*joined, *((BASE, frame) for frame in frames))
+    base_links = [(base, BASE)] if base != BASE else []
+    return (*base_links, *((BASE, frame) for frame in frames))
 
 
 def message(links: Sequence[Link], stamp_ns: int) -> bytes:

@@ -1,4 +1,4 @@
-"""TCPROS (`sim_backends.ros1.framing`) over a Unix socket per topic: a subscriber.
+"""Subscriber of TCPROS (`sim_backends.ros1.framing`), over a Unix socket per topic.
 
 Only the standard library is imported, because Debian's Python imports this module too.
 """
@@ -31,7 +31,7 @@ def topics() -> list[str]:
 
 
 def request(caller: str, topic: str) -> bytes:
-    """Return the connection header by which a subscriber requests `topic`, of any type."""
+    """Return the connection header with which a subscriber requests `topic`, of any type."""
     return pack(pack_header({"callerid": caller, "topic": topic, "md5sum": "*", "type": "*"}))
 
 
@@ -58,13 +58,13 @@ class Listener:
     A publisher that violates TCPROS is disconnected permanently; the other topics continue.
 
     Attributes:
-        wanted: Topics to subscribe to.
-        stopped_by: The signal that was received, or None.
+        wanted_topics: Topics to subscribe to.
+        stop_signal: The signal that was received, or None.
     """
 
     def __init__(self) -> None:
-        self.wanted: set[str] = set()
-        self.stopped_by: int | None = None
+        self.wanted_topics: set[str] = set()
+        self.stop_signal: int | None = None
         self._subscriptions: dict[str, _Subscription] = {}
         self._invalid: set[str] = set()
         self._selector = selectors.DefaultSelector()
@@ -72,14 +72,14 @@ class Listener:
 
     def subscribe(self) -> None:
         """Connect to every wanted topic that has a publisher now."""
-        for topic in sorted(self.wanted - self._subscriptions.keys() - self._invalid):
+        for topic in sorted(self.wanted_topics - self._subscriptions.keys() - self._invalid):
             stream = socket.socket(socket.AF_UNIX)
             try:
                 stream.connect(str(socket_path(topic)))
             except OSError:
                 stream.close()  # it has no publisher yet
                 continue
-            with contextlib.suppress(OSError):  # a publisher that has exited is noticed when the stream is read
+            with contextlib.suppress(OSError):  # a publisher that has exited is detected when the stream is read
                 stream.sendall(request("/record", topic))
             self._subscriptions[topic] = _Subscription(topic, stream)
             self._selector.register(stream, selectors.EVENT_READ, self._subscriptions[topic])
@@ -133,7 +133,7 @@ class Listener:
         self._selector.register(receiver, selectors.EVENT_READ)
 
         def stop(number: int, _: object) -> None:
-            self.stopped_by = number
+            self.stop_signal = number
 
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, stop)

@@ -44,9 +44,9 @@ Values = Mapping[str, bytes]
 
 
 def definition_of(kind: str, text: str) -> Definition:
-    """Return the definition that a publisher of the type `package/Name` announces; `text` if ROS has no definition.
+    """Return the definition that a publisher of the type `package/Name` announces; `text` is used if ROS has none.
 
-    Errors as `template_of`, which first rejects types without a definition.
+    Raises the errors of `template_of`, which first rejects types without a definition.
     """
     return Definition(*_types(kind, text).generate_msgdef(_full_name(kind), ros_version=1))
 
@@ -57,23 +57,23 @@ def template_of(topic: PublishedTopic) -> Template:
     Raises:
         ConfigurationError: The definition is missing or cannot be parsed, or no list can have the required size.
     """
-    packed = _SerializedFields(_types(topic.type, topic.definition), topic.payload_bytes, _values(topic))
+    fields = _SerializedFields(_types(topic.type, topic.definition), topic.payload_bytes, _field_values(topic))
     try:
-        stamped = packed.add_message(_full_name(topic.type))
+        has_header = fields.add_message(_full_name(topic.type))
     except KeyError as error:
-        raise _unknown(topic) from error
-    if topic.payload_bytes and packed.list_type is None:
+        raise _unknown_type_error(topic) from error
+    if topic.payload_bytes and fields.list_type is None:
         raise ConfigurationError(
             f"{topic.type} has no list of numbers whose size can be {topic.payload_bytes} bytes",
             where=f"topic {topic.name}",
             remedy="remove size, or make it a multiple of a number's bytes",
         )
-    floats = packed.list_type == "float32" or topic.type == "sensor_msgs/PointCloud2"
-    head, tail = (part.hex() for part in packed.parts)
-    return Template(stamped, head, tail, topic.payload_bytes, floats)
+    floats = fields.list_type == "float32" or topic.type == "sensor_msgs/PointCloud2"
+    head, tail = (part.hex() for part in fields.parts)
+    return Template(has_header, head, tail, topic.payload_bytes, floats)
 
 
-def _values(topic: PublishedTopic) -> Values:
+def _field_values(topic: PublishedTopic) -> Values:
     values_of = _VALUES.get(topic.type)
     return values_of(topic) if values_of else {}
 
@@ -84,7 +84,10 @@ def _full_name(kind: str) -> str:
 
 @cache
 def _types(kind: str, definition: str) -> "Typestore":
-    """Return ROS 1's types and the types in a definition: fields of the type, then `MSG: package/Name` and fields."""
+    """Return ROS 1's types and the types in a definition.
+
+    The definition has the fields of the type, then `MSG: package/Name` and the fields of each type in it.
+    """
     from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 (50 ms)
 
     from fieldkit.ros.interfaces.definitions import EXTRA_DEFINITIONS  # noqa: PLC0415 (as above)
@@ -104,7 +107,7 @@ def _types(kind: str, definition: str) -> "Typestore":
     return store
 
 
-def _unknown(topic: PublishedTopic) -> ConfigurationError:
+def _unknown_type_error(topic: PublishedTopic) -> ConfigurationError:
     remedy = f"write what `rosmsg show -r {topic.type}` prints under definition: of the topic"
     return ConfigurationError(
         f"an emulated robot cannot publish {topic.type}: ROS 1 itself has no definition of it, or of a type in it",
@@ -132,13 +135,13 @@ class _SerializedFields:
     def add_message(self, kind: str) -> bool:
         """Add every field of the outermost message except its header; return True if it has a header."""
         _, fields = self._store.fielddefs[kind]
-        stamped = bool(fields) and fields[0][1][1] == _HEADER
-        for name, field in fields[1:] if stamped else fields:
+        has_header = bool(fields) and fields[0][1][1] == _HEADER
+        for name, field in fields[1:] if has_header else fields:
             if name in self._values:
                 self._add(self._values[name])
             else:
                 self._add_field(*field)
-        return stamped
+        return has_header
 
     def _add(self, data: bytes) -> None:
         self.parts[self.list_type is not None].extend(data)

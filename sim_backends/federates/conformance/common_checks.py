@@ -1,4 +1,4 @@
-"""Checks of both roles: handshake, ping, refusals, the end of a session, forks that are not declared."""
+"""Checks of both roles: handshake, ping, rejected requests, the end of a session, forks that are not declared."""
 
 from sim_backends.federates.conformance.probe import CheckError, NotDeclaredError, Target
 from sim_backends.federates.exchanges import encode_fork
@@ -12,9 +12,9 @@ def check_handshake(target: Target) -> None:
     welcome = target.open().welcome
     if not welcome.name:
         raise CheckError("welcome has no name")
-    unknown = set(welcome.commands) - set(COMMAND_TYPES)
-    if unknown:
-        raise CheckError(f"welcome has unknown types of commands: {sorted(unknown)}")
+    unknown_types = set(welcome.commands) - set(COMMAND_TYPES)
+    if unknown_types:
+        raise CheckError(f"welcome has unknown types of commands: {sorted(unknown_types)}")
     if any(index >= len(target.hello.agents) for index in welcome.transmitters):
         raise CheckError(f"welcome has transmitters that are not agents: {list(welcome.transmitters)}")
 
@@ -39,12 +39,14 @@ def check_malformed(target: Target) -> None:
 
 def check_counts(target: Target) -> None:
     """A count that is larger than the frame is refused with an error."""
-    times, kind, answer = (
+    bytes_before_count, kind, answer = (
         (16, MessageKind.ADVANCE_PHYSICS, MessageKind.STATES)
         if target.is_physics
         else (24, MessageKind.ADVANCE_NETWORK, MessageKind.OUTCOMES)
     )
-    target.open().expect_error(kind, bytes(times) + b"\xff" * 4, answer, "a count that is larger than the frame")
+    target.open().expect_error(
+        kind, bytes(bytes_before_count) + b"\xff" * 4, answer, "a count that is larger than the frame"
+    )
 
 
 def check_fork_absence(target: Target) -> None:

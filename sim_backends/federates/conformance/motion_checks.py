@@ -17,23 +17,23 @@ from sim_backends.world.motion import State
 
 _WINDOW_S: Final = 0.05
 _LONG_WINDOW_S: Final = 0.25
-"""Window of the checks that compare only the ends of a motion, as each window costs time."""
+"""Window of the checks that compare only the start and the end of a motion; long windows save time."""
 _DRIVE_S: Final = 3.0
 _FLY_S: Final = 5.0
 _YAW_S: Final = 8.0
 """Longest time for a turn to another yaw."""
 _SPEED_M_S: Final = 0.2
-"""A speed that small robots reach."""
+"""A speed that even small robots reach."""
 _TURN_RAD_S: Final = 0.3
 _FLIGHT_M_S: Final = (0.4, 0.0, 0.2)
 _HEADING_RAD: Final = 0.25
 """Largest error of a heading that an agent keeps or has reached."""
 _DIRECTION_RAD: Final = 0.6
-"""Largest angle between heading and direction of motion, as wheels slip."""
+"""Largest angle between heading and direction of motion; it is above 0 because wheels slip."""
 
 
-def _turned(hello: Hello, heading_rad: float) -> Hello:
-    """Return the hello of a run in which all agents start with a heading; the configuration agrees with it."""
+def _hello_with_heading(hello: Hello, heading_rad: float) -> Hello:
+    """Return a hello in which all agents start with a heading, in the configuration too."""
     agents = [replace(agent, start=agent.start._replace(heading_rad=heading_rad)) for agent in hello.agents]
     configuration = json.loads(hello.configuration)
     for plan in configuration.get("scenario", {}).get("agents", {}).values():
@@ -41,7 +41,7 @@ def _turned(hello: Hello, heading_rad: float) -> Hello:
     return replace(hello, agents=agents, configuration=json.dumps(configuration).encode())
 
 
-def _agents(probe: FederateProbe, command: int) -> list[str]:
+def _suitable_agents(probe: FederateProbe, command: int) -> list[str]:
     """Return the names of the agents for which a type of command is suitable."""
     kind, verb = ("twist", "drives") if command == TWIST else ("velocity", "flies")
     if command not in probe.welcome.commands:
@@ -52,10 +52,10 @@ def _agents(probe: FederateProbe, command: int) -> list[str]:
     return names
 
 
-def _moved(
+def _states_under_commands(
     probe: FederateProbe, commands: Mapping[str, Any], seconds: float, window_s: float = _LONG_WINDOW_S
 ) -> Iterator[Mapping[str, State]]:
-    """Yield the states now, and at the ends of windows under commands."""
+    """Yield the present states, and the states at the ends of windows after the commands were sent."""
     step_ns = probe.welcome.step_ns
     window_ns = max(round(window_s * 1e9 / step_ns), 1) * step_ns
     begin_ns = probe.last_ns
@@ -85,9 +85,9 @@ def _check_heading(name: str, state: State, expected_rad: float, when: str) -> N
 def check_drive_axes(target: Target) -> None:
     """A robot that drives forward moves east at a heading of 0, and north at a heading of pi/2."""
     for heading_rad, axis in ((0.0, "east"), (math.pi / 2, "north")):
-        probe = target.open(_turned(target.hello, heading_rad))
-        commands = dict.fromkeys(_agents(probe, TWIST), Twist(_SPEED_M_S))
-        start, *_, last = _moved(probe, commands, _DRIVE_S)
+        probe = target.open(_hello_with_heading(target.hello, heading_rad))
+        commands = dict.fromkeys(_suitable_agents(probe, TWIST), Twist(_SPEED_M_S))
+        start, *_, last = _states_under_commands(probe, commands, _DRIVE_S)
         for name in commands:
             _check_heading(name, start[name], heading_rad, "at the start")
             moved_m = _displacement_m(start[name], last[name])
@@ -103,9 +103,9 @@ def check_drive_axes(target: Target) -> None:
 
 def check_turn(target: Target) -> None:
     """A positive turn rate increases the heading, in radians, and the robot moves in the direction of its heading."""
-    probe = target.open(_turned(target.hello, 0.0))
-    commands = dict.fromkeys(_agents(probe, TWIST), Twist(_SPEED_M_S, _TURN_RAD_S))
-    before, *later = _moved(probe, commands, _DRIVE_S, _WINDOW_S)
+    probe = target.open(_hello_with_heading(target.hello, 0.0))
+    commands = dict.fromkeys(_suitable_agents(probe, TWIST), Twist(_SPEED_M_S, _TURN_RAD_S))
+    before, *later = _states_under_commands(probe, commands, _DRIVE_S, _WINDOW_S)
     turned_rad = dict.fromkeys(commands, 0.0)
     for states in later:
         for name in commands:
@@ -135,7 +135,7 @@ def _heading_rad(states: Mapping[str, State], name: str) -> float:
 
 def check_velocity(target: Target) -> None:
     """Reported velocities agree with displacements."""
-    probe = target.open(_turned(target.hello, 0.5))
+    probe = target.open(_hello_with_heading(target.hello, 0.5))
     commands: dict[str, Twist | Velocity] = {}
     for agent in probe.hello.agents:
         if agent.flies and VELOCITY in probe.welcome.commands:
@@ -144,7 +144,7 @@ def check_velocity(target: Target) -> None:
             commands[agent.name] = Twist(_SPEED_M_S)
     if not commands:
         raise NotDeclaredError("it supports no type of command for these agents")
-    before, *later = _moved(probe, commands, _DRIVE_S, _WINDOW_S)
+    before, *later = _states_under_commands(probe, commands, _DRIVE_S, _WINDOW_S)
     start, step_ns = before, probe.welcome.step_ns
     half_window_s = max(round(_WINDOW_S * 1e9 / step_ns), 1) * step_ns / 2e9
     expected_m = {name: [0.0, 0.0, 0.0] for name in commands}
@@ -164,11 +164,11 @@ def check_velocity(target: Target) -> None:
 
 
 def check_flight_axes(target: Target) -> None:
-    """A commanded velocity is east, north and up, also at a heading of pi/2."""
+    """The components of a commanded velocity are east, north and up, also at a heading of pi/2."""
     heading_rad = math.pi / 2
-    probe = target.open(_turned(target.hello, heading_rad))
-    commands = dict.fromkeys(_agents(probe, VELOCITY), Velocity(_FLIGHT_M_S))
-    start, *_, last = _moved(probe, commands, _FLY_S)
+    probe = target.open(_hello_with_heading(target.hello, heading_rad))
+    commands = dict.fromkeys(_suitable_agents(probe, VELOCITY), Velocity(_FLIGHT_M_S))
+    start, *_, last = _states_under_commands(probe, commands, _FLY_S)
     expected_m = tuple(_FLY_S * speed_m_s for speed_m_s in _FLIGHT_M_S)
     for name in commands:
         _check_heading(name, start[name], heading_rad, "at the start")
@@ -182,14 +182,14 @@ def check_flight_axes(target: Target) -> None:
 
 def check_yaw(target: Target) -> None:
     """A robot that flies turns to the yaw of its command, and keeps its heading if the yaw is NaN."""
-    probe = target.open(_turned(target.hello, 0.5))
+    probe = target.open(_hello_with_heading(target.hello, 0.5))
     yaw_rad = 1.5
-    names = _agents(probe, VELOCITY)
-    for states in _moved(probe, dict.fromkeys(names, Velocity(yaw_rad=yaw_rad)), _YAW_S):
+    names = _suitable_agents(probe, VELOCITY)
+    for states in _states_under_commands(probe, dict.fromkeys(names, Velocity(yaw_rad=yaw_rad)), _YAW_S):
         if all(abs(_angle(_heading_rad(states, name), yaw_rad)) < 0.5 * _HEADING_RAD for name in names):
             break
     for name in names:
         _check_heading(name, states[name], yaw_rad, f"{_YAW_S:g} s after a command with this yaw")
-    *_, last = _moved(probe, dict.fromkeys(names, Velocity((_SPEED_M_S, 0.0, 0.0))), 2.0)
+    *_, last = _states_under_commands(probe, dict.fromkeys(names, Velocity((_SPEED_M_S, 0.0, 0.0))), 2.0)
     for name in names:
         _check_heading(name, last[name], yaw_rad, "2 s after a command without a yaw")

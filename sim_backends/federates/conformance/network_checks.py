@@ -21,7 +21,7 @@ _SIZE_BYTES: Final = 200
 _MAX_EVENTS: Final = 500
 _SEEDS: Final = 4
 _DISTANCES_M: Final = (10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0)
-"""Distances at which packets are sent; a network may lose only some of the packets, at only some of the distances."""
+"""Distances at which packets are sent, because a network may lose packets at only some of the distances."""
 _GROUP: Final = 32
 """Packets at each distance."""
 _SPACING_NS: Final = 20 * _MS
@@ -50,17 +50,17 @@ def _packets(probe: FederateProbe, times_ns: Sequence[int]) -> list[Packet]:
 
 def _times_ns() -> list[int]:
     """Return times of packets: at ends and beginnings of windows, and within them."""
-    borders_ns = [number * _WINDOW_NS + offset_ns for number in range(0, 60, 4) for offset_ns in (0, 1, 500_000)]
-    return sorted(at_ns for at_ns in borders_ns)
+    times_ns = [number * _WINDOW_NS + offset_ns for number in range(0, 60, 4) for offset_ns in (0, 1, 500_000)]
+    return sorted(at_ns for at_ns in times_ns)
 
 
-class _Account:
-    """Follows the fates of packets, and checks what the network reports."""
+class _FateAccount:
+    """Records the fates of packets, and checks the reports of the network."""
 
     def __init__(self, probe: FederateProbe) -> None:
         self._probe = probe
         self._packets: dict[int, Packet] = {}
-        self._decided: set[int] = set()
+        self._decided_ids: set[int] = set()
         self._next_event_ns = probe.welcome.next_event_ns
         self.arrivals: list[Arrival] = []
         self.reasons: dict[int, str] = {}
@@ -73,7 +73,7 @@ class _Account:
         outcomes = self._probe.network(to_ns, states, packets, copy=copy)
         self._packets |= {packet.packet_id: packet for packet in packets}
         if outcomes.at_ns != to_ns:
-            raise CheckError(f"requested to advance to {to_ns} ns, it advanced to {outcomes.at_ns} ns")
+            raise CheckError(f"it was requested to advance to {to_ns} ns, but advanced to {outcomes.at_ns} ns")
         if self._probe.has(FederateCapability.NEXT_EVENT):
             self._check_next_event(outcomes, to_ns, has_packets=bool(packets))
         for arrival in outcomes.arrivals:
@@ -91,14 +91,14 @@ class _Account:
 
     def undecided(self) -> list[int]:
         """Return the numbers of packets that neither arrived nor were dropped."""
-        return sorted(self._packets.keys() - self._decided)
+        return sorted(self._packets.keys() - self._decided_ids)
 
     def _decide(self, packet_id: int) -> None:
         if packet_id not in self._packets:
             raise CheckError(f"the fate of packet {packet_id} was reported, but it was not sent to the network")
-        if packet_id in self._decided:
+        if packet_id in self._decided_ids:
             raise CheckError(f"the fate of packet {packet_id} was reported twice")
-        self._decided.add(packet_id)
+        self._decided_ids.add(packet_id)
 
     def _check_arrival(self, arrival: Arrival, from_ns: int, to_ns: int) -> None:
         self._decide(arrival.packet_id)
@@ -131,16 +131,16 @@ class _Account:
                 )
 
 
-def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _Account:
+def _run(probe: FederateProbe, window_ns: int, until_ns: int = _END_NS) -> _FateAccount:
     """Carry packets in windows of equal length; after all have entered, windows are 100 times as long."""
-    account, states = _Account(probe), _states(probe)
-    waiting = _packets(probe, _times_ns())
+    account, states = _FateAccount(probe), _states(probe)
+    remaining_packets = _packets(probe, _times_ns())
     to_ns = -1
     while to_ns < until_ns:
-        to_ns += window_ns if waiting else 100 * window_ns
-        entering = [packet for packet in waiting if packet.enters_ns <= to_ns]
-        waiting = waiting[len(entering) :]
-        account.advance(to_ns, states, entering)
+        to_ns += window_ns if remaining_packets else 100 * window_ns
+        entering_packets = [packet for packet in remaining_packets if packet.enters_ns <= to_ns]
+        remaining_packets = remaining_packets[len(entering_packets) :]
+        account.advance(to_ns, states, entering_packets)
     return account
 
 
@@ -160,10 +160,10 @@ def check_exactly_once(target: Target) -> None:
 
 
 def check_next_event(target: Target) -> None:
-    """Nothing arrives or is dropped before the announced next event, which may be too early."""
+    """Nothing arrives or is dropped before the announced next event; the announced time may be too early."""
     probe = target.open()
     probe.require(FederateCapability.NEXT_EVENT)
-    account, states = _Account(probe), _states(probe)
+    account, states = _FateAccount(probe), _states(probe)
     outcomes = account.advance(3 * _MS, states, _packets(probe, (_MS, _MS + 1, 3 * _MS)))
     for _ in range(_MAX_EVENTS):
         event_ns = outcomes.next_event_ns
@@ -172,13 +172,13 @@ def check_next_event(target: Target) -> None:
         account.advance(event_ns - 1, states)
         outcomes = account.advance(event_ns, states)
     if outcomes.next_event_ns == NO_EVENT and (undecided := account.undecided()):
-        raise CheckError(f"it has no next event, and packets {undecided} neither arrived nor were dropped")
+        raise CheckError(f"it has no next event, but packets {undecided} neither arrived nor were dropped")
 
 
 def check_window_borders(target: Target) -> None:
     """A packet may enter at either end of a window, and does not arrive before it has entered."""
     probe = target.open()
-    account, states = _Account(probe), _states(probe)
+    account, states = _FateAccount(probe), _states(probe)
     first, second, third = _packets(probe, (10 * _MS, 10 * _MS, 10 * _MS + 1))
     account.advance(10 * _MS, states, [first])
     account.advance(10 * _MS + 1, states, [second, third])
@@ -203,9 +203,9 @@ def check_window_length(target: Target) -> None:
 
 
 def check_far_away(target: Target) -> None:
-    """A packet to an agent that is 1,000 km away is decided; if it is dropped, with a reason."""
+    """The fate of a packet to an agent that is 1,000 km away is decided, with a reason if it is dropped."""
     probe = target.open()
-    account, states = _Account(probe), _states(probe)
+    account, states = _FateAccount(probe), _states(probe)
     distant_agent = probe.hello.agents[-1].name if len(probe.hello.agents) < 2 else probe.hello.agents[1].name
     states[distant_agent] = State((_FAR_M, 0.0, 1.0))
     account.advance(10 * _MS, states, _packets(probe, [5 * _MS]))
@@ -221,8 +221,8 @@ def check_unknown_transport(target: Target) -> None:
         raise NotDeclaredError("it lists no transports")
     (packet,) = _packets(probe, [_MS])
     protocol = "no-such-transport"
-    wrong = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, protocol)
-    body = AdvanceNetwork(2 * _MS, _states(probe), [wrong]).encode(probe.agents)
+    unlisted_packet = Packet(1, packet.source, packet.destination, 1, packet.identity, _MS, _MS, protocol)
+    body = AdvanceNetwork(2 * _MS, _states(probe), [unlisted_packet]).encode(probe.agents)
     probe.expect_error(
         MessageKind.ADVANCE_NETWORK,
         body,
@@ -244,15 +244,15 @@ def check_determinism(target: Target) -> None:
 
 
 def _arrivals_ns(probe: FederateProbe, every: int = 1) -> dict[int, int]:
-    """Return the arrival times of packets that are sent at several distances; only every n-th packet is sent."""
-    account, states = _Account(probe), _states(probe)
+    """Return the arrival times of packets that are sent at several distances; `every` = n sends each n-th packet."""
+    account, states = _FateAccount(probe), _states(probe)
     packets = _packets(probe, [_MS + number * _SPACING_NS for number in range(len(_DISTANCES_M) * _GROUP)])
     first, second = (agent.name for agent in probe.hello.agents[:2])
     east_m, north_m, up_m = states[first].position_m
     for group, distance_m in enumerate(_DISTANCES_M):
         states[second] = State((east_m + distance_m, north_m, up_m))
-        entering = packets[group * _GROUP : (group + 1) * _GROUP : every]
-        account.advance((group + 1) * _GROUP * _SPACING_NS, states, entering)
+        entering_packets = packets[group * _GROUP : (group + 1) * _GROUP : every]
+        account.advance((group + 1) * _GROUP * _SPACING_NS, states, entering_packets)
     account.advance(2 * _END_NS, states)
     return {arrival.packet_id: arrival.at_ns for arrival in account.arrivals}
 
@@ -282,20 +282,20 @@ def check_seed(target: Target) -> None:
         if results[-1] != results[0]:
             return
     if _is_random(results[0]):
-        raise CheckError(f"it loses packets at random, and {_SEEDS} seeds gave the same arrivals and drops")
-    raise NotDeclaredError(f"{_SEEDS} seeds gave the same arrivals, and no random losses were seen")
+        raise CheckError(f"it loses packets at random, but {_SEEDS} seeds gave the same arrivals and drops")
+    raise NotDeclaredError(f"{_SEEDS} seeds gave the same arrivals, and no random losses occurred")
 
 
 def check_removed_packets(target: Target) -> None:
-    """The fate of a packet is the same without other packets; as this is a recommendation, the check never fails."""
+    """The fate of a packet is the same without other packets. This is a recommendation, so the check never fails."""
     results = []
     for every in (1, 2):
         probe = target.open()
         probe.require(FederateCapability.DETERMINISTIC)
         results.append(_arrivals_ns(probe, every))
-    everything, half = results
+    arrivals_of_all, arrivals_of_half = results
     for packet_id in range(1, len(_DISTANCES_M) * _GROUP, 2):
-        if (packet_id in everything) != (packet_id in half):
+        if (packet_id in arrivals_of_all) != (packet_id in arrivals_of_half):
             raise NotDeclaredError(
                 f"packet {packet_id} had another fate without other packets: its draws depend on the order of "
                 "packets, or on contention"
@@ -303,10 +303,10 @@ def check_removed_packets(target: Target) -> None:
 
 
 def check_new_agent(target: Target) -> None:
-    """A packet to an agent that has appeared is decided, if the federate declares that agents may appear."""
+    """The fate of a packet to an agent that has appeared is decided, if agents may appear."""
     probe = target.open()
     probe.require(FederateCapability.AGENTS_APPEAR)
-    account, states = _Account(probe), _states(probe)
+    account, states = _FateAccount(probe), _states(probe)
     account.advance(_MS, states)
     first = probe.hello.agents[0].name
     states["new agent"] = states[first]
@@ -322,12 +322,12 @@ def check_absent_agent(target: Target) -> None:
     """Nothing arrives at an agent without a state, if the federate declares that agents may disappear."""
     probe = target.open()
     probe.require(FederateCapability.AGENTS_DISAPPEAR)
-    account, states = _Account(probe), _states(probe)
+    account, states = _FateAccount(probe), _states(probe)
     packets = _packets(probe, [2 * _MS, 3 * _MS, 4 * _MS])[::2]
     receiver = packets[0].destination
-    present = {name: state for name, state in states.items() if name != receiver}
+    present_states = {name: state for name, state in states.items() if name != receiver}
     account.advance(_MS, states)
-    account.advance(1_000 * _MS, present, packets)
+    account.advance(1_000 * _MS, present_states, packets)
     if account.arrivals:
         raise CheckError(f"a packet arrived at {receiver}, which has disappeared")
     account.advance(_END_NS, states)
@@ -352,7 +352,7 @@ def check_dead_reckoning(target: Target) -> None:
 
 
 def check_fork(target: Target) -> None:
-    """A copy continues as the original, and neither changes the other."""
+    """A copy continues like the original, and neither changes the other."""
     probe = target.open()
     probe.require(FederateCapability.FORK)
     states = _states(probe)
@@ -360,8 +360,9 @@ def check_fork(target: Target) -> None:
     probe.network(_MS, states, packets[:2])
     probe.fork(1)
     requests = (5 * _MS, packets[2:]), (_END_NS, packets[:0])
-    in_copy, in_original = (
-        [probe.network(to_ns, states, entering, copy=copy) for to_ns, entering in requests] for copy in (1, 0)
+    copy_outcomes, original_outcomes = (
+        [probe.network(to_ns, states, entering_packets, copy=copy) for to_ns, entering_packets in requests]
+        for copy in (1, 0)
     )
-    if in_copy != in_original:
+    if copy_outcomes != original_outcomes:
         raise CheckError("the copy and the original gave different answers to equal requests")

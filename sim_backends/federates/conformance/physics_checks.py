@@ -6,7 +6,13 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final
 
-from sim_backends.federates.conformance.probe import Advanced, CheckError, FederateProbe, NotDeclaredError, Target
+from sim_backends.federates.conformance.probe import (
+    CheckError,
+    FederateProbe,
+    NotDeclaredError,
+    PhysicsAnswer,
+    Target,
+)
 from sim_backends.federates.exchanges import encode_number
 from sim_backends.federates.frames import MessageKind
 from sim_backends.federates.handshake import AgentStart, FederateCapability
@@ -15,7 +21,7 @@ from sim_backends.physics.body import Twist, Velocity
 from sim_backends.world.motion import State, extrapolate
 
 _START_M: Final = 0.5
-"""Largest distance of an agent from the start that it was given."""
+"""Largest distance of an agent from its requested start."""
 _SAME_M: Final = 1e-6
 """Largest difference between positions that must be equal; results may depend on the order of additions."""
 _MOVED_M: Final = 0.02
@@ -44,34 +50,34 @@ def _commands(probe: FederateProbe) -> Mapping[str, Twist | Velocity]:
     return commands
 
 
-def _check_same(first: Mapping[str, State], second: Mapping[str, State], what: str) -> None:
+def _check_same(first: Mapping[str, State], second: Mapping[str, State], description: str) -> None:
     for name in first:
         distance_m = math.dist(first[name].position_m, second[name].position_m)
         if distance_m > _SAME_M:
-            raise CheckError(f"{what}: the positions of {name} differ by {distance_m:.3g} m")
+            raise CheckError(f"{description}: the positions of {name} differ by {distance_m:.3g} m")
 
 
-def _check_time(probe: FederateProbe, to_ns: int, advanced: Advanced) -> None:
+def _check_time(probe: FederateProbe, to_ns: int, answer: PhysicsAnswer) -> None:
     step_ns = probe.welcome.step_ns
     expected_ns = to_ns - to_ns % step_ns
-    if advanced.at_ns != expected_ns:
+    if answer.at_ns != expected_ns:
         raise CheckError(
-            f"requested to advance to {to_ns} ns, it returned the states at {advanced.at_ns} ns instead of "
-            f"{expected_ns} ns, its last step of {step_ns} ns until then"
+            f"it was requested to advance to {to_ns} ns, but returned the states at {answer.at_ns} ns instead of "
+            f"{expected_ns} ns, the time of its last step of {step_ns} ns"
         )
 
 
 def check_start(target: Target) -> None:
-    """At time 0 each agent has a state near the start that it was given."""
+    """At time 0 each agent has a state near its requested start."""
     probe = target.open()
-    advanced = probe.physics(0)
-    _check_time(probe, 0, advanced)
+    answer = probe.physics(0)
+    _check_time(probe, 0, answer)
     for agent in target.hello.agents:
-        if agent.name not in advanced.states:  # it is absent, which the federate declares
+        if agent.name not in answer.states:  # the agent is absent; the probe checks that the federate declares this
             continue
-        distance_m = math.dist(advanced.states[agent.name].position_m, agent.start.position_m)
+        distance_m = math.dist(answer.states[agent.name].position_m, agent.start.position_m)
         if distance_m > _START_M:
-            raise CheckError(f"{agent.name} starts {distance_m:.3g} m away from the start that it was given")
+            raise CheckError(f"{agent.name} starts {distance_m:.3g} m away from its requested start")
 
 
 def check_remainders(target: Target) -> None:
@@ -85,22 +91,22 @@ def check_remainders(target: Target) -> None:
 
 
 def check_drift(target: Target) -> None:
-    """Many windows of 1.1 steps give the same motion as one window; 10^6 of them with --windows 1000000."""
+    """Many windows of 1.1 steps give the same motion as one window; --windows sets their number."""
     probe = target.open()
     step_ns = probe.welcome.step_ns
     window_ns = step_ns + max(step_ns // 10, 1)
     commands = _commands(probe)
-    advanced = probe.physics(0)
+    answer = probe.physics(0)
     for window in range(1, target.windows + 1):
         to_ns = window * window_ns
-        advanced = probe.physics(to_ns, commands if window == 1 else None)
-        _check_time(probe, to_ns, advanced)
+        answer = probe.physics(to_ns, commands if window == 1 else None)
+        _check_time(probe, to_ns, answer)
     if not probe.has(FederateCapability.DETERMINISTIC):
         raise NotDeclaredError("it does not declare DETERMINISTIC; only the times were compared")
-    once = target.open()
-    once.physics(0)
-    at_once = once.physics(target.windows * window_ns, commands)
-    _check_same(advanced.states, at_once.states, f"{target.windows} windows instead of one")
+    single_window_probe = target.open()
+    single_window_probe.physics(0)
+    single_window_answer = single_window_probe.physics(target.windows * window_ns, commands)
+    _check_same(answer.states, single_window_answer.states, f"{target.windows} windows instead of one")
 
 
 def check_repeated_time(target: Target) -> None:
@@ -120,13 +126,13 @@ def check_motion(target: Target) -> None:
     before = start = probe.physics(0).states
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     for step in range(1, _COMMANDED_STEPS + 1):
-        advanced = probe.physics(step * step_ns, commands if step == 1 else None)
-        for name, state in advanced.states.items():
+        answer = probe.physics(step * step_ns, commands if step == 1 else None)
+        for name, state in answer.states.items():
             moved_m = math.dist(state.position_m, before[name].position_m)
             speed_m_s = max(math.hypot(*state.velocity_m_s), math.hypot(*before[name].velocity_m_s))
             if moved_m > _JUMP_M + 2 * speed_m_s * step_ns / 1e9:
                 raise CheckError(f"{name} moved by {moved_m:.3g} m in a step, at a speed of {speed_m_s:.3g} m/s")
-        before = advanced.states
+        before = answer.states
     for name in commands:
         moved_m = math.dist(before[name].position_m, start[name].position_m)
         if moved_m < min(_MOVED_M, 0.1 * _SPEED_M_S * _COMMANDED_STEPS * step_ns / 1e9):
@@ -134,41 +140,41 @@ def check_motion(target: Target) -> None:
 
 
 def check_limits(target: Target) -> None:
-    """Extrapolation at the velocity is wrong by at most a t^2 / 2, where a is the returned limit."""
+    """The error of an extrapolation at the velocity is at most a t^2 / 2, where a is the returned limit."""
     probe = target.open()
     before = probe.physics(0)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     window_s = _LIMIT_STEPS * step_ns / 1e9
-    # A simulator that moves bodies at the velocity of the end of a step is wrong by one more step.
+    # The error is larger by one step for a simulator that moves bodies at the velocity at the end of a step.
     per_limit_s2 = window_s**2 / 2 + window_s * step_ns / 1e9
     for window in range(1, 40):
-        advanced = probe.physics(window * _LIMIT_STEPS * step_ns, commands if window == 1 else None)
+        answer = probe.physics(window * _LIMIT_STEPS * step_ns, commands if window == 1 else None)
         for name, state in before.states.items():
             expected = extrapolate(state, window_s).position_m
-            error_m = math.dist(advanced.states[name].position_m, expected)
+            error_m = math.dist(answer.states[name].position_m, expected)
             if error_m > before.limits_m_s2[name] * per_limit_s2 + _SAME_M:
                 raise CheckError(
                     f"{name} was {error_m:.3g} m away from its extrapolated position after {window_s:g} s; its limit "
                     f"of {before.limits_m_s2[name]:.3g} m/s^2 allows {before.limits_m_s2[name] * per_limit_s2:.3g} m"
                 )
-        before = advanced
+        before = answer
 
 
 def check_command_time(target: Target) -> None:
-    """A command applies from `from_ns` on, even if the federate was not requested to advance to it before."""
-    exact = target.open()
-    exact.require(FederateCapability.DETERMINISTIC)
-    step_ns, commands = exact.welcome.step_ns, _commands(exact)
+    """A command applies from `from_ns`, even if no earlier request advanced the federate to this time."""
+    exact_probe = target.open()
+    exact_probe.require(FederateCapability.DETERMINISTIC)
+    step_ns, commands = exact_probe.welcome.step_ns, _commands(exact_probe)
     middle_ns, end_ns = 100 * step_ns, 300 * step_ns
-    exact.physics(0)
-    exact.physics(middle_ns)
-    expected = exact.physics(end_ns, commands)
-    late = target.open()
-    late.physics(0)
+    exact_probe.physics(0)
+    exact_probe.physics(middle_ns)
+    expected = exact_probe.physics(end_ns, commands)
+    late_probe = target.open()
+    late_probe.physics(0)
     _check_same(
         expected.states,
-        late.physics(end_ns, commands, from_ns=middle_ns).states,
-        f"a command from {middle_ns} ns on",
+        late_probe.physics(end_ns, commands, from_ns=middle_ns).states,
+        f"a command that applies from {middle_ns} ns",
     )
 
 
@@ -183,7 +189,7 @@ def check_unknown_command(target: Target) -> None:
 
 
 def check_determinism(target: Target) -> None:
-    """Equal requests give equal answers, byte by byte, if the federate declares this."""
+    """Equal requests give identical answers, if the federate declares this."""
     answers = []
     for _ in range(2):
         probe = target.open()
@@ -198,7 +204,7 @@ def check_determinism(target: Target) -> None:
 
 
 def check_lifetimes(target: Target) -> None:
-    """An agent has states from its appearance at its start until it disappears, if the federate removes agents."""
+    """An agent has states only from its appearance until its disappearance, if the federate removes agents."""
     appears_steps, disappears_steps = 100, 300
     name = target.hello.agents[0].name
     step_ns = target.hello.step_ns
@@ -227,19 +233,19 @@ def check_lifetimes(target: Target) -> None:
         if step == appears_steps:
             distance_m = math.dist(states[name].position_m, target.hello.agents[0].start.position_m)
             if distance_m > _START_M:
-                raise CheckError(f"{name} appears {distance_m:.3g} m away from the start that it was given")
+                raise CheckError(f"{name} appears {distance_m:.3g} m away from its requested start")
 
 
 def check_fork(target: Target) -> None:
-    """A copy continues as the original, and neither changes the other."""
+    """A copy continues like the original, and neither changes the other."""
     probe = target.open()
     probe.require(FederateCapability.FORK)
     step_ns, commands = probe.welcome.step_ns, _commands(probe)
     probe.physics(0)
     middle_ns, end_ns = 100 * step_ns, 400 * step_ns
-    at_fork = probe.physics(middle_ns, commands)
+    answer_at_fork = probe.physics(middle_ns, commands)
     probe.fork(1)
-    in_copy = probe.physics(end_ns, from_ns=middle_ns, copy=1)
-    again = probe.physics(middle_ns, from_ns=middle_ns)
-    _check_same(at_fork.states, again.states, "the original, after its copy has advanced")
-    _check_same(in_copy.states, probe.physics(end_ns, from_ns=middle_ns).states, "the original and its copy")
+    copy_answer = probe.physics(end_ns, from_ns=middle_ns, copy=1)
+    repeated_answer = probe.physics(middle_ns, from_ns=middle_ns)
+    _check_same(answer_at_fork.states, repeated_answer.states, "the original, after its copy has advanced")
+    _check_same(copy_answer.states, probe.physics(end_ns, from_ns=middle_ns).states, "the original and its copy")

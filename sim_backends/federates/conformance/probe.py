@@ -1,4 +1,4 @@
-"""Helpers of the checks: connections to fresh federates, and the last request and answer of each."""
+"""Helpers of the checks: connections to newly started federates, and the last request and answer of each."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -37,7 +37,7 @@ class NotDeclaredError(Exception):
 
 
 class Opener(Protocol):
-    """Starts or connects a fresh federate."""
+    """Starts or connects to a new federate."""
 
     def __call__(self, hello: Hello) -> tuple[FederateSession, Hello, Welcome]:
         """Return its session, like `open_session`."""
@@ -45,7 +45,7 @@ class Opener(Protocol):
 
 
 @dataclass(frozen=True)
-class Advanced:
+class PhysicsAnswer:
     """The answer of a physics.
 
     Attributes:
@@ -63,17 +63,17 @@ class Advanced:
 
 def frame_text(frame: bytes) -> str:
     """Return a description of a frame: its size, and its first bytes in hexadecimal."""
-    rest = "" if len(frame) <= _SHOWN_BYTES else "..."
-    return f"{len(frame)} bytes: {frame[:_SHOWN_BYTES].hex(' ', 4)}{rest}"
+    ellipsis = "" if len(frame) <= _SHOWN_BYTES else "..."
+    return f"{len(frame)} bytes: {frame[:_SHOWN_BYTES].hex(' ', 4)}{ellipsis}"
 
 
 class FederateProbe:
-    """A fresh federate, which is used without the coordinator's safeguards.
+    """A new federate, which is used without the safeguards of the coordinator.
 
     Args:
-        opener: Starts or connects it.
+        opener: Starts or connects to it.
         hello: The hello that it receives.
-        exchange: Receives the last request and answer.
+        exchange: The probe stores the last request and its answer in this mapping.
 
     Attributes:
         hello: The hello that it received.
@@ -112,25 +112,29 @@ class FederateProbe:
         self, kind: MessageKind, body: bytes, answer: MessageKind, decode: Callable[[bytes], Any], *, copy: int = 0
     ) -> Any:  # noqa: ANN401 (of `decode`)
         """Send a request, and return the decoded answer; errors as for `FederateSession.request`."""
-        what = kind.name.lower().replace("_", " ")
-        return self._session.request(kind, copy, body, answer, decode=decode, what=lambda: what)
+        request_name = kind.name.lower().replace("_", " ")
+        return self._session.request(kind, copy, body, answer, decode=decode, describe=lambda: request_name)
 
     def physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
-    ) -> Advanced:
-        """Advance a physics; the commands apply from the time of the last call on, or from `from_ns`."""
+    ) -> PhysicsAnswer:
+        """Advance a physics; the commands apply from the time of the last call, or from `from_ns`."""
         begin_ns = self.last_ns if from_ns is None else from_ns
         body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
         names_before = set(self.agents.names)
-        decode = partial(_decode_advanced, agents=self.agents)
-        advanced: Advanced = self.request(MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy)
+        decode = partial(_decode_physics_answer, agents=self.agents)
+        answer_: PhysicsAnswer = self.request(
+            MessageKind.ADVANCE_PHYSICS, body, MessageKind.STATES, decode, copy=copy
+        )
         self.last_ns = to_ns
         if set(self.agents.names) - names_before and not self.has(FederateCapability.AGENTS_APPEAR):
-            raise CheckError(f"an agent appeared, {self.agents.names[-1]}, which it does not declare")
-        missing = names_before - advanced.states.keys()
-        if missing and not self.has(FederateCapability.AGENTS_DISAPPEAR):
-            raise CheckError(f"there is no state of {', '.join(sorted(missing))}, and it does not declare this")
-        return advanced
+            raise CheckError(f"the agent {self.agents.names[-1]} appeared, but it does not declare AGENTS_APPEAR")
+        missing_names = names_before - answer_.states.keys()
+        if missing_names and not self.has(FederateCapability.AGENTS_DISAPPEAR):
+            raise CheckError(
+                f"there is no state of {', '.join(sorted(missing_names))}, but it does not declare AGENTS_DISAPPEAR"
+            )
+        return answer_
 
     def network(
         self,
@@ -159,20 +163,22 @@ class FederateProbe:
         number: int = self.request(MessageKind.PING, encode_number(value), MessageKind.PONG, decode_number)
         return number
 
-    def expect_error(self, kind: MessageKind, body: bytes, answer: MessageKind, why: str) -> None:
+    def expect_error(self, kind: MessageKind, body: bytes, answer: MessageKind, request_text: str) -> None:
         """Send a request that the federate must refuse.
 
         Raises:
-            CheckError: It sends another answer, or none within the deadline.
+            CheckError: It sends another answer, or no answer within the deadline.
         """
-        started_s = time.monotonic()
+        start_s = time.monotonic()
         try:
             self.request(kind, body, answer, bytes)
         except FederateError as error:
             if error.exit_code == 1 and ("failed at the request" in error.what):
                 return
-            raise CheckError(f"it must refuse {why}: {error.what} ({time.monotonic() - started_s:.1f} s)") from error
-        raise CheckError(f"it must refuse {why}, and it answered")
+            raise CheckError(
+                f"it must refuse {request_text}: {error.what} ({time.monotonic() - start_s:.1f} s)"
+            ) from error
+        raise CheckError(f"it must refuse {request_text}, but it answered")
 
     def end(self) -> None:
         """End the session by `bye`, and wait until the federate closes the connection.
@@ -188,13 +194,13 @@ class FederateProbe:
             pass
 
     def close(self) -> None:
-        """End the federate."""
+        """Stop the federate."""
         self._session.close()
 
 
-def _decode_advanced(body: bytes, agents: AgentTable) -> Advanced:
+def _decode_physics_answer(body: bytes, agents: AgentTable) -> PhysicsAnswer:
     at_ns, states = decode_states(body, agents)
-    return Advanced(at_ns, states, states.limits_m_s2, body)
+    return PhysicsAnswer(at_ns, states, states.limits_m_s2, body)
 
 
 @dataclass
@@ -202,7 +208,7 @@ class Target:
     """An external federate under test.
 
     Attributes:
-        opener: Starts or connects it.
+        opener: Starts or connects to it.
         hello: The hello that it receives.
         windows: Number of windows of the check for drift.
     """
@@ -221,7 +227,7 @@ class Target:
         return self.hello.role == PHYSICS
 
     def open(self, hello: Hello | None = None) -> FederateProbe:
-        """Return a fresh federate after the last one has ended: a listening federate may serve one run at a time.
+        """Stop the last federate, and return a new one; a listening federate may serve only one run at a time.
 
         Args:
             hello: The hello that it receives, if it is not the hello of the target.
@@ -232,7 +238,7 @@ class Target:
         return self._probe
 
     def close(self) -> None:
-        """End the last federate."""
+        """Stop the last federate."""
         if self._probe is not None:
             self._probe.close()
             self._probe = None

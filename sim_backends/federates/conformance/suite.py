@@ -16,11 +16,11 @@ class CheckResult:
 
     Attributes:
         name: Name of the check.
-        meaning: What it requires.
-        failure: What is wrong; empty if it passed or does not apply.
-        skipped: Why it does not apply; empty if it does.
+        meaning: The requirement that it checks.
+        failure: The violation; empty if it passed or does not apply.
+        skipped: The reason why it does not apply; empty if it applies.
         request: The last request, if it failed.
-        answer: The answer to it, if it failed.
+        answer: The answer to the last request, if it failed.
     """
 
     name: str
@@ -43,7 +43,7 @@ def checks(*, is_physics: bool) -> dict[str, Check]:
 
 
 def run_checks(target: Target) -> Iterator[CheckResult]:
-    """Run all checks of the target's role, each with fresh federates, and yield their results."""
+    """Run all checks of the target's role, each with new federates, and yield their results."""
     for name, check in checks(is_physics=target.is_physics).items():
         yield run_check(target, name, check)
 

@@ -1,1 +1,1 @@
-"""Transports that carry the frames between coordinator and federate; `table` lists them."""
+"""Transports that carry the frames between coordinator and federate; `transport_table` lists them."""

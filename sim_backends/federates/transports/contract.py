@@ -15,7 +15,7 @@ TOKEN_VARIABLE: Final = "FIELDKIT_FEDERATE_TOKEN"  # noqa: S105 (the variable's 
 
 
 class ChannelListener(Protocol):
-    """Accepts one channel after another."""
+    """Accepts channels, one at a time."""
 
     def accept(self, deadline_s: float | None) -> FrameChannel:
         """Return the next channel.
@@ -84,12 +84,12 @@ def read_token(address: TransportAddress) -> str:
     """Return the token of a connection: the value of `TOKEN_VARIABLE`.
 
     Raises:
-        ConfigurationError: There is none, and other machines can use the address.
+        ConfigurationError: There is no token, but other machines can use the address.
     """
     value = os.environ.get(TOKEN_VARIABLE, "")
     if not value and not address.is_loopback:
         raise ConfigurationError(
-            f"{address} is not on this machine, and there is no token",
+            f"{address} is not on this machine, but there is no token",
             remedy=f"set {TOKEN_VARIABLE} to the same secret text on both sides",
         )
     return value
@@ -141,8 +141,8 @@ def split_host_and_port(text: str) -> tuple[str, str, int, bool]:
     Raises:
         ValueError: Host or port is missing, or the port is not a number.
     """
-    scheme, _, rest = text.partition(":")
-    host, _, port = rest.rpartition(":")
+    scheme, _, host_and_port = text.partition(":")
+    host, _, port = host_and_port.rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ValueError("host or port is missing")
     return scheme.removesuffix("-listen"), host.strip("[]"), int(port), scheme.endswith("-listen")

@@ -35,11 +35,11 @@ DATAGRAM_HEADER_BYTES: Final = _HEADER.size
 _DATA_BYTES: Final = MAX_DATAGRAM_BYTES - DATAGRAM_HEADER_BYTES
 DATAGRAM_VERSION: Final = 1
 _WINDOW: Final = 64
-"""Datagrams that may be unacknowledged; a receive buffer of Linux's default size has room for them."""
+"""Largest number of unacknowledged datagrams; they fit into a receive buffer of Linux's default size."""
 _LINGER_S: Final = 0.5
 _PROBE_S: Final = 2.0
 _SILENCE_S: Final = 3600.0
-"""Time without a datagram after which the other machine has disappeared. A federate may be suspended meanwhile."""
+"""Time without a datagram after which the connection ends; it is long, because a federate may be suspended."""
 
 
 class DatagramKind(IntEnum):
@@ -61,7 +61,7 @@ class DatagramHeader(NamedTuple):
         cookie: Number that the listening side has drawn for this connection and the address of the connecting side.
         number: Number of the datagram, counting only datagrams with data; in a datagram without data, the number of
             the next datagram with data.
-        expected: Number that its sender expects next.
+        expected: The next number that its sender expects.
     """
 
     kind: DatagramKind
@@ -94,7 +94,7 @@ class RetransmissionTimer:
     """The retransmission timer of RFC 6298, with limits that suit a run: 20 ms and 2 s instead of 1 s and 60 s.
 
     Attributes:
-        interval_s: Time after which to resend.
+        interval_s: Time after which unacknowledged datagrams are sent again.
     """
 
     _MIN_S: Final = 0.02
@@ -125,7 +125,7 @@ class DatagramChannel:
     """A channel over a UDP socket that is connected to the other side, so that the kernel checks its address.
 
     Args:
-        endpoint: The socket, which it owns.
+        endpoint: The socket; the channel closes it.
         connection: See `DatagramHeader`.
         cookie: See `DatagramHeader`.
     """
@@ -138,13 +138,13 @@ class DatagramChannel:
         self._identity = connection, cookie
         self._number = self._expected = 0
         self._unacknowledged: dict[int, bytes] = {}
-        self._sent_s: dict[int, float] = {}  # without datagrams that were sent again
+        self._sent_s: dict[int, float] = {}  # only datagrams that were sent once
         self._timer = RetransmissionTimer()
         self._resend_s = 0.0
-        self._early: dict[int, bytes] = {}
+        self._early_data: dict[int, bytes] = {}
         self._data = bytearray()
-        self._owes_acknowledgement = False
-        self._heard_s = time.monotonic()
+        self._must_acknowledge = False
+        self._last_received_s = time.monotonic()
         self._is_closed = self._is_closed_by_peer = False
 
     def send(self, frame: bytes, deadline_s: float | None) -> None:
@@ -195,7 +195,7 @@ class DatagramChannel:
         header = unpack_datagram(datagram)
         if header is None or (header.connection, header.cookie) != self._identity:
             return
-        self._heard_s = time.monotonic()
+        self._last_received_s = time.monotonic()
         self._acknowledge_until(header.expected)
         if header.kind is DatagramKind.DATA:
             self._add_data(header.number, datagram[DATAGRAM_HEADER_BYTES:])
@@ -203,12 +203,12 @@ class DatagramChannel:
             self._is_closed_by_peer = True
 
     def _add_data(self, number: int, data: bytes) -> None:
-        self._owes_acknowledgement = True
+        self._must_acknowledge = True
         is_full = len(self._data) > HEADER_BYTES + MAX_FRAME_BYTES
         if not self._expected <= number < self._expected + _WINDOW or is_full:
             return
-        self._early[number] = data
-        while (data_in_order := self._early.pop(self._expected, None)) is not None:
+        self._early_data[number] = data
+        while (data_in_order := self._early_data.pop(self._expected, None)) is not None:
             self._data += data_in_order
             self._expected += 1
 
@@ -232,7 +232,7 @@ class DatagramChannel:
         """
         if self._is_closed or self._is_closed_by_peer:
             raise ClosedError("the connection was closed")
-        if self._owes_acknowledgement:
+        if self._must_acknowledge:
             if self._read_available():
                 return
             self._transmit(DatagramKind.ACKNOWLEDGEMENT, self._number)
@@ -242,19 +242,19 @@ class DatagramChannel:
             if now_s >= deadline_s:
                 raise DeadlineError("the wait reached its deadline")
             limit_s = min(limit_s, deadline_s)
-        # A timer that has just expired must not make this a loop without a wait.
+        # A negative timeout would wait without a limit.
         if self._readable.poll(max((limit_s - now_s) * 1e3, 0)):
             self._read_available()
             return
         now_s = time.monotonic()
-        if now_s - self._heard_s > _SILENCE_S:
+        if now_s - self._last_received_s > _SILENCE_S:
             raise ClosedError(f"nothing was received for {_SILENCE_S:g} s")
         if not self._resend_if_due(now_s) and not self._unacknowledged and limit_s != deadline_s:
             # If the process has exited, its machine refuses this datagram.
             self._transmit(DatagramKind.ACKNOWLEDGEMENT, self._number)
 
     def _read_available(self) -> bool:
-        """Read a datagram if there is one; return True if so.
+        """Read a datagram if one has arrived, and return True if so.
 
         Raises:
             ClosedError: The other side's process has exited.
@@ -283,7 +283,7 @@ class DatagramChannel:
         Raises:
             ClosedError: The other side's process has exited.
         """
-        self._owes_acknowledgement = False
+        self._must_acknowledge = False
         try:
             self._socket.send(pack_datagram(DatagramHeader(kind, *self._identity, number, self._expected), data))
         except ConnectionRefusedError as error:

@@ -1,9 +1,10 @@
 """DDS with CycloneDDS: two reliable topics that keep all samples. There is no master.
 
 The two sides discover each other at different times. A writer may thus send the first sample before the reader has
-discovered it; a volatile reader never receives this sample. So the topics are transient local: a reader receives the
-last two samples of a writer that it discovers later. Two are needed if the federate refuses a run, as the end of the
-run follows the error. All other samples follow an answer, which proves that the reader has discovered the writer.
+discovered it; a volatile reader never receives this sample. The topics are therefore transient local: a reader
+receives the last two samples of a writer that it discovers later. Two are needed if the federate refuses a run,
+because the end of the run follows the error. All other samples follow an answer, which proves that the reader has
+discovered the writer.
 
 The topics are `fieldkit/NAME/requests` and `fieldkit/NAME/answers`, their type is `fieldkit::Frame` with one member,
 `data`, a sequence of octets. Without an address of an interface, only the loopback interface is used.
@@ -54,31 +55,31 @@ def frame_topic(name: str, part: str) -> Topic:
 
 
 class _Participants:
-    """The participants of this process, as a process can have only one configuration per domain."""
+    """The participants of this process; they are shared, because a process has only one configuration per domain."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._participants: dict[tuple[int, str], tuple[Middleware, int]] = {}
 
     def open(self, address: "DdsAddress") -> Middleware:
-        """Return the participant of a domain and interface, which is started if necessary.
+        """Return the participant of a domain and interface; start it if necessary.
 
         Raises:
             MiddlewareError: CycloneDDS is missing or does not start.
         """
         key = address.domain, address.interface
         with self._lock:
-            participant, uses = self._participants.get(key) or (adapter("dds")(address.network), 0)
-            self._participants[key] = participant, uses + 1
+            participant, use_count = self._participants.get(key) or (adapter("dds")(address.network), 0)
+            self._participants[key] = participant, use_count + 1
         return participant
 
     def close(self, address: "DdsAddress") -> None:
         """Close the participant after its last use."""
         key = address.domain, address.interface
         with self._lock:
-            participant, uses = self._participants.pop(key)
-            if uses > 1:
-                self._participants[key] = participant, uses - 1
+            participant, use_count = self._participants.pop(key)
+            if use_count > 1:
+                self._participants[key] = participant, use_count - 1
             else:
                 participant.close()
 
@@ -91,14 +92,14 @@ class DdsBus:
 
     Args:
         address: The address.
-        reads: Topic to read, `requests` or `answers`.
-        writes: Topic to write.
+        read_topic: Topic to read, `requests` or `answers`.
+        write_topic: Topic to write.
 
     Raises:
         ConfigurationError: CycloneDDS is missing or does not start.
     """
 
-    def __init__(self, address: "DdsAddress", reads: str, writes: str) -> None:
+    def __init__(self, address: "DdsAddress", read_topic: str, write_topic: str) -> None:
         try:
             participant = _PARTICIPANTS.open(address)
         except MiddlewareError as error:
@@ -107,8 +108,8 @@ class DdsBus:
             ) from error
         self._address = address
         self._samples: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._writer = participant.publisher(frame_topic(address.name, writes))
-        self._matched_writers = participant.subscribe(frame_topic(address.name, reads), self._deliver)
+        self._writer = participant.publisher(frame_topic(address.name, write_topic))
+        self._matched_writers = participant.subscribe(frame_topic(address.name, read_topic), self._deliver)
 
     def _deliver(self, data: bytes, _at_ns: int) -> None:
         if len(data) >= _CDR.size:
@@ -117,7 +118,7 @@ class DdsBus:
                 self._samples.put(data[_CDR.size :])
 
     def write(self, sample: bytes, deadline_s: float | None) -> None:
-        """Implement `SampleBus.write`; a write returns False after a second in which a reader was too slow."""
+        """Implement `SampleBus.write`; the writer returns False if a reader was too slow for a second."""
         data = _CDR.pack(_CDR_LITTLE_ENDIAN, len(sample)) + sample
         while not self._writer.write(data):
             if not self.has_peer():
@@ -149,7 +150,7 @@ class DdsAddress:
     Attributes:
         name: Its name.
         domain: DDS domain.
-        interface: IPv4 address of this machine on the network to use.
+        interface: IPv4 address of the network interface to use.
         listens: See `TransportAddress`.
     """
 
@@ -175,11 +176,11 @@ class DdsAddress:
 
     def connect(self, deadline_s: float) -> samples.SampleChannel:
         """Implement `TransportAddress.connect`."""
-        return samples.connected_channel(DdsBus(self, reads="answers", writes="requests"), self, deadline_s)
+        return samples.connected_channel(DdsBus(self, read_topic="answers", write_topic="requests"), self, deadline_s)
 
     def listen(self) -> AbstractContextManager[ChannelListener]:
         """Implement `TransportAddress.listen`."""
-        return samples.listening(lambda: DdsBus(self, reads="requests", writes="answers"))
+        return samples.listening(lambda: DdsBus(self, read_topic="requests", write_topic="answers"))
 
 
 def parse(text: str) -> DdsAddress:
@@ -188,13 +189,13 @@ def parse(text: str) -> DdsAddress:
     Raises:
         ValueError: It is invalid.
     """
-    _, name, *rest = text.split(":")
-    domain = rest[0] if rest else "0"
+    _, name, *fields = text.split(":")
+    domain = fields[0] if fields else "0"
     if not _NAME.fullmatch(name):
         raise ValueError(f"{name!r} is not a name of letters, digits and underscores")
-    if not domain.isdecimal() or int(domain) > _MAX_DOMAIN or len(rest) > 2:
+    if not domain.isdecimal() or int(domain) > _MAX_DOMAIN or len(fields) > 2:
         raise ValueError(f"the domain is not a number up to {_MAX_DOMAIN}")
-    return DdsAddress(name, int(domain), rest[1] if len(rest) > 1 else _LOOPBACK)
+    return DdsAddress(name, int(domain), fields[1] if len(fields) > 1 else _LOOPBACK)
 
 
 TRANSPORT: Final = FederateTransport(

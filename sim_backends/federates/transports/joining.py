@@ -22,7 +22,8 @@ def accept_federate(address: TransportAddress, expected_token: str, deadline_s: 
 
     Raises:
         ConfigurationError: The address cannot be used.
-        DeadlineError: No federate with this token has connected; the message has the reason of the last rejection.
+        DeadlineError: No federate with this token has connected; the message contains the reason of the last
+            rejection.
     """
     rejection = ""
     with address.listen() as listener:
@@ -41,6 +42,6 @@ def accept_federate(address: TransportAddress, expected_token: str, deadline_s: 
             channel.close()
 
 
-def join(channel: FrameChannel, own_token: str, deadline_s: float) -> None:
+def join(channel: FrameChannel, token: str, deadline_s: float) -> None:
     """Send the first message of a federate that has connected."""
-    channel.send(encode(MessageKind.JOIN, 0, 0, encode_join(own_token)), deadline_s)
+    channel.send(encode(MessageKind.JOIN, 0, 0, encode_join(token)), deadline_s)

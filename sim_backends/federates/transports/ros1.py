@@ -23,7 +23,7 @@ from sim_backends.ros1.node_calls import MasterError
 
 _DEFAULT_MASTER: Final = "http://localhost:11311"
 _NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_PATIENCE_S: Final = 60.0
+_MASTER_TIMEOUT_S: Final = 60.0
 MESSAGE: Final = RosMessageType(
     "std_msgs/UInt8MultiArray",
     "82373f1612381bb6ee473b5cd6f5d89c",
@@ -42,25 +42,25 @@ class Ros1Bus:
 
     Args:
         address: The address.
-        reads: Topic to subscribe to, `requests` or `answers`.
-        writes: Topic to publish.
+        read_topic: Topic to subscribe to, `requests` or `answers`.
+        write_topic: Topic to publish.
         deadline_s: Time of `time.monotonic` until which to wait for the master.
 
     Raises:
         ConfigurationError: No port can be opened, or the master refuses the node.
-        DeadlineError: No master answers.
+        DeadlineError: The master does not answer.
     """
 
-    def __init__(self, address: "Ros1Address", reads: str, writes: str, deadline_s: float) -> None:
-        name = f"/fieldkit/{address.name}_{writes}_{secrets.token_hex(4)}"
+    def __init__(self, address: "Ros1Address", read_topic: str, write_topic: str, deadline_s: float) -> None:
+        name = f"/fieldkit/{address.name}_{write_topic}_{secrets.token_hex(4)}"
         prefix = f"/fieldkit/{address.name}"
         try:
             self._node = RosNode(name, address.master, address.host)
         except OSError as error:
             raise ConfigurationError(f"{address} cannot be used: {error}", remedy="check ROS_IP") from error
         try:
-            self._publisher = self._node.publish(f"{prefix}/{writes}", MESSAGE, deadline_s)
-            self._subscriber = self._node.subscribe(f"{prefix}/{reads}", MESSAGE, deadline_s)
+            self._publisher = self._node.publish(f"{prefix}/{write_topic}", MESSAGE, deadline_s)
+            self._subscriber = self._node.subscribe(f"{prefix}/{read_topic}", MESSAGE, deadline_s)
         except TimeoutError as error:
             self._node.close()
             raise DeadlineError(str(error)) from error
@@ -100,12 +100,12 @@ class Ros1Bus:
 
 @dataclass(frozen=True)
 class Ros1Address:
-    """Name of a federate, master and own address.
+    """Name of a federate, and the addresses of the master and of this machine.
 
     Attributes:
         name: Its name.
         master: URI of the master.
-        host: Address of this machine for other nodes; empty for the address from which the master is reached.
+        host: Address of this machine for other nodes; empty for the local address of connections to the master.
         listens: See `TransportAddress`.
     """
 
@@ -124,13 +124,15 @@ class Ros1Address:
 
     def connect(self, deadline_s: float) -> samples.SampleChannel:
         """Implement `TransportAddress.connect`."""
-        bus = Ros1Bus(self, reads="answers", writes="requests", deadline_s=deadline_s)
+        bus = Ros1Bus(self, read_topic="answers", write_topic="requests", deadline_s=deadline_s)
         return samples.connected_channel(bus, self, deadline_s)
 
     def listen(self) -> AbstractContextManager[ChannelListener]:
         """Implement `TransportAddress.listen`; the master may start later."""
-        deadline_s = time.monotonic() + _PATIENCE_S
-        return samples.listening(lambda: Ros1Bus(self, reads="requests", writes="answers", deadline_s=deadline_s))
+        deadline_s = time.monotonic() + _MASTER_TIMEOUT_S
+        return samples.listening(
+            lambda: Ros1Bus(self, read_topic="requests", write_topic="answers", deadline_s=deadline_s)
+        )
 
 
 def parse(text: str) -> Ros1Address:

@@ -36,7 +36,7 @@ _KIND_OFFSET: Final = _RUN.size + 4
 _CHECK_S: Final = 0.5
 """Interval at which a channel that waits checks that the other side exists."""
 _PEER_S: Final = 10.0
-"""Longest wait of the side that accepts, for the discovery of its peer. If it exits earlier, its answer is lost."""
+"""Longest wait of the accepting side for the discovery of its peer; an answer before the discovery may be lost."""
 _MAX_WAITING: Final = 16
 _POLL_S: Final = 0.01
 
@@ -49,7 +49,7 @@ class SampleBus(Protocol):
 
         Raises:
             ClosedError: There is no reader.
-            DeadlineError: It was not accepted in time.
+            DeadlineError: The sample was not accepted in time.
         """
         ...
 
@@ -57,16 +57,16 @@ class SampleBus(Protocol):
         """Return the next sample.
 
         Raises:
-            DeadlineError: There was none in time.
+            DeadlineError: No sample arrived in time.
         """
         ...
 
     def has_peer(self) -> bool:
-        """Return True if the other side reads and writes now."""
+        """Return True if the other side currently has a reader and a writer."""
         ...
 
     def close(self) -> None:
-        """Close it."""
+        """Close the bus."""
         ...
 
 
@@ -76,14 +76,14 @@ class SampleChannel:
     Args:
         bus: The bus.
         run: Number of the run.
-        first: The first sample, if it was received already.
+        first_sample: The first sample, if it was received already.
         owns_bus: True if `close` must close the bus.
     """
 
-    def __init__(self, bus: SampleBus, run: int, *, first: bytes = b"", owns_bus: bool = False) -> None:
+    def __init__(self, bus: SampleBus, run: int, *, first_sample: bytes = b"", owns_bus: bool = False) -> None:
         self._bus = bus
         self._run = _RUN.pack(run)
-        self._first = first
+        self._first_sample = first_sample
         self._owns_bus = owns_bus
         self._is_closed = self._is_closed_by_peer = False
         self.other_hellos: deque[bytes] = deque(maxlen=_MAX_WAITING)
@@ -97,18 +97,18 @@ class SampleChannel:
     def receive(self, deadline_s: float | None, max_bytes: int = MAX_FRAME_BYTES) -> ProtocolFrame:
         """Implement `FrameChannel.receive`."""
         sample = self._next_sample(deadline_s)
-        body_at = _RUN.size + HEADER_BYTES
-        if len(sample) < body_at:
+        body_offset = _RUN.size + HEADER_BYTES
+        if len(sample) < body_offset:
             raise MalformedFrameError(len(sample) - _RUN.size, "the sample ends within a header")
-        header = read_header(sample[_RUN.size : body_at], max_bytes)
-        if len(sample) != body_at + header.size:
-            raise MalformedFrameError(0, f"a sample with {len(sample) - body_at} bytes, not {header.size}")
-        return ProtocolFrame(header, sample[body_at:])
+        header = read_header(sample[_RUN.size : body_offset], max_bytes)
+        if len(sample) != body_offset + header.size:
+            raise MalformedFrameError(0, f"a sample with {len(sample) - body_offset} bytes, not {header.size}")
+        return ProtocolFrame(header, sample[body_offset:])
 
     def _next_sample(self, deadline_s: float | None) -> bytes:
-        if self._first:
-            first, self._first = self._first, b""
-            return first
+        if self._first_sample:
+            first_sample, self._first_sample = self._first_sample, b""
+            return first_sample
         while not self._is_closed and not self._is_closed_by_peer:
             check_s = time.monotonic() + _CHECK_S
             try:
@@ -151,18 +151,18 @@ class SampleListener:
 
     def __init__(self, bus: SampleBus) -> None:
         self._bus = bus
-        self._waiting: deque[bytes] = deque(maxlen=_MAX_WAITING)
+        self._waiting_hellos: deque[bytes] = deque(maxlen=_MAX_WAITING)
 
     def accept(self, deadline_s: float | None) -> SampleChannel:
         """Implement `ChannelListener.accept`."""
-        while not self._waiting:
+        while not self._waiting_hellos:
             sample = self._bus.receive(deadline_s)
             if _is_hello(sample):
-                self._waiting.append(sample)
-        first = self._waiting.popleft()
+                self._waiting_hellos.append(sample)
+        first_sample = self._waiting_hellos.popleft()
         _wait_for_peer(self._bus, time.monotonic() + _PEER_S)
-        channel = SampleChannel(self._bus, _RUN.unpack_from(first)[0], first=first)
-        channel.other_hellos = self._waiting
+        channel = SampleChannel(self._bus, _RUN.unpack_from(first_sample)[0], first_sample=first_sample)
+        channel.other_hellos = self._waiting_hellos
         return channel
 
 
@@ -170,7 +170,7 @@ def connected_channel(bus: SampleBus, address: object, deadline_s: float) -> Sam
     """Return the channel of a new run, as soon as a federate reads and writes.
 
     Raises:
-        DeadlineError: There was none in time.
+        DeadlineError: No federate was discovered in time.
     """
     if not _wait_for_peer(bus, deadline_s):
         bus.close()
@@ -188,7 +188,7 @@ def _wait_for_peer(bus: SampleBus, deadline_s: float) -> bool:
 
 
 def listening(make_bus: Callable[[], SampleBus]) -> AbstractContextManager[ChannelListener]:
-    """Return a listener on a bus, which is closed afterwards."""
+    """Return a context manager for a listener on a bus; it closes the bus at the end."""
 
     @contextmanager
     def listen() -> Iterator[SampleListener]:

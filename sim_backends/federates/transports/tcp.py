@@ -41,9 +41,9 @@ class TcpAddress(HostAndPort):
     def connect(self, deadline_s: float) -> StreamChannel:
         """Implement `TransportAddress.connect`; refused attempts are repeated."""
         while True:
-            left_s = deadline_s - time.monotonic()
+            remaining_s = deadline_s - time.monotonic()
             try:
-                connection = socket.create_connection((self.host, self.port), timeout=max(left_s, 0.001))
+                connection = socket.create_connection((self.host, self.port), timeout=max(remaining_s, 0.001))
             except OSError as error:
                 if time.monotonic() + _RETRY_S >= deadline_s:
                     raise DeadlineError(f"no connection to {self}: {error}") from error

@@ -21,7 +21,7 @@ def parse_address(text: str) -> TransportAddress | None:
     """Return the address of a text; None if the text does not begin with the scheme of a transport.
 
     Raises:
-        ConfigurationError: The rest is not an address of this transport.
+        ConfigurationError: The text is not a valid address of this transport.
     """
     scheme, colon, _ = text.partition(":")
     transport = _BY_SCHEME.get(scheme) if colon else None

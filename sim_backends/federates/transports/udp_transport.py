@@ -32,8 +32,8 @@ _MAX_RETRY_S: Final = 1.0
 class UdpListener:
     """Accepts connections.
 
-    A connection keeps the socket that listened, so that the other side always uses the same port. The next call of
-    `accept` opens another socket. While a connection exists, other programs are refused and try again.
+    A connection takes over the socket that listened, so that the other side always uses the same port. The next call
+    of `accept` opens another socket. While a connection exists, other programs are refused and try again.
 
     Args:
         address: The address.
@@ -56,8 +56,8 @@ class UdpListener:
             self._socket = self._address.bound_socket()
             self._secret = secrets.token_bytes(16)  # cookies of earlier connections are invalid
         while True:
-            left_s = None if deadline_s is None else max(deadline_s - time.monotonic(), 0)
-            if not select.select([self._socket], [], [], left_s)[0]:
+            remaining_s = None if deadline_s is None else max(deadline_s - time.monotonic(), 0)
+            if not select.select([self._socket], [], [], remaining_s)[0]:
                 raise DeadlineError("no program has connected")
             try:
                 datagram, peer = self._socket.recvfrom(65536)
@@ -141,9 +141,13 @@ class UdpAddress(HostAndPort):
 
 
 def _request_cookie(endpoint: socket.socket, connection: int, limit_s: float) -> int | None:
-    """Return the cookie for a connection, or None if there was no answer in time; raises OSError if it is refused."""
+    """Return the cookie for a connection, or None if there was no answer in time.
+
+    Raises:
+        OSError: The connection is refused.
+    """
     endpoint.send(pack_datagram(DatagramHeader(DatagramKind.OPEN, connection)))
-    while (left_s := limit_s - time.monotonic()) > 0 and select.select([endpoint], [], [], left_s)[0]:
+    while (remaining_s := limit_s - time.monotonic()) > 0 and select.select([endpoint], [], [], remaining_s)[0]:
         header = unpack_datagram(endpoint.recv(65536))
         if header is not None and header.kind is DatagramKind.COOKIE and header.connection == connection:
             return header.cookie

@@ -7,16 +7,16 @@ from typing import Final
 
 from sim_backends.network.packets import Packet
 from sim_backends.network.ros1.ros1_options import LENGTH_BYTES, Ros1Flow, Ros1Options
-from sim_backends.network.ros1.streams import Lost, TcpStreams
+from sim_backends.network.ros1.streams import LossCallback, TcpStreams
 from sim_backends.network.wire import IpPacket, Wire, WireTimer
 
 TRANSPORT: Final = "ros1"
 """Name of the transport, as in packets of programs."""
 NOT_CONNECTED: Final = "no subscriber is connected"
-GIVEN_UP: Final = "the subscriber has given this connection up"
+GIVEN_UP: Final = "the subscriber has given up this connection"
 OUT_OF_ORDER: Final = "blocks of UDPROS out of order"
 _PROBE_BYTES: Final = 20 + 32
-"""A TCP segment without data, with timestamps."""
+"""Size of a TCP segment without data, with timestamps and the IP header."""
 _UDP_BYTES: Final = 20 + 8
 _UDPROS_HEADER_BYTES: Final = 8
 
@@ -29,13 +29,13 @@ class Probe:
         flow: Flow of the connection.
         connection: Number of the connection, from 1.
         number: Number of the probe.
-        alive: The response; None for a query.
+        is_alive: The response; None for a query.
     """
 
     flow: str
     connection: int
     number: int
-    alive: bool | None = None
+    is_alive: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class TcprosLink:
         self._options = options
         self._downstream = flow.publisher, flow.subscriber
         self._retry_ns = options.reconnect.first_ns
-        # The connection that each end regards as open; 0 for none.
+        # Number of the connection that is open at each end; 0 if no connection is open there.
         self._publisher_connection = 0
         self._subscriber_connection = 0
         self._connection_count = 0
@@ -102,20 +102,22 @@ class TcprosLink:
             return
         connection, packet_id = self._publisher_connection, packet.packet_id
         arrive = partial(self._arrive, connection, packet_id)
-        self._send(connection, LENGTH_BYTES + packet.size_bytes, arrive, partial(self._lose, connection, packet_id))
+        self._send(
+            connection, LENGTH_BYTES + packet.size_bytes, arrive, partial(self._drop_and_close, connection, packet_id)
+        )
 
     def receive(self, packet: IpPacket) -> None:
         """Process a probe or its response."""
         probe: Probe = packet.body
-        if probe.alive is None:
-            alive = probe.connection == self._publisher_connection
-            self._emit(self._downstream, Probe(self._name, probe.connection, probe.number, alive))
-        elif not probe.alive:
+        if probe.is_alive is None:
+            is_alive = probe.connection == self._publisher_connection
+            self._emit(self._downstream, Probe(self._name, probe.connection, probe.number, is_alive))
+        elif not probe.is_alive:
             self._reconnect_later(probe.connection, "")
         elif probe.connection == self._subscriber_connection:
             self._reset_silence_timer()
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
         """Ignore the loss of a probe."""
 
     def _accept(self, connection: int) -> None:
@@ -133,7 +135,7 @@ class TcprosLink:
             self._reset_silence_timer()
 
     def _reconnect_later(self, connection: int, reason: str) -> None:  # noqa: ARG002 (see Lost)
-        """Give up the connection at the subscriber and open another one later, unless this has been done."""
+        """Give up the connection at the subscriber and open another one later, unless it was already given up."""
         if connection != self._subscriber_connection:
             return
         self._subscriber_connection = 0
@@ -146,7 +148,7 @@ class TcprosLink:
         if connection == self._publisher_connection:
             self._publisher_connection = 0
 
-    def _lose(self, connection: int, packet_id: int, reason: str) -> None:
+    def _drop_and_close(self, connection: int, packet_id: int, reason: str) -> None:
         self._wire.drop(packet_id, reason)
         self._close(connection, reason)
 
@@ -163,7 +165,7 @@ class TcprosLink:
         self._silence_timer.set(self._wire.now_ns + self._options.silence_ns)
 
     def _probe(self) -> None:
-        """Probe the connection from the subscriber, or give it up."""
+        """Probe the connection from the subscriber, or give up the connection after too many probes."""
         if self._unanswered_probes == self._options.probes:
             self._reconnect_later(self._subscriber_connection, "")
             return
@@ -173,15 +175,19 @@ class TcprosLink:
         self._emit(upstream, Probe(self._name, self._subscriber_connection, self._probe_count))
         self._silence_timer.set(self._wire.now_ns + self._options.probe_ns)
 
-    def _send(self, connection: int, size_bytes: int, delivered: Callable[[], None], lost: Lost) -> None:
-        self._streams.send(self._downstream, f"{self._name} {connection}", size_bytes, delivered, lost, reverse=True)
+    def _send(
+        self, connection: int, size_bytes: int, on_delivered: Callable[[], None], on_lost: LossCallback
+    ) -> None:
+        self._streams.send(
+            self._downstream, f"{self._name} {connection}", size_bytes, on_delivered, on_lost, reverse=True
+        )
 
     def _emit(self, ends: tuple[str, str], probe: Probe) -> None:
         source, destination = ends
         if source == destination:
             self._reset_silence_timer()
             return
-        kind = "probe" if probe.alive is None else "probe answer"
+        kind = "probe" if probe.is_alive is None else "probe answer"
         identity = f"{self._name} {kind}", probe.number
         self._wire.transmit(IpPacket(source, destination, TRANSPORT, _PROBE_BYTES, identity, probe))
 
@@ -198,7 +204,7 @@ class UdprosLink:
         options: Options of the nodes.
 
     Attributes:
-        connected: True if the publisher has a subscriber.
+        is_connected: True if the publisher has a subscriber.
     """
 
     def __init__(self, wire: Wire, name: str, flow: Ros1Flow, options: Ros1Options) -> None:
@@ -207,21 +213,21 @@ class UdprosLink:
         self._flow = flow
         self._payload_bytes = options.datagram_bytes - _UDPROS_HEADER_BYTES
         # The message that the subscriber is reassembling, and the index of the next block.
-        self._current = -1
-        self._next = 0
+        self._current_packet_id = -1
+        self._next_block = 0
         self._open: set[int] = set()
-        self.connected = False
+        self.is_connected = False
 
     def connect(self) -> None:
         """Do nothing; the subscriber has sent its address to the publisher."""
 
     def accept(self) -> None:
         """Add the subscriber at the publisher."""
-        self.connected = True
+        self.is_connected = True
 
     def publish(self, packet: Packet) -> None:
         """Send a message from the publisher."""
-        if not self.connected:
+        if not self.is_connected:
             self._wire.drop(packet.packet_id, NOT_CONNECTED)
             return
         source, destination = self._flow.publisher, self._flow.subscriber
@@ -240,20 +246,20 @@ class UdprosLink:
     def receive(self, packet: IpPacket) -> None:
         """Process a datagram at the subscriber."""
         block: Block = packet.body
-        if block.index == 0 and block.packet_id != self._current:
-            self._current, self._next = block.packet_id, 0
-        if block.packet_id != self._current or block.index != self._next:
+        if block.index == 0 and block.packet_id != self._current_packet_id:
+            self._current_packet_id, self._next_block = block.packet_id, 0
+        if block.packet_id != self._current_packet_id or block.index != self._next_block:
             self._drop(block.packet_id, OUT_OF_ORDER)
             return
-        self._next += 1
-        if self._next == block.block_count:
-            self._next = 0
-            self._current = -1
+        self._next_block += 1
+        if self._next_block == block.block_count:
+            self._next_block = 0
+            self._current_packet_id = -1
             if block.packet_id in self._open:
                 self._open.remove(block.packet_id)
                 self._wire.deliver(block.packet_id)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
         """Record, for statistics only, that a datagram will not arrive."""
         self._drop(packet.body.packet_id, reason)
 

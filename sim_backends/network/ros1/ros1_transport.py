@@ -53,10 +53,10 @@ class Ros1:
             else UdprosLink(wire, name, flow, options)
             for name, flow in self._flows.items()
         }
-        self._published: set[str] = set()
-        self._subscribed: set[str] = set()
-        self._topic_requested: set[str] = set()
-        self._has_keepalive: set[str] = set()
+        self._publisher_flows: set[str] = set()
+        self._subscriber_flows: set[str] = set()
+        self._requested_topics: set[str] = set()
+        self._agents_with_keepalive: set[str] = set()
         for name, flow in self._flows.items():
             self._at_start(flow.publisher, partial(self._register_publisher, name))
             self._at_start(flow.subscriber, partial(self._register_subscriber, name))
@@ -82,10 +82,10 @@ class Ros1:
         else:
             self._streams.receive(host, packet)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`."""
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.record_loss`."""
         if isinstance(packet.body, Probe | Block):
-            self._links[packet.body.flow].lost(packet, reason)
+            self._links[packet.body.flow].record_loss(packet, reason)
 
     def _at_start(self, agent: str, call: Callable[[], None]) -> None:
         starts_ns = self._options.starts_ns.get(agent, 0)
@@ -93,8 +93,8 @@ class Ros1:
 
     def _register_publisher(self, name: str) -> None:
         def serve() -> CallResponse:
-            self._published.add(name)
-            if name in self._subscribed:
+            self._publisher_flows.add(name)
+            if name in self._subscriber_flows:
                 self._update(name)
             return CallResponse(sizes.PUBLISHER_REGISTERED_BYTES, _do_nothing)
 
@@ -103,8 +103,8 @@ class Ros1:
 
     def _register_subscriber(self, name: str) -> None:
         def serve() -> CallResponse:
-            self._subscribed.add(name)
-            if name not in self._published:
+            self._subscriber_flows.add(name)
+            if name not in self._publisher_flows:
                 return CallResponse(sizes.SUBSCRIBER_REGISTERED_BYTES, _do_nothing)
             size_bytes = sizes.SUBSCRIBER_REGISTERED_BYTES + sizes.PUBLISHER_BYTES
             return CallResponse(size_bytes, partial(self._request_topic, name))
@@ -123,32 +123,32 @@ class Ros1:
         self._calls.call(self._master, self._flows[name].subscriber, size_bytes, serve, self._options.update)
 
     def _request_topic(self, name: str) -> None:
-        """Send the request for connection parameters from the subscriber to a publisher, unless already done."""
-        if name in self._topic_requested:
+        """Send the request for connection parameters from the subscriber to a publisher, once per flow."""
+        if name in self._requested_topics:
             return
-        self._topic_requested.add(name)
+        self._requested_topics.add(name)
         flow, link = self._flows[name], self._links[name]
-        udp = flow.protocol == "udpros"
+        is_udp = flow.protocol == "udpros"
 
         def serve() -> CallResponse:
             link.accept()
-            if udp:
+            if is_udp:
                 return CallResponse(sizes.UDPROS_REQUESTED_BYTES, link.connect)
             return CallResponse(sizes.TOPIC_REQUESTED_BYTES, partial(self._connect, name))
 
-        size_bytes = sizes.REQUEST_UDPROS_BYTES if udp else sizes.REQUEST_TOPIC_BYTES
+        size_bytes = sizes.REQUEST_UDPROS_BYTES if is_udp else sizes.REQUEST_TOPIC_BYTES
         request = self._options.request
         self._calls.call(flow.subscriber, flow.publisher, size_bytes, serve, request, topic=name)
 
     def _connect(self, name: str) -> None:
         """Open a connection from a subscriber; before the first one, query the master for the keep-alive setting."""
         subscriber, link = self._flows[name].subscriber, self._links[name]
-        if subscriber in self._has_keepalive:
+        if subscriber in self._agents_with_keepalive:
             link.connect()
             return
 
         def on_keepalive() -> None:
-            self._has_keepalive.add(subscriber)
+            self._agents_with_keepalive.add(subscriber)
             link.connect()
 
         def serve() -> CallResponse:

@@ -12,7 +12,7 @@ from sim_backends.network.tcp.connection import Tcp
 from sim_backends.network.tcp.tcp_options import TcpOptions
 from sim_backends.network.wire import IpPacket, Wire
 
-Lost = Callable[[str], None]
+LossCallback = Callable[[str], None]
 """Called with the reason of a loss."""
 
 
@@ -36,8 +36,8 @@ class TcpStreams:
         self._wire = wire
         self._transport = transport
         self._tcp = Tcp(self, options)
-        self._sent = 0
-        self._in_flight: dict[int, tuple[Callable[[], None], Lost]] = {}
+        self._message_count = 0
+        self._in_flight: dict[int, tuple[Callable[[], None], LossCallback]] = {}
 
     def send(
         self,
@@ -45,7 +45,7 @@ class TcpStreams:
         connection: str,
         size_bytes: int,
         on_delivered: Callable[[], None],
-        on_lost: Lost,
+        on_lost: LossCallback,
         *,
         reverse: bool = False,
     ) -> None:
@@ -53,10 +53,10 @@ class TcpStreams:
 
         Args:
             ends: Source and destination; within one host a message arrives immediately.
-            connection: Name of the connection, which is opened by its first message, and again after it was given up.
+            connection: Name of the connection; its first message opens it, also after the connection was given up.
             size_bytes: Size of the message.
             on_delivered: Called when the message is complete at the destination.
-            on_lost: Called when the connection was given up before that.
+            on_lost: Called if the connection is given up before that.
             reverse: True if the message is sent to the host that opened the connection.
         """
         source, destination = ends
@@ -64,15 +64,15 @@ class TcpStreams:
             self._wire.at(self._wire.now_ns, source, on_delivered)
             return
         self.now_ns = self._wire.now_ns
-        self._sent += 1
-        self._in_flight[self._sent] = on_delivered, on_lost
+        self._message_count += 1
+        self._in_flight[self._message_count] = on_delivered, on_lost
         self._tcp.send(
             Packet(
-                self._sent,
+                self._message_count,
                 source,
                 destination,
                 size_bytes,
-                (f"{connection} back" if reverse else connection, self._sent),
+                (f"{connection} back" if reverse else connection, self._message_count),
                 self.now_ns,
                 self.now_ns,
                 self._transport,

@@ -30,7 +30,7 @@ class NewReno:
         self._segment_bytes = options.segment_bytes
         self.window_bytes = options.initial_window_segments * options.segment_bytes
         self.threshold_bytes: int | None = None
-        # Fraction of a byte by which the window will grow: a numerator; the denominator is the window.
+        # Numerator of the fraction of a byte by which the window will grow; the denominator is the window.
         self._credit = 0
 
     @property
@@ -60,9 +60,14 @@ class NewReno:
         self.window_bytes = self.threshold_bytes
         self._credit = 0
 
-    def on_timeout(self, flight_bytes: int, *, again: bool) -> None:
-        """Reduce the window after a timeout (RFC 5681, 3.1); `again` is True without progress since the last one."""
-        if not again:
+    def on_timeout(self, flight_bytes: int, *, is_repeated: bool) -> None:
+        """Reduce the window after a timeout (RFC 5681, 3.1).
+
+        Args:
+            flight_bytes: Bytes in flight.
+            is_repeated: True if there was no progress since the last timeout.
+        """
+        if not is_repeated:
             self.threshold_bytes = self._reduced_threshold(flight_bytes)
         self.window_bytes = self._segment_bytes
         self._credit = 0
@@ -132,7 +137,7 @@ class Cubic(NewReno):
         super().__init__(options)
         # The plateau (W_max); None before the first loss and after a timeout (4.8, 4.10).
         self._w_max_bytes: int | None = None
-        # The window before the last reduction for any reason (cwnd_prior); None before the first.
+        # The window before the last reduction for any reason (cwnd_prior); None before the first reduction.
         self._cwnd_prior_bytes: int | None = None
         self._reset_epoch()
 
@@ -155,10 +160,10 @@ class Cubic(NewReno):
         self._reset_epoch()
 
     @override
-    def on_timeout(self, flight_bytes: int, *, again: bool) -> None:
-        if not again:
+    def on_timeout(self, flight_bytes: int, *, is_repeated: bool) -> None:
+        if not is_repeated:
             self._cwnd_prior_bytes = self.window_bytes
-        super().on_timeout(flight_bytes, again=again)
+        super().on_timeout(flight_bytes, is_repeated=is_repeated)
         self._w_max_bytes = None
         self._reset_epoch()
 

@@ -71,7 +71,7 @@ class TcpConnection:
     """One connection, open or being opened, which carries messages in one direction.
 
     The reverse direction of the same connection is a second object, which is open from the start. ACKs of the first
-    and data of the second are never combined in one packet.
+    object and data of the second object are never combined in one packet.
 
     Args:
         wire: The network below.
@@ -151,8 +151,8 @@ class TcpConnection:
         body = self._name, segment
         self._wire.transmit(IpPacket(source, destination, "tcp", segment.size_bytes, identity, body))
 
-    def _read(self, upto: int) -> None:
-        for packet_id in self._stream.read(upto):
+    def _read(self, end: int) -> None:
+        for packet_id in self._stream.read(end):
             self._wire.deliver(packet_id)
 
     def _give_up(self, reason: str) -> None:
@@ -239,8 +239,8 @@ class Tcp:
         if connection is not None:
             connection.receive(host, segment)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`: a lost packet loses no message, because TCP retransmits."""
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.record_loss`: a lost packet loses no message, because TCP retransmits."""
 
     def _remove(self, name: ConnectionName) -> None:
         del self._connections[name]

@@ -13,11 +13,11 @@ from sim_backends.network.tcp.tcp_options import TcpOptions
 _NS_PER_S_CUBED: Final = 10**27
 # bic_scale 41: C is 410 / 1024 segments per s^3.
 _C: Final = 410, 1024
-# beta 717 of 1024.
+# beta is 717 / 1024.
 _BETA: Final = 717, 1024
 # beta_scale: Reno's window grows by one segment per 15/8 acknowledged windows.
 _RENO: Final = 15, 8
-# The growth rate is updated after HZ / 32, unless the window changed.
+# Time after which the growth rate is updated even if the window has not changed: HZ / 32.
 _UPDATE_NS: Final = 1_000_000_000 // 32
 # Minimum number of acknowledged segments per segment of growth, and maximum before the first loss.
 _MIN_ACKED_PER_SEGMENT: Final = 2
@@ -40,7 +40,7 @@ class LinuxCubic(NewReno):
 
     def __init__(self, options: TcpOptions) -> None:
         super().__init__(options)
-        # In segments: the window at the last loss (W_max); 0 before the first loss and after a timeout.
+        # The window at the last loss (W_max), in segments; 0 before the first loss and after a timeout.
         self._w_max = 0
         self._min_round_trip_ns: int | None = None
         self._restart_epoch()
@@ -65,9 +65,9 @@ class LinuxCubic(NewReno):
         super().on_loss(flight_bytes)
         self._restart_epoch()
 
-    def on_timeout(self, flight_bytes: int, *, again: bool) -> None:
+    def on_timeout(self, flight_bytes: int, *, is_repeated: bool) -> None:
         """Reduce the window after a timeout, and reset the measurements of the path (bictcp_reset)."""
-        super().on_timeout(flight_bytes, again=again)
+        super().on_timeout(flight_bytes, is_repeated=is_repeated)
         self._w_max = 0
         self._min_round_trip_ns = None
         self._restart_epoch()
@@ -84,12 +84,12 @@ class LinuxCubic(NewReno):
         self._reno = 0
         self._reno_acked_bytes = 0
         self._acked_per_segment = 0
-        self._updated_ns = 0
-        self._updated_window = 0
+        self._last_update_ns = 0
+        self._window_at_last_update = 0
 
     def _avoid_congestion(self, now_ns: int, acked_bytes: int, round_trip_ns: int) -> None:  # noqa: ARG002 (the minimum is used)
         self._reno_acked_bytes += acked_bytes
-        if self._window != self._updated_window or now_ns - self._updated_ns > _UPDATE_NS:
+        if self._window != self._window_at_last_update or now_ns - self._last_update_ns > _UPDATE_NS:
             self._update(now_ns, acked_bytes)
         needed_bytes = self._acked_per_segment * self._segment_bytes
         if self._credit >= needed_bytes:
@@ -103,7 +103,7 @@ class LinuxCubic(NewReno):
     def _update(self, now_ns: int, acked_bytes: int) -> None:
         """Compute the number of acknowledged segments per segment of growth (bictcp_update)."""
         window = self._window
-        self._updated_window, self._updated_ns = window, now_ns
+        self._window_at_last_update, self._last_update_ns = window, now_ns
         if self._epoch_ns is None:
             self._start_epoch(now_ns, acked_bytes)
         target = self._target(now_ns)

@@ -10,8 +10,8 @@ from sim_backends.network.wire import Wire, WireTimer
 class Receiver:
     """Receives segments and acknowledges them.
 
-    Its program reads immediately. The offered window is therefore never closed and never probed, and it holds only
-    out-of-order data, which is never discarded.
+    Its program reads immediately. The receive window is therefore never closed and never probed, and its buffer
+    contains only out-of-order data, which is never discarded.
 
     Args:
         wire: Provides the clock.
@@ -22,7 +22,7 @@ class Receiver:
         is_open: True if the connection is already open.
 
     Attributes:
-        expected: The next expected sequence number (RCV.NXT); 0 before a SYN has arrived.
+        next_expected: The next expected sequence number (RCV.NXT); 0 before a SYN has arrived.
     """
 
     def __init__(
@@ -47,43 +47,43 @@ class Receiver:
         self._last_ack = int(is_open)
         self._echo_ns = 0
         self._last_segment: Segment | None = None
-        self.expected = int(is_open)
+        self.next_expected = int(is_open)
 
     def receive(self, segment: Segment) -> None:
         """Process a segment of the other end."""
         if segment.syn:
-            if not self.expected:
-                self.expected = 1
+            if not self.next_expected:
+                self.next_expected = 1
                 self._echo_ns = segment.sent_ns
             self._last_segment = segment
             self._send_ack()
             return
-        if not self.expected or not segment.length:
+        if not self.next_expected or not segment.length:
             return
         # RFC 7323, 4.3: echo the timestamp of the segment at the last ACK's number, so that the ACK delay is
         # included.
         if segment.first <= self._last_ack and segment.sent_ns >= self._echo_ns:
             self._echo_ns = segment.sent_ns
         self._last_segment = segment
-        if segment.first <= self.expected < segment.end:
+        if segment.first <= self.next_expected < segment.end:
             self._advance(segment)
         else:
-            if segment.first > self.expected:
+            if segment.first > self.next_expected:
                 self._store_out_of_order(segment)
             self._send_ack()
 
     def _advance(self, segment: Segment) -> None:
         had_gap = bool(self._sack_order)
-        self.expected = segment.end
+        self.next_expected = segment.end
         if had_gap:
             self._out_of_order.add(segment.first, segment.end)
             merged = self._out_of_order.containing(segment.first)
             assert merged is not None
-            self.expected = merged[1]
-            self._out_of_order.remove_before(self.expected)
-            self._sack_order = [number for number in self._sack_order if number >= self.expected]
+            self.next_expected = merged[1]
+            self._out_of_order.remove_before(self.next_expected)
+            self._sack_order = [number for number in self._sack_order if number >= self.next_expected]
         self._unacknowledged_segments += 1
-        self._on_readable(self.expected)
+        self._on_readable(self.next_expected)
         # RFC 5681, 4.2: send an ACK immediately for every second segment, and if a gap was filled completely or
         # partly.
         if had_gap or self._unacknowledged_segments >= self._options.segments_per_ack:
@@ -96,8 +96,8 @@ class Receiver:
         self._out_of_order.add(segment.first, segment.end)
         block = self._out_of_order.containing(segment.first)
         assert block is not None
-        others = [number for number in self._sack_order if not block[0] <= number < block[1]]
-        self._sack_order = [segment.first, *others]
+        other_ranges = [number for number in self._sack_order if not block[0] <= number < block[1]]
+        self._sack_order = [segment.first, *other_ranges]
 
     def _send_ack(self) -> None:
         assert self._last_segment is not None
@@ -105,13 +105,13 @@ class Receiver:
         sacks = tuple(block for block in blocks if block is not None)
         self._timer.stop()
         self._unacknowledged_segments = 0
-        self._last_ack = self.expected
+        self._last_ack = self.next_expected
         self._transmit(
             Segment(
                 syn=self._last_segment.syn,
                 first=0 if self._last_segment.syn else 1,
                 length=0,
-                acknowledges=self.expected,
+                acknowledges=self.next_expected,
                 sacks=sacks,
                 window_bytes=self._options.receive_window_bytes,
                 sent_ns=self._wire.now_ns,

@@ -78,17 +78,19 @@ class RackScoreboard(Scoreboard):
         super().send_again(now_ns, segment)
         self._transmissions.append((segment, segment.transmissions))
 
-    def detect_losses(self, now_ns: int, *, recovering: bool) -> int | None:
-        """Mark segments as lost that were sent before an arrived segment and longer ago than the time limit.
+    def detect_losses(self, now_ns: int, *, is_recovering: bool) -> int | None:
+        """Mark a segment as lost if it was sent before an arrived segment and longer ago than a limit.
 
         The limit is the sum of a round trip and the reordering window.
         """
-        limit_ns = self._round_trip_ns + self._reordering_window_ns(recovering=recovering)
+        limit_ns = self._round_trip_ns + self._reordering_window_ns(is_recovering=is_recovering)
         transmissions, undecided, due_ns = self._transmissions, list[tuple[SentSegment, int]](), None
         while transmissions:
             segment, transmission_count = transmissions[0]
             is_current = (
-                segment.copies and segment.transmissions == transmission_count and segment.end > self.acknowledged
+                segment.copies
+                and segment.transmissions == transmission_count
+                and segment.end > self.first_unacknowledged
             )
             if is_current and (segment.sent_ns, segment.end) >= self._latest_delivered:
                 break
@@ -114,20 +116,20 @@ class RackScoreboard(Scoreboard):
             and self._min_round_trip_ns is not None
             and round_trip_ns < self._min_round_trip_ns
         ):
-            # It was an earlier transmission that arrived (RFC 8985, 6.2, step 2).
+            # An earlier transmission has arrived (RFC 8985, 6.2, step 2).
             return
         if segment.transmissions == 1:
             self._min_round_trip_ns = min(round_trip_ns, self._min_round_trip_ns or round_trip_ns)
         self._round_trip_ns = round_trip_ns
         self._latest_delivered = max(self._latest_delivered, (segment.sent_ns, segment.end))
 
-    def _reordering_window_ns(self, *, recovering: bool) -> int:
+    def _reordering_window_ns(self, *, is_recovering: bool) -> int:
         """Return the tolerated delay of a segment beyond a round trip (RFC 8985, 6.2, step 4)."""
         threshold_reached = (
             len(self._latest_sacked) == DUPLICATE_THRESHOLD
             and self._latest_sacked[0] >= self._removed_count + self._acked_count
         )
-        if recovering or threshold_reached:
+        if is_recovering or threshold_reached:
             return 0
         return (self._min_round_trip_ns or 0) // _REORDERING_SHARE
 
@@ -150,14 +152,14 @@ class ProportionalReduction:
         self._delivered_bytes = 0
         self._sent_bytes = 0
 
-    def window_bytes(self, pipe_bytes: int, delivered_bytes: int, *, safe: bool) -> int:
+    def window_bytes(self, pipe_bytes: int, delivered_bytes: int, *, is_safe: bool) -> int:
         """Return the window after an ACK.
 
         Args:
             pipe_bytes: Estimate of the bytes in flight.
             delivered_bytes: Bytes newly reported as received by the ACK number or by SACK.
-            safe: True if the ACK acknowledges new data and shows no further loss. Slow start may then compensate for
-                losses beyond the reduction (RFC 6937, 3, SSRB); Linux uses the same condition.
+            is_safe: True if the ACK acknowledges new data and shows no further loss. Slow start may then compensate
+                for losses beyond the reduction (RFC 6937, 3, SSRB); Linux uses the same condition.
         """
         self._delivered_bytes += delivered_bytes
         deficit_bytes = self._delivered_bytes - self._sent_bytes
@@ -165,7 +167,7 @@ class ProportionalReduction:
             share = -(-self._delivered_bytes * self._threshold_bytes // self._flight_bytes)
             allowed_bytes = share - self._sent_bytes
         else:
-            limit = max(deficit_bytes, delivered_bytes) + self._segment_bytes if safe else deficit_bytes
+            limit = max(deficit_bytes, delivered_bytes) + self._segment_bytes if is_safe else deficit_bytes
             allowed_bytes = min(self._threshold_bytes - pipe_bytes, limit)
         return pipe_bytes + max(allowed_bytes, 0)
 

@@ -1,6 +1,6 @@
 """The byte stream of a connection: the messages written to it, its segments, and ranges of its sequence numbers.
 
-Segments are as they are on the wire, without ports and checksums. Sequence numbers are relative, as in packet
+Segments have the same fields as on the wire, except ports and checksums. Sequence numbers are relative, as in packet
 analysers: a SYN has number 0, the first data byte number 1. They do not wrap around.
 """
 
@@ -15,7 +15,7 @@ Range = tuple[int, int]
 
 
 class Ranges:
-    """A set of numbers, stored as ranges that neither overlap nor touch."""
+    """A set of numbers, stored as ranges that are neither overlapping nor adjacent."""
 
     def __init__(self) -> None:
         self._firsts: list[int] = []
@@ -33,10 +33,10 @@ class Ranges:
         after = bisect_right(self._firsts, end)
         new_ranges = []
         position = first
-        for known_first, known_end in zip(self._firsts[begin:after], self._ends[begin:after], strict=True):
-            if position < known_first:
-                new_ranges.append((position, known_first))
-            position = max(position, known_end)
+        for existing_first, existing_end in zip(self._firsts[begin:after], self._ends[begin:after], strict=True):
+            if position < existing_first:
+                new_ranges.append((position, existing_first))
+            position = max(position, existing_end)
         if position < end:
             new_ranges.append((position, end))
         if begin < after:
@@ -132,15 +132,15 @@ class MessageStream:
 
     def __init__(self, segment_bytes: int) -> None:
         self._segment_bytes = segment_bytes
-        self._numbers = 0
+        self._next_segment_number = 0
         self._unsent: deque[_Message] = deque()
         self._unread: deque[_Message] = deque()
         self.end = 1
 
     def write(self, packet_id: int, size_bytes: int) -> None:
         """Append a message."""
-        message = _Message(packet_id, self.end, self.end + size_bytes, self._numbers)
-        self._numbers += -(-size_bytes // self._segment_bytes)
+        message = _Message(packet_id, self.end, self.end + size_bytes, self._next_segment_number)
+        self._next_segment_number += -(-size_bytes // self._segment_bytes)
         self.end = message.end
         self._unsent.append(message)
         self._unread.append(message)
@@ -149,21 +149,21 @@ class MessageStream:
         """Return the number of the segment that starts with the byte `first`, which must not decrease between calls.
 
         A segment ends when it is full or at the end of a message. Therefore at most one segment starts in each
-        segment-sized part of a message; the number of these parts before it is unique and independent of what was
-        sent before.
+        segment-sized part of a message. The number of these parts before it is unique, and does not depend on earlier
+        segments.
         """
         while self._unsent[0].end <= first:
             self._unsent.popleft()
         message = self._unsent[0]
         return message.number + (first - message.first) // self._segment_bytes
 
-    def read(self, upto: int) -> list[int]:
-        """Return the packets that are complete before `upto` and were not returned before."""
+    def read(self, end: int) -> list[int]:
+        """Return the packets that end at or before `end` and have not been returned before."""
         packet_ids = []
-        while self._unread and self._unread[0].end <= upto:
+        while self._unread and self._unread[0].end <= end:
             packet_ids.append(self._unread.popleft().packet_id)
         return packet_ids
 
     def unread(self) -> list[int]:
-        """Return the packets that were not read."""
+        """Return the packets that have not been read."""
         return [message.packet_id for message in self._unread]

@@ -62,7 +62,7 @@ class Sender:
         self._log = log
         self._timer = WireTimer(wire, host, self._on_timeout)
         self._reordering_timer = WireTimer(wire, host, self._on_reordering_timeout)
-        self._open = False
+        self._is_open = False
         self._echo_ns: int | None = None
         self._receive_window_bytes = 0
         # Consecutive timeouts without progress.
@@ -83,13 +83,13 @@ class Sender:
         if round_trip_ns is None:
             self._send_syn()
         else:
-            self._open = True
+            self._is_open = True
             self._receive_window_bytes = options.receive_window_bytes
             self.round_trips.sample(round_trip_ns)
 
     def on_written(self) -> None:
         """Send data that was written to the stream, as far as the windows allow."""
-        if not self._open:
+        if not self._is_open:
             return
         idle_ns = self._wire.now_ns - self._last_sent_ns
         if self._options.restart_after_idle and not self.scoreboard and idle_ns > self.round_trips.timeout_ns:
@@ -101,12 +101,12 @@ class Sender:
         """Process a segment of the other end."""
         if segment.syn:
             self._on_syn_ack(segment)
-        elif self._open:
+        elif self._is_open:
             self._on_ack(segment)
 
     def close(self) -> None:
         """Stop sending, and stop all timers."""
-        self._open = False
+        self._is_open = False
         self._timer.stop()
         self._reordering_timer.stop()
 
@@ -116,8 +116,8 @@ class Sender:
 
     def _on_syn_ack(self, segment: Segment) -> None:
         """Process a SYN-ACK; a repeated SYN-ACK is only acknowledged again."""
-        if not self._open:
-            self._open = True
+        if not self._is_open:
+            self._is_open = True
             self._timer.stop()
             if self._timeouts > 1:
                 self.control.on_syn_losses()
@@ -134,15 +134,15 @@ class Sender:
         self.round_trips.sample(self._wire.now_ns - segment.echoes_ns)
 
     def _on_ack(self, segment: Segment) -> None:
-        scoreboard, upto, now_ns = self.scoreboard, segment.acknowledges, self._wire.now_ns
-        assert upto is not None
+        scoreboard, ack_number, now_ns = self.scoreboard, segment.acknowledges, self._wire.now_ns
+        assert ack_number is not None
         self._receive_window_bytes = segment.window_bytes
         self._echo_ns = segment.sent_ns
         delivered_bytes, losses = scoreboard.delivered_bytes, scoreboard.losses
         scoreboard.arrive(now_ns, segment.sacks)
-        advances = upto > scoreboard.acknowledged
-        if advances:
-            scoreboard.acknowledge(now_ns, upto)
+        is_new_ack = ack_number > scoreboard.first_unacknowledged
+        if is_new_ack:
+            scoreboard.acknowledge(now_ns, ack_number)
             self._timeouts = 0
             self._sample_round_trip(segment)
             self._restart_timer()
@@ -152,27 +152,27 @@ class Sender:
             self._window_bytes = self._reduction.window_bytes(
                 scoreboard.pipe_bytes,
                 scoreboard.delivered_bytes - delivered_bytes,
-                safe=advances and scoreboard.losses == losses,
+                is_safe=is_new_ack and scoreboard.losses == losses,
             )
         self._send()
         self._log("ack")
 
     def _detect_losses(self) -> None:
         """Detect losses, and start a recovery if none is in progress."""
-        due_ns = self.scoreboard.detect_losses(self._wire.now_ns, recovering=self._recovery_end is not None)
+        due_ns = self.scoreboard.detect_losses(self._wire.now_ns, is_recovering=self._recovery_end is not None)
         if due_ns is None:
             self._reordering_timer.stop()
         else:
             self._reordering_timer.set(due_ns)
-        if self._recovery_end is None and (lost := self.scoreboard.next_lost()) is not None:
-            self._start_recovery(lost)
+        if self._recovery_end is None and (lost_segment := self.scoreboard.next_lost()) is not None:
+            self._start_recovery(lost_segment)
 
     def _on_reordering_timeout(self) -> None:
         """Detect losses after the reordering window has passed (RFC 8985, 6.3)."""
-        if self._open:
+        if self._is_open:
             self._detect_losses()
             if self._reduction is not None:
-                self._window_bytes = self._reduction.window_bytes(self.scoreboard.pipe_bytes, 0, safe=False)
+                self._window_bytes = self._reduction.window_bytes(self.scoreboard.pipe_bytes, 0, is_safe=False)
             self._send()
 
     def _update_window(self, delivered_bytes: int) -> None:
@@ -183,11 +183,11 @@ class Sender:
         """
         now_ns = self._wire.now_ns
         last_ack_ns, self._last_ack_ns = self._last_ack_ns, now_ns
-        recovering = self._reduction is not None
-        if self._recovery_end is not None and self.scoreboard.acknowledged >= self._recovery_end:
+        is_recovering = self._reduction is not None
+        if self._recovery_end is not None and self.scoreboard.first_unacknowledged >= self._recovery_end:
             self._recovery_end = None
             self._reduction = None
-        if recovering:
+        if is_recovering:
             return
         if self._is_window_limited:
             assert self.round_trips.smoothed_ns is not None
@@ -195,24 +195,26 @@ class Sender:
         else:
             self.control.on_idle(now_ns - last_ack_ns)
 
-    def _start_recovery(self, lost: SentSegment) -> None:
+    def _start_recovery(self, lost_segment: SentSegment) -> None:
         """Start a recovery: reduce the window and send the first lost segment (RFC 6675, 5, step 4)."""
         scoreboard = self.scoreboard
-        self._recovery_end = scoreboard.next
+        self._recovery_end = scoreboard.next_number
         self.control.on_loss(self._flight_bytes())
         self._reduction = ProportionalReduction(
-            self.control.window_bytes, scoreboard.next - scoreboard.acknowledged, self._options.segment_bytes
+            self.control.window_bytes,
+            scoreboard.next_number - scoreboard.first_unacknowledged,
+            self._options.segment_bytes,
         )
         self._log("loss")
-        self._send_again(lost)
+        self._send_again(lost_segment)
 
     def _flight_bytes(self) -> int:
         """Return FlightSize without the data that limited transmit sent beyond the window (RFC 5681, 3.2, step 2)."""
-        return min(self.scoreboard.next - self.scoreboard.acknowledged, self.control.window_bytes)
+        return min(self.scoreboard.next_number - self.scoreboard.first_unacknowledged, self.control.window_bytes)
 
     def _on_timeout(self) -> None:
         self._timeouts += 1
-        if not self._open:
+        if not self._is_open:
             self._on_syn_timeout()
             return
         if self._timeouts > self._options.retries:
@@ -220,9 +222,9 @@ class Sender:
             return
         scoreboard = self.scoreboard
         is_repeated = self._timeouts > 1 or (self._reduction is not None and not self.control.reduces_in_recovery)
-        self.control.on_timeout(self._flight_bytes(), again=is_repeated)
+        self.control.on_timeout(self._flight_bytes(), is_repeated=is_repeated)
         scoreboard.lose_all()
-        self._recovery_end = scoreboard.next
+        self._recovery_end = scoreboard.next_number
         self._reduction = None
         self.round_trips.back_off()
         self._log("timeout")
@@ -242,33 +244,33 @@ class Sender:
             self._window_bytes = self.control.window_bytes
         self._is_window_limited = False
         while True:
-            resend = scoreboard.next_lost()
-            length = resend.end - resend.first if resend else self._next_length()
+            segment_to_resend = scoreboard.next_lost()
+            length = segment_to_resend.end - segment_to_resend.first if segment_to_resend else self._next_length()
             if not length and self._recovery_end is not None:
-                resend = scoreboard.next_overtaken()
-                length = resend.end - resend.first if resend else 0
+                segment_to_resend = scoreboard.next_overtaken()
+                length = segment_to_resend.end - segment_to_resend.first if segment_to_resend else 0
             if not length:
                 return
             if scoreboard.pipe_bytes + length > self._window_bytes:
                 self._is_window_limited = True
                 return
-            if resend:
-                self._send_again(resend)
+            if segment_to_resend:
+                self._send_again(segment_to_resend)
             else:
                 self._send_new(length)
 
     def _next_length(self) -> int:
         """Return the length of the next new segment; 0 if there is none."""
         scoreboard, options = self.scoreboard, self._options
-        length = min(options.segment_bytes, self._stream.end - scoreboard.next)
-        if scoreboard.next + length > scoreboard.acknowledged + self._receive_window_bytes:
+        length = min(options.segment_bytes, self._stream.end - scoreboard.next_number)
+        if scoreboard.next_number + length > scoreboard.first_unacknowledged + self._receive_window_bytes:
             return 0
         if options.nagle and length < options.segment_bytes and scoreboard:
             return 0
         return length
 
     def _send_new(self, length: int) -> None:
-        segment = self.scoreboard.send(self._wire.now_ns, length, self._stream.number(self.scoreboard.next))
+        segment = self.scoreboard.send(self._wire.now_ns, length, self._stream.number(self.scoreboard.next_number))
         self._emit(segment.first, length, number=segment.number, earlier_transmissions=0)
         self._record_sent(length)
         if self._timer.due_ns is None:

@@ -28,7 +28,7 @@ class TcpOptions:
             Linux's autotuning: half of the maximum of 6 MiB in `tcp_rmem`, by `tcp_adv_win_scale`.
         min_timeout_ns: Minimum retransmission timeout: 200 ms in Linux, 1 s in RFC 6298.
         max_timeout_ns: Maximum retransmission timeout (Linux: TCP_RTO_MAX).
-        initial_timeout_ns: Timeout before the first round trip was measured (RFC 6298, 2.1).
+        initial_timeout_ns: Timeout until the first round trip has been measured (RFC 6298, 2.1).
         clock_granularity_ns: Clock granularity G of RFC 6298: the minimum of the variance term of a timeout.
         syn_retries: Maximum number of SYN retransmissions (Linux: tcp_syn_retries).
         retries: Maximum number of consecutive retransmission timeouts without progress before the connection is given
@@ -43,7 +43,7 @@ class TcpOptions:
             acknowledged bytes, as in Linux. RFC 5681 has 1, RFC 3465 up to 2.
 
     Raises:
-        ConfigurationError: No connection can work with one of the values.
+        ConfigurationError: A value is below its minimum.
     """
 
     mtu_bytes: int = 1500

@@ -31,7 +31,7 @@ _WRITER_BYTES: Final = 200
 _READER_BYTES: Final = 212
 """Sizes of the SEDP data of a writer and of a reader, without the names of topic and type."""
 _DIRECTED_RESPONSES: Final = 4
-_LEASE_EXPIRED: Final = "the subscriber's lease ran out"
+_LEASE_EXPIRED: Final = "the lease of the subscriber expired"
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class Announcement:
     """An SPDP message.
 
     Attributes:
-        directed: True if it responds to an announcement and needs no response.
+        is_directed: True if it responds to an announcement and needs no response.
     """
 
-    directed: bool
+    is_directed: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,18 +76,18 @@ class SharedHeartbeats:
 
 
 @dataclass(slots=True)
-class _Remote:
-    """State of a remote participant, as one participant records it.
+class _RemoteParticipant:
+    """The state of a remote participant at one participant.
 
     Attributes:
         lease: Fires when the lease may have expired.
-        renewed_ns: Time of the last message from it.
-        alive: True from its announcement until its lease expires.
+        last_renewal_ns: Time of the last message from it.
+        is_alive: True from its announcement until its lease expires.
     """
 
     lease: WireTimer
-    renewed_ns: int = 0
-    alive: bool = False
+    last_renewal_ns: int = 0
+    is_alive: bool = False
 
 
 class TopicDiscovery:
@@ -115,7 +115,7 @@ class TopicDiscovery:
         self._user_sessions = dict(sessions)
         self._timing = timing
         self._discovery_timing = discovery_timing
-        self._remotes: dict[tuple[str, str], _Remote] = {}
+        self._remote_participants: dict[tuple[str, str], _RemoteParticipant] = {}
         self._announcement_counts: dict[tuple[str, str], int] = {}
         self._collected_heartbeats: dict[str, dict[str, Heartbeat]] = {}
         self._shared_counts: dict[str, int] = {}
@@ -126,31 +126,31 @@ class TopicDiscovery:
 
     def renew_lease(self, host: str, peer: str) -> None:
         """Record that a message from `peer` arrived at `host`, which renews its lease."""
-        remote = self._remotes.get((host, peer))
-        if remote is not None and remote.alive:
-            remote.renewed_ns = self._wire.now_ns
+        remote_participant = self._remote_participants.get((host, peer))
+        if remote_participant is not None and remote_participant.is_alive:
+            remote_participant.last_renewal_ns = self._wire.now_ns
 
     def receive(self, host: str, peer: str, message: Announcement | SharedHeartbeats) -> None:
         """Process a message of `peer` that arrived at `host`."""
         if isinstance(message, Announcement):
-            self._on_announcement(host, peer, directed=message.directed)
+            self._on_announcement(host, peer, is_directed=message.is_directed)
         elif (heartbeat := message.by_peer.get(host)) is not None:
             self._sedp_session(peer, host).reader.on_message(heartbeat)
 
-    def _on_announcement(self, host: str, peer: str, *, directed: bool) -> None:
+    def _on_announcement(self, host: str, peer: str, *, is_directed: bool) -> None:
         if self._wire.now_ns < self._discovery_timing.starts_ns.get(host, 0) or host not in self._participants:
             return
-        remote = self._remotes.get((host, peer))
-        if remote is None:
-            remote = self._remotes[host, peer] = _Remote(
+        remote_participant = self._remote_participants.get((host, peer))
+        if remote_participant is None:
+            remote_participant = self._remote_participants[host, peer] = _RemoteParticipant(
                 WireTimer(self._wire, host, partial(self._check_lease, host, peer))
             )
-        if remote.alive:
+        if remote_participant.is_alive:
             return
-        remote.alive = True
-        remote.renewed_ns = self._wire.now_ns
-        remote.lease.bring_forward(self._wire.now_ns + self._discovery_timing.lease_ns)
-        if not directed:
+        remote_participant.is_alive = True
+        remote_participant.last_renewal_ns = self._wire.now_ns
+        remote_participant.lease.bring_forward(self._wire.now_ns + self._discovery_timing.lease_ns)
+        if not is_directed:
             self._respond(host, peer, _DIRECTED_RESPONSES)
         self._start_sedp(host, peer)
 
@@ -166,7 +166,9 @@ class TopicDiscovery:
         """Announce a participant and assert its liveliness periodically."""
         self._announce(participant)
         for peer in self._participants:
-            if (remote := self._remotes.get((participant, peer))) is not None and remote.alive:
+            if (
+                remote_participant := self._remote_participants.get((participant, peer))
+            ) is not None and remote_participant.is_alive:
                 writer = self._sedp_session(participant, peer).writer
                 writer.write(Sample(_LIVELINESS_BYTES, writer.last + 1))
         self._wire.at(
@@ -179,11 +181,11 @@ class TopicDiscovery:
             self._announcement_counts.get((participant, peer), -1) + 1
         )
         key = f"spdp {participant} {peer}", number
-        body = Announcement(directed=bool(peer))
+        body = Announcement(is_directed=bool(peer))
         self._wire.transmit(IpPacket(participant, peer or None, TRANSPORT, SPDP_BYTES, key, body))
 
     def _respond(self, host: str, peer: str, count: int) -> None:
-        if count and self._remotes[host, peer].alive:
+        if count and self._remote_participants[host, peer].is_alive:
             self._announce(host, peer)
             next_ns = self._wire.now_ns + self._discovery_timing.directed_ns
             self._wire.at(next_ns, host, partial(self._respond, host, peer, count - 1))
@@ -227,34 +229,34 @@ class TopicDiscovery:
         self._wire.transmit(IpPacket(host, None, TRANSPORT, size_bytes, key, SharedHeartbeats(heartbeats)))
 
     def _offer_endpoints(self, host: str, peer: str) -> None:
-        """Add the endpoints of `host` to the writer for `peer`, unless earlier ones are still unacknowledged."""
+        """Add the endpoints of `host` to the writer for `peer`, unless added endpoints are still unacknowledged."""
         writer = self._sedp_session(host, peer).writer
         if any(sample.endpoint_flow for sample in writer.unacknowledged):
             return
         for name, flow in self._flows.items():
-            for agent, publishes in ((flow.publisher, True), (flow.subscriber, False)):
+            for agent, is_publisher in ((flow.publisher, True), (flow.subscriber, False)):
                 if agent == host:
-                    size_bytes = _endpoint_bytes(flow, writer=publishes)
+                    size_bytes = _endpoint_bytes(flow, writer=is_publisher)
                     writer.add_historical(Sample(size_bytes, writer.last + 1, endpoint_flow=name))
 
     def _on_endpoint(self, host: str, peer: str, sample: Sample) -> None:
-        """Match an endpoint of `host` with the endpoint of `peer` that it has received."""
+        """Match an endpoint of `host` with the endpoint of `peer` whose data `host` has received."""
         flow = self._flows.get(sample.endpoint_flow)
-        if flow is None or not self._remotes[host, peer].alive:
+        if flow is None or not self._remote_participants[host, peer].is_alive:
             return
         session = self._user_sessions[sample.endpoint_flow]
-        if (flow.publisher, flow.subscriber) == (peer, host) and not session.reader.matched:
+        if (flow.publisher, flow.subscriber) == (peer, host) and not session.reader.is_matched:
             session.reader.match()
-        elif (flow.publisher, flow.subscriber) == (host, peer) and not session.writer.matched:
+        elif (flow.publisher, flow.subscriber) == (host, peer) and not session.writer.is_matched:
             session.writer.match()
 
     def _check_lease(self, host: str, peer: str) -> None:
-        remote = self._remotes[host, peer]
-        expires_ns = remote.renewed_ns + self._discovery_timing.lease_ns
+        remote_participant = self._remote_participants[host, peer]
+        expires_ns = remote_participant.last_renewal_ns + self._discovery_timing.lease_ns
         if self._wire.now_ns < expires_ns:
-            remote.lease.bring_forward(expires_ns)
+            remote_participant.lease.bring_forward(expires_ns)
             return
-        remote.alive = False
+        remote_participant.is_alive = False
         self._sedp_session(host, peer).writer.remove_reader(_LEASE_EXPIRED)
         self._sedp_session(peer, host).unmatch_reader()
         for name, flow in self._flows.items():

@@ -1,7 +1,7 @@
 """A flow of publish-subscribe: a writer, its reader, and the record of the result of each sample.
 
 The two ends exchange information only by messages. The record uses the state of both ends: a sample will never arrive
-if its writer has given it up, no message with a part of it is in flight, and its reader does not hold it.
+if its writer has given it up, no message with a part of it is in flight, and its reader has not stored all of it.
 """
 
 from collections.abc import Callable
@@ -63,30 +63,30 @@ class TopicSession:
         self._deliver = deliver
         self._drop = drop
         self._topics = topics
-        self._reliable = flow.qos.reliability == "reliable"
-        self.writer = TopicWriter(wire, flow, timing, self._to_reader, self._on_given_up)
+        self._is_reliable = flow.qos.reliability == "reliable"
+        self.writer = TopicWriter(wire, flow, timing, self._to_reader, self._on_give_up)
         self.reader = TopicReader(wire, flow, timing, self._to_writer, self._on_delivered)
 
     def receive(self, host: str, message: RtpsMessage) -> None:
         """Process a message that arrived at `host`."""
-        samples = self._resolve(message)
-        at_reader = host == self._flow.subscriber
+        samples = self._mark_resolved(message)
+        is_at_reader = host == self._flow.subscriber
         for submessage in message.submessages:
             if isinstance(submessage, AckNack | NackFrag):
-                if not at_reader:
+                if not is_at_reader:
                     self.writer.on_acknack(submessage)
-            elif at_reader:
+            elif is_at_reader:
                 self.reader.on_message(submessage)
         for sample in samples:
-            if not self._reliable and not self.reader.matched:
-                sample.given_up = NOT_MATCHED
+            if not self._is_reliable and not self.reader.is_matched:
+                sample.give_up_reason = NOT_MATCHED
             self._settle(sample)
 
-    def lost(self, message: RtpsMessage, reason: str) -> None:
+    def record_loss(self, message: RtpsMessage, reason: str) -> None:
         """Record, for statistics only, that a message will not arrive."""
-        for sample in self._resolve(message):
-            if not self._reliable:
-                sample.given_up = reason
+        for sample in self._mark_resolved(message):
+            if not self._is_reliable:
+                sample.give_up_reason = reason
             self._settle(sample)
 
     def unmatch_reader(self) -> None:
@@ -94,29 +94,29 @@ class TopicSession:
         for sample in self.reader.remove_writer():
             self._settle(sample)
 
-    def _resolve(self, message: RtpsMessage) -> list[Sample]:
+    def _mark_resolved(self, message: RtpsMessage) -> list[Sample]:
         """Mark a message as arrived or lost; return its samples the first time, and none for further copies."""
-        if message.resolved:
+        if message.is_resolved:
             return []
-        message.resolved = True
+        message.is_resolved = True
         samples = [submessage.sample for submessage in message.submessages if isinstance(submessage, Data)]
         for sample in samples:
             sample.in_flight -= 1
         return samples
 
     def _on_delivered(self, sample: Sample) -> None:
-        if not sample.settled:
-            sample.settled = True
+        if not sample.is_settled:
+            sample.is_settled = True
             self._deliver(sample)
 
-    def _on_given_up(self, sample: Sample, reason: str) -> None:
-        sample.given_up = reason
+    def _on_give_up(self, sample: Sample, reason: str) -> None:
+        sample.give_up_reason = reason
         self._settle(sample)
 
     def _settle(self, sample: Sample) -> None:
-        if sample.given_up and not sample.in_flight and not sample.held and not sample.settled:
-            sample.settled = True
-            self._drop(sample, sample.given_up)
+        if sample.give_up_reason and not sample.in_flight and not sample.is_stored and not sample.is_settled:
+            sample.is_settled = True
+            self._drop(sample, sample.give_up_reason)
 
     def _to_reader(self, submessages: tuple[Submessage, ...], key: PacketIdentity) -> None:
         for submessage in submessages:

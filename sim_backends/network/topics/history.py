@@ -22,7 +22,7 @@ class WriterHistory:
 
     Attributes:
         samples: Samples by sequence number, oldest first, without gaps.
-        unacknowledged_bytes: Sum of their sizes.
+        unacknowledged_bytes: Sum of the sizes of these samples.
     """
 
     def __init__(self, qos: Qos, timing: RtpsTiming) -> None:
@@ -30,8 +30,8 @@ class WriterHistory:
         self._low_bytes = timing.low_bytes
         self._high_bytes = timing.high_bytes
         self._max_high_bytes = timing.max_high_bytes
-        self._grew_ns = 0
-        self._resending = False
+        self._last_growth_ns = 0
+        self._has_resent = False
         self.samples: dict[int, Sample] = {}
         self.unacknowledged_bytes = 0
 
@@ -53,7 +53,7 @@ class WriterHistory:
         for number in [number for number in self.samples if number < base]:
             self._remove(number)
         if not self.samples:
-            self._resending = False
+            self._has_resent = False
 
     def clear(self) -> list[Sample]:
         """Remove and return all samples."""
@@ -63,24 +63,24 @@ class WriterHistory:
 
     def on_resend(self) -> None:
         """Reduce the high watermark for a retransmission, but only once until all samples are acknowledged."""
-        if not self._resending:
-            self._resending = True
+        if not self._has_resent:
+            self._has_resent = True
             self._high_bytes = max(8 * self._high_bytes // 10, self._low_bytes)
 
     def admits(self, now_ns: int) -> bool:
-        """Return True if a writer may write now; raise the high watermark if it prevents writing."""
+        """Return True if a writer may write now; raise the high watermark if it prevents writing and may grow."""
         if self._depth is not None or self.unacknowledged_bytes <= self._high_bytes:
             return True
         headroom_bytes = self._max_high_bytes - self._high_bytes
-        if not self._resending and headroom_bytes > 0 and now_ns >= self._grew_ns + _GROWTH_PAUSE_NS:
+        if not self._has_resent and headroom_bytes > 0 and now_ns >= self._last_growth_ns + _GROWTH_PAUSE_NS:
             self._high_bytes += headroom_bytes // 32 or headroom_bytes
-            self._grew_ns = now_ns
+            self._last_growth_ns = now_ns
         return self.unacknowledged_bytes <= self._high_bytes
 
     @property
     def can_resume(self) -> bool:
         """True if a blocked writer may write again."""
-        return self.unacknowledged_bytes <= self._low_bytes and not self._resending
+        return self.unacknowledged_bytes <= self._low_bytes and not self._has_resent
 
     @property
     def fill_level(self) -> int:

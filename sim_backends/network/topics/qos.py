@@ -17,7 +17,7 @@ class Qos:
         reliability: `reliable`, or `best_effort`.
         history: `keep_last` samples up to `depth`, or `keep_all`: then the writer blocks while too many of them are
             unacknowledged.
-        depth: Number of samples that `keep_last` keeps, including unacknowledged ones.
+        depth: Number of samples that `keep_last` stores, including unacknowledged ones.
         max_blocking_ns: Time for which a sample waits for a blocked writer before it is dropped; None means without
             limit, as in ROS 2 on CycloneDDS.
     """
@@ -72,7 +72,8 @@ class RtpsTiming:
         fragment_bytes: Size of a sample's fragments (`FragmentSize`); a message contains an integer number of them.
         message_bytes: Maximum size of a message of new data (`MaxMessageSize`).
         retransmit_bytes: Maximum size of a message of retransmitted data (`MaxRexmitMessageSize`).
-        heartbeat_ns: Time from the last write to a separate heartbeat, and interval of these (`HeartbeatInterval`).
+        heartbeat_ns: Time from the last write to a separate heartbeat, and interval of separate heartbeats
+            (`HeartbeatInterval`).
         first_heartbeat_ns: Time from matching a reader to the first heartbeat.
         heartbeat_min_ns: Minimum heartbeat interval, used while much data is unacknowledged.
         heartbeat_max_ns: Maximum heartbeat interval, reached if the reader does not respond.
@@ -82,7 +83,7 @@ class RtpsTiming:
         ack_delay_ns: Minimum interval of two acknowledgements of the same data (`AckDelay`).
         nack_repeat_ns: Time from a request to the next if no heartbeat arrives (`AutoReschedNackDelay`).
         first_acknack_ns: Time from matching a writer to the reader's first ACKNACK (`PreEmptiveAckDelay`).
-        first_acknack_repeat_ns: Initial interval of its repetitions.
+        first_acknack_repeat_ns: Initial interval at which the first ACKNACK is repeated.
         low_bytes: Low watermark: unacknowledged data below which a blocked writer resumes (`WhcLow`).
         high_bytes: Initial high watermark, above which a writer blocks (`WhcHighInit`).
         max_high_bytes: Maximum high watermark, reached while nothing is lost (`WhcHigh`).

@@ -1,4 +1,4 @@
-"""Messages of RTPS and their sizes (OMG DDSI-RTPS 2.5, clause 9.4), as far as they are used here.
+"""The used messages of RTPS, and their sizes (OMG DDSI-RTPS 2.5, clause 9.4).
 
 A message consists of a header and submessages. Message sizes include the headers of IP and UDP.
 """
@@ -22,7 +22,7 @@ _GAP_BYTES: Final = 32
 
 @dataclass(slots=True, eq=False)
 class Sample:
-    """A sample of a topic, with statistics that neither end uses.
+    """A sample of a topic, with statistics that the ends do not use.
 
     Attributes:
         size_bytes: Serialized size with the encapsulation header of 4 bytes.
@@ -31,9 +31,9 @@ class Sample:
         number: Its sequence number at its writer; 0 until it is sent.
         times_sent: Number of transmissions of each fragment.
         in_flight: Number of messages with a part of it that have neither arrived nor been lost.
-        held: True if its reader has received all of it, even if it cannot be delivered before an earlier sample.
-        given_up: Reason why its writer will not send it again; empty while the writer may send it.
-        settled: True if it was delivered or dropped.
+        is_stored: True if its reader has stored all of it, possibly until an earlier sample has been delivered.
+        give_up_reason: Reason why its writer will not send it again; empty while the writer may send it.
+        is_settled: True if it was delivered or dropped.
         endpoint_flow: For a sample of the discovery, the flow whose endpoint it describes.
     """
 
@@ -43,9 +43,9 @@ class Sample:
     number: int = 0
     times_sent: dict[int, int] = field(default_factory=dict)
     in_flight: int = 0
-    held: bool = False
-    given_up: str = ""
-    settled: bool = False
+    is_stored: bool = False
+    give_up_reason: str = ""
+    is_settled: bool = False
     endpoint_flow: str = ""
 
     def fragments(self, fragment_bytes: int) -> int:
@@ -109,7 +109,7 @@ class AckNack:
     """ACKNACK: the samples that a reader has, and the samples that it lacks (8.3.8.1).
 
     Attributes:
-        base: It has all samples before this one.
+        base: The reader has all samples before this number.
         missing: Requested samples in ascending order, none before `base`.
         count: Number of the message.
         final: True if no heartbeat is required in response; False for a reader's first ACKNACK.
@@ -151,8 +151,8 @@ class Gap:
     """GAP: samples that a writer will never send again (8.3.8.4).
 
     Attributes:
-        first: The first of them.
-        end: One beyond the last.
+        first: Number of the first of these samples.
+        end: Number after the last of these samples.
     """
 
     first: int
@@ -174,18 +174,18 @@ class RtpsMessage:
     Attributes:
         flow: Name of the flow.
         submessages: Its content.
-        resolved: True if it has already arrived or been lost, for statistics.
+        is_resolved: True if it has already arrived or been lost; only statistics use it.
     """
 
     flow: str
     submessages: tuple[Submessage, ...]
-    resolved: bool = False
+    is_resolved: bool = False
 
 
 def ip_bytes(submessages: tuple[Submessage, ...]) -> int:
     """Return the size of an IP packet with these submessages.
 
-    Messages for one reader or writer contain an INFO_DST.
+    A message for a single reader or writer also contains an INFO_DST.
     """
     header_bytes = IP_AND_UDP_BYTES + RTPS_HEADER_BYTES
     if not all(

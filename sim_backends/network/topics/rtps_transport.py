@@ -19,7 +19,7 @@ class Topics:
 
     A subscriber receives data by unicast, as in CycloneDDS if multicast is restricted to discovery (`AllowMulticast:
     spdp`); this is recommended for Wi-Fi, where multicast has no link-layer acknowledgement. A program continues
-    while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so that its own
+    while its writer is blocked: its samples are queued. A subscriber reads samples immediately, so that its
     history is never full.
 
     Not modelled: durability other than volatile, HEARTBEAT_FRAG, which is optional, and the topics that ROS 2 adds to
@@ -50,14 +50,14 @@ class Topics:
         self._discovery = TopicDiscovery(wire, flows, self._sessions, timing, discovery) if discovery else None
         if self._discovery is None:
             for session in self._sessions.values():
-                session.writer.match(responded=True)
+                session.writer.match(has_responded=True)
                 session.reader.match(request_heartbeat=False)
 
     @property
-    def matched(self) -> bool:
+    def is_matched(self) -> bool:
         """True if the writer and the reader of every flow are matched."""
         sessions = [self._sessions[name] for name in self._flows]
-        return all(session.writer.matched and session.reader.matched for session in sessions)
+        return all(session.writer.is_matched and session.reader.is_matched for session in sessions)
 
     def send(self, packet: Packet) -> None:
         """Implement `Transport.send`.
@@ -72,7 +72,7 @@ class Topics:
                 remedy=did_you_mean(name, self._flows, "flows: " + ", ".join(self._flows)),
             )
         writer = self._sessions[name].writer
-        if writer.matched:
+        if writer.is_matched:
             writer.write(Sample(packet.size_bytes, number, packet.packet_id))
         else:
             self._wire.drop(packet.packet_id, NOT_MATCHED)
@@ -86,10 +86,10 @@ class Topics:
         elif self._discovery is not None:
             self._discovery.receive(host, packet.source, packet.body)
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        """Implement `Transport.lost`."""
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        """Implement `Transport.record_loss`."""
         if isinstance(packet.body, RtpsMessage):
-            self._sessions[packet.body.flow].lost(packet.body, reason)
+            self._sessions[packet.body.flow].record_loss(packet.body, reason)
 
     def _deliver(self, sample: Sample) -> None:
         self._wire.deliver(sample.packet_id)

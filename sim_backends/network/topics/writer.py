@@ -19,11 +19,11 @@ Transmit = Callable[[tuple[Submessage, ...], PacketIdentity], None]
 """Sends a message to the other end. Its random numbers are derived from the identity, which begins with the kind of
 message."""
 
-PUSHED_OUT: Final = "pushed out of the writer's history before it was acknowledged"
+EVICTED: Final = "evicted from the writer's history before it was acknowledged"
 OVERTAKEN: Final = "overtaken by a later sample"
 """Result of a sample that is never sent again, unless it is delivered or lost."""
 BLOCKED: Final = "the writer was blocked for longer than max_blocking_time"
-_LONG_AGO_NS: Final = -(10**18)
+_NEVER_NS: Final = -(10**18)
 _PIGGYBACK_PAUSE_NS: Final = 100_000
 _HEARTBEATS_AT_FULL_RATE: Final = 5
 
@@ -57,74 +57,74 @@ class TopicWriter:
         self._timing = timing
         self._transmit = transmit
         self._give_up = give_up
-        self._reliable = flow.qos.reliability == "reliable"
+        self._is_reliable = flow.qos.reliability == "reliable"
         self._max_blocking_ns = flow.qos.max_blocking_ns
         self._history = WriterHistory(flow.qos, timing)
-        self._waiting: dict[Sample, None] = {}
-        self._last = 0
-        self._matched = False
+        self._waiting_samples: dict[Sample, None] = {}
+        self._last_number = 0
+        self._is_matched = False
         self._reader_responded = False
         # Numbers of heartbeats and gaps, and the number of the reader's last message.
-        self._heartbeats = self._gaps = self._last_acknack_count = 0
+        self._heartbeat_count = self._gap_count = self._last_acknack_count = 0
         self._heartbeats_since_write = 0
-        self._written_ns = self._heartbeat_ns = self._ack_requested_ns = _LONG_AGO_NS
+        self._last_write_ns = self._last_heartbeat_ns = self._last_ack_request_ns = _NEVER_NS
         self._heartbeat_timer = WireTimer(wire, flow.publisher, self._send_heartbeat)
         self.on_reader_start: Callable[[], None] = lambda: None
         self.share_heartbeat: Callable[[Heartbeat], None] | None = None
 
     @property
-    def matched(self) -> bool:
+    def is_matched(self) -> bool:
         """True if the writer has a reader."""
-        return self._matched
+        return self._is_matched
 
     @property
     def last(self) -> int:
         """The sequence number of its last sample."""
-        return self._last
+        return self._last_number
 
     @property
     def unacknowledged(self) -> Iterable[Sample]:
         """The samples that its reader has not acknowledged, oldest first."""
         return self._history.samples.values()
 
-    def match(self, *, responded: bool = False) -> None:
+    def match(self, *, has_responded: bool = False) -> None:
         """Add the reader; send it heartbeats unless it has already responded."""
-        self._matched = True
-        self._reader_responded = responded
+        self._is_matched = True
+        self._reader_responded = has_responded
         self._heartbeats_since_write = 0
-        if self._reliable and not responded:
+        if self._is_reliable and not has_responded:
             self._heartbeat_timer.bring_forward(self._wire.now_ns + self._timing.first_heartbeat_ns)
 
     def add_historical(self, sample: Sample) -> None:
         """Add a sample without sending it; the next heartbeat announces it and the reader requests it."""
-        self._last += 1
-        sample.number = self._last
+        self._last_number += 1
+        sample.number = self._last_number
         self._history.insert(sample)
 
     def remove_reader(self, reason: str) -> None:
         """Remove the reader and give up all unacknowledged samples."""
-        self._matched = False
+        self._is_matched = False
         self._heartbeat_timer.stop()
-        waiting, self._waiting = self._waiting, {}
-        for sample in (*self._history.clear(), *waiting):
+        waiting_samples, self._waiting_samples = self._waiting_samples, {}
+        for sample in (*self._history.clear(), *waiting_samples):
             self._give_up(sample, reason)
 
     def write(self, sample: Sample) -> None:
         """Send a sample now, or when the writer is no longer blocked."""
-        if not self._waiting and (not self._reliable or self._history.admits(self._wire.now_ns)):
+        if not self._waiting_samples and (not self._is_reliable or self._history.admits(self._wire.now_ns)):
             self._send(sample)
             return
-        if not self._waiting:
+        if not self._waiting_samples:
             # When the writer starts to block, it requests the acknowledgements for which it waits.
             heartbeat = self._heartbeat(final=False)
             self._transmit((heartbeat,), self._key_of((heartbeat,)))
-        self._waiting[sample] = None
+        self._waiting_samples[sample] = None
         if self._max_blocking_ns is not None:
             self._wire.at(self._wire.now_ns + self._max_blocking_ns, self._host, lambda: self._expire(sample))
 
     def on_acknack(self, message: AckNack | NackFrag) -> None:
         """Process a response of the reader: remove acknowledged samples, send requested ones again."""
-        if not self._matched or message.count <= self._last_acknack_count:
+        if not self._is_matched or message.count <= self._last_acknack_count:
             return
         self._last_acknack_count = message.count
         if isinstance(message, NackFrag):
@@ -140,20 +140,20 @@ class TopicWriter:
         self._resume()
 
     def _send(self, sample: Sample) -> None:
-        self._last += 1
-        sample.number = self._last
-        evicted = self._history.insert(sample) if self._reliable else None
+        self._last_number += 1
+        sample.number = self._last_number
+        evicted_sample = self._history.insert(sample) if self._is_reliable else None
         fragment_count = sample.fragments(self._timing.fragment_bytes)
-        per_message = max(self._timing.message_bytes // self._timing.fragment_bytes, 1)
-        for first in range(0, fragment_count, per_message):
-            count = min(per_message, fragment_count - first)
+        fragments_per_message = max(self._timing.message_bytes // self._timing.fragment_bytes, 1)
+        for first in range(0, fragment_count, fragments_per_message):
+            count = min(fragments_per_message, fragment_count - first)
             submessages: tuple[Submessage, ...] = (self._data(sample, first, count),)
-            if self._reliable and first + per_message >= fragment_count:
+            if self._is_reliable and first + fragments_per_message >= fragment_count:
                 submessages += self._piggyback()
             self._transmit(submessages, (f"data{first}", sample.key))
-        if evicted is not None:
-            self._give_up(evicted, PUSHED_OUT)
-        if not self._reliable:
+        if evicted_sample is not None:
+            self._give_up(evicted_sample, EVICTED)
+        if not self._is_reliable:
             self._give_up(sample, OVERTAKEN)
 
     def _data(self, sample: Sample, first: int, count: int) -> Data:
@@ -164,32 +164,38 @@ class TopicWriter:
 
     def _piggyback(self) -> tuple[Submessage, ...]:
         now_ns = self._wire.now_ns
-        # A response will be required soon; requiring it now saves a separate message.
-        requires_response = now_ns >= self._written_ns + 4 * self._timing.heartbeat_ns // 5 or self._above_watermark()
-        since_heartbeat_ns = now_ns - self._heartbeat_ns
-        self._written_ns = now_ns
+        # A response will be required soon; if it is required now, no separate message is needed.
+        requires_response = (
+            now_ns >= self._last_write_ns + 4 * self._timing.heartbeat_ns // 5 or self._is_above_watermark()
+        )
+        since_heartbeat_ns = now_ns - self._last_heartbeat_ns
+        self._last_write_ns = now_ns
         self._reset_heartbeat_rate()
         if not requires_response and since_heartbeat_ns <= _PIGGYBACK_PAUSE_NS:
             return ()
         return (self._heartbeat(final=not requires_response),)
 
     def _heartbeat(self, *, final: bool) -> Heartbeat:
-        self._heartbeat_ns = self._wire.now_ns
+        self._last_heartbeat_ns = self._wire.now_ns
         if not final:
-            self._ack_requested_ns = self._wire.now_ns
+            self._last_ack_request_ns = self._wire.now_ns
         self._heartbeats_since_write += 1
         return self._new_heartbeat(final=final, directed=False)
 
     def _new_heartbeat(self, *, final: bool, directed: bool) -> Heartbeat:
-        self._heartbeats += 1
-        return Heartbeat(self._history.first or self._last + 1, self._last, self._heartbeats, final, directed)
+        self._heartbeat_count += 1
+        return Heartbeat(
+            self._history.first or self._last_number + 1, self._last_number, self._heartbeat_count, final, directed
+        )
 
     def _send_heartbeat(self) -> None:
-        if not (self._matched and (self._history.samples or not self._reader_responded)):
+        if not (self._is_matched and (self._history.samples or not self._reader_responded)):
             return
         now_ns = self._wire.now_ns
-        if now_ns >= self._heartbeat_ns + self._interval_ns():
-            requires_response = now_ns >= self._written_ns + self._timing.heartbeat_ns or self._above_watermark()
+        if now_ns >= self._last_heartbeat_ns + self._interval_ns():
+            requires_response = (
+                now_ns >= self._last_write_ns + self._timing.heartbeat_ns or self._is_above_watermark()
+            )
             heartbeat = self._heartbeat(final=not requires_response)
             if self.share_heartbeat is None or now_ns % self._timing.heartbeat_ns:
                 self._transmit((heartbeat,), self._key_of((heartbeat,)))
@@ -204,20 +210,20 @@ class TopicWriter:
         self._heartbeat_timer.bring_forward(at_ns)
 
     def _interval_ns(self) -> int:
-        """Return the time to the next heartbeat: it doubles after every second heartbeat from the sixth."""
+        """Return the time to the next heartbeat; from the sixth one, it doubles after every second heartbeat."""
         interval_ns = self._timing.heartbeat_ns
         for _ in range((self._heartbeats_since_write - _HEARTBEATS_AT_FULL_RATE) // 2):
             if 2 * interval_ns >= self._timing.heartbeat_max_ns:
                 break
             interval_ns *= 2
-        interval_ns >>= self._history.fill_level + bool(self._waiting)
+        interval_ns >>= self._history.fill_level + bool(self._waiting_samples)
         return max(interval_ns, self._timing.heartbeat_min_ns)
 
-    def _above_watermark(self) -> bool:
+    def _is_above_watermark(self) -> bool:
         """Return True if so much data is unacknowledged that a response is required now."""
         return (
             self._history.fill_level > 0
-            and self._wire.now_ns >= self._ack_requested_ns + self._timing.ack_request_min_ns
+            and self._wire.now_ns >= self._last_ack_request_ns + self._timing.ack_request_min_ns
         )
 
     def _reset_heartbeat_rate(self) -> None:
@@ -226,7 +232,7 @@ class TopicWriter:
 
     def _on_nack(self, nack: AckNack) -> None:
         submessages: list[Submessage] = []
-        first = self._history.first or self._last + 1
+        first = self._history.first or self._last_number + 1
         if nack.missing[0] < first:
             submessages.append(Gap(nack.missing[0], first))
         for number in nack.missing:
@@ -239,7 +245,7 @@ class TopicWriter:
     def _on_nack_frag(self, nack: NackFrag) -> None:
         sample = self._history.samples.get(nack.number)
         if sample is None:
-            self._respond([Gap(nack.number, nack.number + 1)] if nack.number <= self._last else [])
+            self._respond([Gap(nack.number, nack.number + 1)] if nack.number <= self._last_number else [])
         else:
             fragment_count = sample.fragments(self._timing.fragment_bytes)
             self._respond([self._data(sample, fragment, 1) for fragment in nack.missing if fragment < fragment_count])
@@ -258,23 +264,26 @@ class TopicWriter:
         self._reset_heartbeat_rate()
 
     def _key_of(self, message: tuple[Submessage, ...]) -> PacketIdentity:
-        head = message[0]
-        if isinstance(head, Data):
-            return f"data{head.first} again{head.sample.times_sent[head.first]}", head.sample.key
-        if isinstance(head, Heartbeat):
-            return "heartbeat", head.count
-        self._gaps += 1
-        return "gap", self._gaps
+        first_submessage = message[0]
+        if isinstance(first_submessage, Data):
+            return (
+                f"data{first_submessage.first} again{first_submessage.sample.times_sent[first_submessage.first]}",
+                first_submessage.sample.key,
+            )
+        if isinstance(first_submessage, Heartbeat):
+            return "heartbeat", first_submessage.count
+        self._gap_count += 1
+        return "gap", self._gap_count
 
     def _resume(self) -> None:
         """Write waiting samples, if the writer was blocked and may resume."""
-        if self._waiting and self._history.can_resume:
-            while self._waiting and self._history.admits(self._wire.now_ns):
-                sample = next(iter(self._waiting))
-                del self._waiting[sample]
+        if self._waiting_samples and self._history.can_resume:
+            while self._waiting_samples and self._history.admits(self._wire.now_ns):
+                sample = next(iter(self._waiting_samples))
+                del self._waiting_samples[sample]
                 self._send(sample)
 
     def _expire(self, sample: Sample) -> None:
-        if sample in self._waiting:
-            del self._waiting[sample]
+        if sample in self._waiting_samples:
+            del self._waiting_samples[sample]
             self._give_up(sample, BLOCKED)

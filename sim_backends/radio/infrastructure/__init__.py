@@ -1,1 +1,1 @@
-"""What is on the air besides the robots: access points with roaming, neighbouring networks, microwave ovens."""
+"""Transmitters that are not robots: access points with roaming, neighbouring networks, microwave ovens."""

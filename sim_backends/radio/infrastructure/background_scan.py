@@ -1,6 +1,6 @@
-"""When a station scans, and whether it roams: wpa_supplicant's `bgscan="simple"` and its comparison of access points.
+"""Decisions of a station when to scan and whether to roam: `bgscan="simple"` of wpa_supplicant.
 
-Written after bgscan_simple.c and events.c of wpa_supplicant 2.10, and the signal events of mac80211 (mlme.c).
+The model follows bgscan_simple.c and events.c of wpa_supplicant 2.10, and the signal events of mac80211 (mlme.c).
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,9 @@ _LARGEST_DIFFERENCE_DB: Final = 5.0
 
 
 def required_difference_db(current_dbm: float) -> float:
-    """Return by how much another access point must be stronger than the current one: events.c.
+    """Return the margin by which another access point must be stronger than the current one (events.c).
 
-    Its changes of this margin by estimated throughputs are omitted.
+    In wpa_supplicant, estimated throughputs also change this margin; these changes are omitted.
     """
     return next((difference for below, difference in _DIFFERENCES_DB if current_dbm < below), _LARGEST_DIFFERENCE_DB)
 
@@ -91,7 +91,7 @@ class BackgroundScan:
         return self.long_ns // self.short_ns + 1
 
     def on_scan(self, now_ns: int) -> None:
-        """Record that a scan starts: many scans in a row with the short interval are followed by long ones."""
+        """Record that a scan starts. After many consecutive scans with the short interval, the interval is long."""
         if self._interval_ns == self.short_ns:
             self._short_scans += 1
             if self._short_scans >= self._max_short_scans:

@@ -29,9 +29,9 @@ _OVEN: Final = "oven "
 def conflict(options: RadioOptions, robots: Collection[str], *, has_relay: bool) -> str | None:
     """Return the reason why access points and neighbours cannot be combined with these robots, or None."""
     names = [*robots, *options.access_points, *options.neighbours]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        return f"two of the robots, radio.access_points and radio.neighbours have the name {twice}"
+    duplicate = next((name for name in names if names.count(name) > 1), None)
+    if duplicate is not None:
+        return f"two of the robots, radio.access_points and radio.neighbours have the name {duplicate}"
     if options.access_points and has_relay:
         return "with radio.access_points no robot can be an access point: use the topology masterless"
     return None
@@ -45,7 +45,7 @@ def station_place_m(at_m: Place, height_m: float, world: World | None) -> Vector
 
 
 class Infrastructure:
-    """Stations and sources of noise besides the robots.
+    """Stations and sources of noise that are not robots.
 
     Args:
         seed: Seed of all random draws.
@@ -71,14 +71,15 @@ class Infrastructure:
         self._world = world
         first = next(iter(robots.values()))
         phy = None if first.phy is None else replace(first.phy, power_save_timeout_ns=None)
-        fixed: dict[str, AccessPointOptions | NeighbourNetworkOptions] = {
+        stations: dict[str, AccessPointOptions | NeighbourNetworkOptions] = {
             **options.access_points,
             **options.neighbours,
         }
         self.antennas: dict[str, Antenna] = dict(robots) | {
-            name: replace(first, tx_power_dbm=float(station.tx_power_dbm), phy=phy) for name, station in fixed.items()
+            name: replace(first, tx_power_dbm=float(station.tx_power_dbm), phy=phy)
+            for name, station in stations.items()
         }
-        self.places_m = {name: self._place_m(station.at_m, station.height) for name, station in fixed.items()}
+        self.places_m = {name: self._place_m(station.at_m, station.height) for name, station in stations.items()}
         self.robots: Sequence[int] = range(len(robots))
         self.roaming: Roaming | None = None
         self._access_points: Sequence[int] = ()
@@ -117,18 +118,18 @@ class Infrastructure:
             ]
 
     def jam(self, now_ns: int, emitters: Iterable[Emitter]) -> None:
-        """Set the jammers that send noise from now on."""
+        """Set the jammers that send noise until the next call."""
         self._jammers = {_JAMMER + emitter.name: self._emission(now_ns, emitter) for emitter in emitters}
         self._set_emissions(now_ns)
 
     @staticmethod
     def log_packet(log: Callable[[TransmissionAttempt], None], attempt: TransmissionAttempt) -> None:
-        """Pass an attempt to `log`, unless it is of a frame of a station itself."""
+        """Pass an attempt to `log`, unless its frame is not a packet of a robot."""
         if not isinstance(attempt.payload, ManagementFrame):
             log(attempt)
 
     def use_power_save(self) -> None:
-        """Let the access points buffer packets for robots with power save."""
+        """Make the access points buffer packets for robots with power save."""
         power_save = self._exchange.delivery.power_save
         if power_save is not None and self.roaming is not None:
             power_save.access_points = self._access_points

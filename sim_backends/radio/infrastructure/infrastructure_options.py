@@ -24,21 +24,21 @@ class AccessPointOptions(Strict):
 
 
 class RoamingOptions(Strict):
-    """Roaming as by wpa_supplicant with `bgscan="simple:SHORT:THRESHOLD:LONG"` on mac80211.
+    """Roaming like wpa_supplicant with `bgscan="simple:SHORT:THRESHOLD:LONG"` on mac80211.
 
-    The defaults are those of NetworkManager for a network of which it has seen several access points, and the
-    constants of mac80211 for an active scan (`IEEE80211_PROBE_DELAY` and `IEEE80211_CHANNEL_TIME`, 1/33 s each).
+    The defaults are those of NetworkManager for a network with several known access points, and the constants of
+    mac80211 for an active scan (`IEEE80211_PROBE_DELAY` and `IEEE80211_CHANNEL_TIME`, 1/33 s each).
 
     Attributes:
         short: Interval between scans while the signal is below the threshold.
-        threshold_dbm: That threshold, for the signal of beacons.
+        threshold_dbm: Threshold of the signal of beacons.
         long: Interval between scans while the signal is above the threshold.
         channels: Number of channels that a scan visits, including the current one.
-        dwell: Time on each other channel. The access point buffers packets during it.
+        dwell: Time on each other channel, during which the access point buffers packets.
         home: Time on the current channel between two others.
         handshake: True for the 4-way handshake of WPA2 after each association; `false` for an open network.
-        processing: Time of a station or access point between a received and the next sent frame of an association.
-            Our choice.
+        processing: Time of a station or access point from the reception of a frame of an association until it sends
+            the next one. Our choice.
     """
 
     short: Annotated[Duration, Field(gt=0)] = 30.0
@@ -62,8 +62,8 @@ class NeighbourNetworkOptions(Strict):
 
     Attributes:
         at_m: Its position, metres east and north.
-        duty: Share of the time in which it sends if it never waits: frames of 1,500 bytes at the basic rate, without
-            ACK, at random intervals.
+        duty: Share of the time in which it sends if it never waits for the channel. It sends frames of 1,500 bytes at
+            the basic rate, without ACK, at random intervals.
         height: Its height above the ground.
         tx_power_dbm: Transmit power.
     """

@@ -15,7 +15,7 @@ NEIGHBOUR: Final = "neighbour"
 _FRAME_BYTES: Final = 1536
 """Size of an Ethernet payload with MAC header and FCS."""
 _MAX_WAITING: Final = 10
-"""Frames that a neighbour queues before it discards new ones."""
+"""Maximum number of frames that a neighbour queues; it discards further frames."""
 
 
 class NeighbourTraffic:
@@ -50,10 +50,10 @@ class NeighbourTraffic:
 
     def _schedule(self, now_ns: int, index: int, number: int) -> None:
         wait_ns = -self._mean_ns[index] * math.log(1 - self._draws[index].draw(number))
-        self._events.at(now_ns + max(round(wait_ns), 1), self._send, index, number)
+        self._events.schedule(now_ns + max(round(wait_ns), 1), self._send, index, number)
 
     def _send(self, now_ns: int, index: int, number: int) -> None:
-        if self._delivery.waiting_management(index) < _MAX_WAITING:
+        if self._delivery.count_waiting_management(index) < _MAX_WAITING:
             self._delivery.send_management(now_ns, index, None, ManagementFrame(NEIGHBOUR), _FRAME_BYTES)
         self._schedule(now_ns, index, number + 1)
 
@@ -63,10 +63,11 @@ class MicrowaveOven:
 
     Args:
         seed: Seed of the phase of the mains.
-        emitter: Its name, position and power in the channel.
+        emitter: Name and position of the oven, and its power in the channel.
         mains_hz: Frequency of the mains.
         events: Scheduled events.
-        switch: Called with the time, the oven, and the end of its noise if it starts now; None if it ends.
+        switch: Called when the noise starts or ends, with the time, the oven, and the end of the noise (None if the
+            noise ends now).
 
     Attributes:
         is_on: True while it sends noise.
@@ -85,14 +86,14 @@ class MicrowaveOven:
         self._half_ns = round(0.5e9 / mains_hz)
         self._events = events
         self._switch = switch
-        events.at(int(RandomStream(seed, emitter.name, "mains").draw(0) * 2 * self._half_ns), self._turn_on)
+        events.schedule(int(RandomStream(seed, emitter.name, "mains").draw(0) * 2 * self._half_ns), self._turn_on)
 
     def _turn_on(self, now_ns: int) -> None:
         self.is_on = True
-        self._events.at(now_ns + self._half_ns, self._turn_off)
+        self._events.schedule(now_ns + self._half_ns, self._turn_off)
         self._switch(now_ns, self, now_ns + self._half_ns)
 
     def _turn_off(self, now_ns: int) -> None:
         self.is_on = False
-        self._events.at(now_ns + self._half_ns, self._turn_on)
+        self._events.schedule(now_ns + self._half_ns, self._turn_on)
         self._switch(now_ns, self, None)

@@ -1,4 +1,4 @@
-"""Packets of robots that are stations of access points, and frames of the stations themselves.
+"""Packets of robots that are stations of access points, and management frames of all stations.
 
 The access points share an ideal wired network: it takes no time and has no losses. A packet goes from a robot to its
 access point, over the wired network to the access point of its destination, and to the destination. The wired network
@@ -26,11 +26,11 @@ _HIGHEST_DSCP: Final = 46
 
 @dataclass(frozen=True, slots=True)
 class ManagementFrame:
-    """The content of a frame that a station sends for itself: it is received by no program.
+    """The content of a frame that is not a packet of a robot: a management frame, or a frame of a neighbour.
 
     Attributes:
         kind: For example `beacon`.
-        number: Number of the exchange of which it is a part; 0 if it is alone.
+        number: Number of the exchange to which it belongs; 0 if it belongs to none.
     """
 
     kind: str
@@ -38,21 +38,22 @@ class ManagementFrame:
 
 
 class ManagementHandler(Protocol):
-    """The object that receives the frames of stations themselves."""
+    """An object that processes management frames."""
 
     def on_management(self, now_ns: int, transmitter: int, receiver: int, frame: ManagementFrame) -> None:
-        """Process a frame that a station has received; stations are indices."""
+        """Process a frame that a station has received; `transmitter` and `receiver` are indices of stations."""
         ...
 
 
 class ManagedDelivery(PacketDelivery[Payload]):
-    """Packets of robots that may be stations of access points. Arguments as the base class.
+    """Packets of robots that may be stations of access points. Arguments are those of the base class.
 
     Attributes:
         robots: Indices of the robots; other stations are access points and neighbours.
         access_points: Indices of the access points; without any, packets go directly or over a relay.
-        serving: Access point of each robot by the wired network; None for a robot that is not associated.
-        handler: Receives frames of stations themselves; None if no object needs them.
+        serving_access_point: Access point to which the wired network sends the packets for each robot; None for a
+            robot that is not associated.
+        handler: Processes management frames; None if they are ignored.
     """
 
     def __init__(
@@ -65,19 +66,19 @@ class ManagedDelivery(PacketDelivery[Payload]):
         super().__init__(channel, stations, events, queue_packets)
         self.robots: Sequence[int] = ()
         self.access_points: Sequence[int] = ()
-        self.serving: dict[int, int | None] = {}
+        self.serving_access_point: dict[int, int | None] = {}
         self.handler: ManagementHandler | None = None
-        # Packets from and to a robot that is not on the channel; in a handover only packets from it.
-        self._held: dict[int, list[tuple[Station[Payload], Frame[Payload]]]] = {}
+        # Packets from and to a robot that is not on the channel; during a handover only packets from the robot.
+        self._held_packets: dict[int, list[tuple[Station[Payload], Frame[Payload]]]] = {}
         self._in_handover: set[int] = set()
         # Robots to which an access point sends a broadcast.
-        self._addressed: dict[Frame[Payload], frozenset[int]] = {}
-        self._sent: defaultdict[int, int] = defaultdict(int)
+        self._broadcast_receivers: dict[Frame[Payload], frozenset[int]] = {}
+        self._management_counts: defaultdict[int, int] = defaultdict(int)
 
     def send_management(
         self, now_ns: int, transmitter: int, receiver: int | None, content: ManagementFrame, size_bytes: int
     ) -> None:
-        """Send a frame of a station itself before its packets.
+        """Send a management frame, or a frame of a neighbour, before the packets of the station.
 
         Args:
             now_ns: Current time.
@@ -88,8 +89,8 @@ class ManagedDelivery(PacketDelivery[Payload]):
         """
         station = self._stations[transmitter]
         name = f"{self._channel.names[transmitter]} management"
-        packet = name, self._sent[transmitter]
-        self._sent[transmitter] += 1
+        packet = name, self._management_counts[transmitter]
+        self._management_counts[transmitter] += 1
         frame: Frame[Payload] = Frame(
             content,  # type: ignore[arg-type]  # a management frame has no payload of a program
             size_bytes - _OVERHEAD_BYTES,
@@ -104,14 +105,14 @@ class ManagedDelivery(PacketDelivery[Payload]):
         super().enqueue_now(now_ns, station, frame)
         self._put_first(station, frame)
 
-    def waiting_management(self, transmitter: int) -> int:
-        """Return the number of frames of a station itself that it has not sent yet."""
+    def count_waiting_management(self, transmitter: int) -> int:
+        """Return the number of management frames that a station has not sent yet."""
         return sum(_is_management(frame) for queue in _queues(self._stations[transmitter]) for frame in queue)
 
     def _put_first(self, station: Station[Payload], frame: Frame[Payload]) -> None:
-        """Move the last frame of a queue before all that were not sent yet.
+        """Move the last frame of a queue before all frames that were not sent yet.
 
-        A frame that was sent is finished first, so that its receiver recognizes a repetition.
+        A frame that was already sent stays first, so that its receiver can detect a repetition.
         """
         queue = station.queue if station.categories is None else station.categories.queue_of(frame)
         if not queue or queue[-1] is not frame:
@@ -130,12 +131,12 @@ class ManagedDelivery(PacketDelivery[Payload]):
             self._send_to_access_point(now_ns, station, frame)
 
     def _send_to_access_point(self, now_ns: int, station: Station[Payload], frame: Frame[Payload]) -> None:
-        frame.onward, frame.keep = (frame.receiver,), False
-        held = self._held.get(station.index)
-        if held is not None:
-            held.append((station, frame))
+        frame.forward_to, frame.is_for_receiver = (frame.receiver,), False
+        held_packets = self._held_packets.get(station.index)
+        if held_packets is not None:
+            held_packets.append((station, frame))
             return
-        frame.receiver = self.serving.get(station.index)
+        frame.receiver = self.serving_access_point.get(station.index)
         if frame.receiver is None:
             self.lose(now_ns, station.index, frame, NOT_ASSOCIATED)
         else:
@@ -147,21 +148,21 @@ class ManagedDelivery(PacketDelivery[Payload]):
         if robot is None:
             self._distribute_broadcast(now_ns, frame)
             return
-        access_point = self.serving.get(robot)
+        access_point = self.serving_access_point.get(robot)
         if access_point is None or robot in self._in_handover:
             self.lose(now_ns, self.access_points[0], frame, NOT_ASSOCIATED)
             return
         transmitter = self._stations[access_point]
-        held = self._held.get(robot)
-        if held is not None:
-            held.append((transmitter, frame))
+        held_packets = self._held_packets.get(robot)
+        if held_packets is not None:
+            held_packets.append((transmitter, frame))
         else:
             super().enqueue(now_ns, transmitter, frame)
 
     def _distribute_broadcast(self, now_ns: int, frame: Frame[Payload]) -> None:
         members: dict[int, set[int]] = {}
         for robot in self.robots:
-            access_point = self.serving.get(robot)
+            access_point = self.serving_access_point.get(robot)
             if access_point is not None:
                 members.setdefault(access_point, set()).add(robot)
             elif self.log_loss is not None and self._channel.names[robot] != frame.source:
@@ -179,7 +180,7 @@ class ManagedDelivery(PacketDelivery[Payload]):
                 frame.before,
                 dscp=frame.dscp,
             )
-            self._addressed[copy] = frozenset(robots)
+            self._broadcast_receivers[copy] = frozenset(robots)
             super().enqueue(now_ns, self._stations[access_point], copy)
 
     @override
@@ -194,67 +195,69 @@ class ManagedDelivery(PacketDelivery[Payload]):
         super().pass_up(now_ns, transmitter, peer, packets)
 
     def _is_off_channel(self, robot: int) -> bool:
-        return robot in self._held and robot not in self._in_handover
+        return robot in self._held_packets and robot not in self._in_handover
 
     def _accepts(self, receiver: int, frame: Frame[Payload]) -> bool:
-        """Return True unless the frame is a broadcast for stations of another network or access point."""
+        """Return False if the frame is a broadcast for stations of another network or access point."""
         if frame.receiver is not None:
             return True
         if not self.access_points:
             return receiver in self.robots
-        return receiver in self._addressed.get(frame, ()) and receiver not in self._held
+        return receiver in self._broadcast_receivers.get(frame, ()) and receiver not in self._held_packets
 
     @override
     def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
         if isinstance(frame.payload, ManagementFrame):
             return
         accepted = [index for index in received if self._accepts(index, frame)]
-        self.count_receptions(now_ns, transmitter, frame, accepted, self._addressed.pop(frame, self.robots))
+        self.count_receptions(now_ns, transmitter, frame, accepted, self._broadcast_receivers.pop(frame, self.robots))
 
     @override
     def lose(self, now_ns: int, transmitter: int, frame: Frame[Payload], reason: str) -> None:
         if not isinstance(frame.payload, ManagementFrame):
             super().lose(now_ns, transmitter, frame, reason)
-            self._addressed.pop(frame, None)
+            self._broadcast_receivers.pop(frame, None)
 
     @override
     def _intended_receivers(self, transmitter: int, frame: Frame[Payload]) -> Iterable[str]:
         names = self._channel.names
-        own = {names[robot] for robot in self._addressed.get(frame, self.robots)}
-        return [name for name in super()._intended_receivers(transmitter, frame) if name in own]
+        robot_names = {names[robot] for robot in self._broadcast_receivers.get(frame, self.robots)}
+        return [name for name in super()._intended_receivers(transmitter, frame) if name in robot_names]
 
     @override
     def discard_queue(self, now_ns: int, station: Station[Payload]) -> None:
         super().discard_queue(now_ns, station)
-        held = self._held.get(station.index)
-        if held is not None:
-            for _, frame in held:
+        held_packets = self._held_packets.get(station.index)
+        if held_packets is not None:
+            for _, frame in held_packets:
                 self.lose(now_ns, station.index, frame, RADIO_OFF)
-            held.clear()
+            held_packets.clear()
 
     def hold(self, now_ns: int, robot: int) -> None:
         """Keep the packets from and to a robot that leaves the channel, until `release`."""
         station = self._stations[robot]
-        held = self._held.setdefault(robot, [])
-        held += [(station, frame) for frame in self._withdraw(now_ns, station, self.serving.get(robot))]
-        access_point = self.serving.get(robot)
+        held_packets = self._held_packets.setdefault(robot, [])
+        held_packets += [
+            (station, frame) for frame in self._withdraw(now_ns, station, self.serving_access_point.get(robot))
+        ]
+        access_point = self.serving_access_point.get(robot)
         if access_point is not None:
             transmitter = self._stations[access_point]
-            held += [(transmitter, frame) for frame in self._withdraw(now_ns, transmitter, robot)]
+            held_packets += [(transmitter, frame) for frame in self._withdraw(now_ns, transmitter, robot)]
 
     def start_handover(self, now_ns: int, robot: int) -> None:
         """Keep the packets from a robot that leaves its access point; packets to it are lost until `associate`."""
         self.hold(now_ns, robot)
         self._in_handover.add(robot)
         station = self._stations[robot]
-        own = []
-        for transmitter, frame in self._held[robot]:
+        packets_from_robot = []
+        for transmitter, frame in self._held_packets[robot]:
             self._end_session(now_ns, transmitter, frame)
             if transmitter is station:
-                own.append((station, frame))
+                packets_from_robot.append((station, frame))
             else:
                 self.lose(now_ns, transmitter.index, frame, NOT_ASSOCIATED)
-        self._held[robot] = own
+        self._held_packets[robot] = packets_from_robot
         if self.power_save is not None:
             for transmitter, frame in self.power_save.withdraw(robot):
                 self.lose(now_ns, transmitter.index, frame, NOT_ASSOCIATED)
@@ -262,41 +265,41 @@ class ManagedDelivery(PacketDelivery[Payload]):
     def associate(self, now_ns: int, robot: int, access_point: int | None) -> None:
         """Set the access point of a robot, and send its waiting packets; without an access point they are lost."""
         self._in_handover.discard(robot)
-        self.serving[robot] = access_point
+        self.serving_access_point[robot] = access_point
         self.release(now_ns, robot)
 
     def release(self, now_ns: int, robot: int) -> None:
         """Send the packets from and to a robot that is on the channel again."""
-        for transmitter, frame in self._held.pop(robot, ()):
+        for transmitter, frame in self._held_packets.pop(robot, ()):
             if transmitter.index == robot:
-                frame.receiver = self.serving.get(robot)
-            if frame.receiver is None or self.serving.get(robot) is None:
+                frame.receiver = self.serving_access_point.get(robot)
+            if frame.receiver is None or self.serving_access_point.get(robot) is None:
                 self.lose(now_ns, transmitter.index, frame, NOT_ASSOCIATED)
             else:
                 super().enqueue(now_ns, transmitter, frame)
 
     def _withdraw(self, now_ns: int, station: Station[Payload], receiver: int | None) -> list[Frame[Payload]]:
-        """Remove the packets of a station to a receiver from its queues, without those in its current exchange.
+        """Remove the packets of a station to a receiver from its queues, except those in its current exchange.
 
         Packets that the receiver has already decoded are removed and not returned.
         """
         current = _in_exchange(station)
-        withdrawn: list[Frame[Payload]] = []
+        withdrawn_frames: list[Frame[Payload]] = []
         for queue in _queues(station):
-            kept = [
+            remaining_frames = [
                 frame for frame in queue if frame.receiver != receiver or frame in current or _is_management(frame)
             ]
-            if len(kept) < len(queue):
-                remaining = set(kept)
-                withdrawn += [frame for frame in queue if frame not in remaining]
+            if len(remaining_frames) < len(queue):
+                frames_to_keep = set(remaining_frames)
+                withdrawn_frames += [frame for frame in queue if frame not in frames_to_keep]
                 queue.clear()
-                queue.extend(kept)
-        if withdrawn and station.index in self._events.starts:
+                queue.extend(remaining_frames)
+        if withdrawn_frames and station.index in self._events.starts:
             if any(_queues(station)):
                 self._events.schedule_start(station.contention.earliest_start_ns(now_ns), station.index)
             else:
                 self._events.cancel_start(station.index)
-        return [frame for frame in withdrawn if not self._is_received(station, frame)]
+        return [frame for frame in withdrawn_frames if not self._is_received(station, frame)]
 
     def _is_received(self, station: Station[Payload], frame: Frame[Payload]) -> bool:
         receiver = frame.receiver
@@ -322,7 +325,7 @@ def _queues(station: Station[Payload]) -> Iterable[deque[Frame[Payload]]]:
 
 
 def _in_exchange(station: Station[Payload]) -> Collection[Frame[Payload]]:
-    """Return the frames of a station's current exchange."""
+    """Return the frames of a station's current exchange; empty if there is none."""
     if not station.exchange_id & 1:
         return ()
     if station.aggregate is not None:

@@ -1,8 +1,8 @@
 """Access points, and the robots that roam between them: beacons, scans, association and its loss.
 
 All access points and robots share one channel here; a robot that scans another channel neither sends nor receives.
-Probe frames would be on the other channels, so they are omitted: a scan finds each access point whose signal reaches
-the sensitivity at that time. Beacons and the frames of an association are sent on the air with their retries.
+Probe frames would be on the other channels, so they are omitted. A scan finds each access point whose signal reaches
+the sensitivity of the robot at that time. Beacons and the frames of an association are sent on the air with retries.
 """
 
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ BEACON: Final = "beacon"
 _BEACON_BYTES: Final = 250
 """Size of a beacon of hostapd with 802.11n and WPA2. Our estimate from its elements."""
 
-# Kind, size with MAC header and FCS, and True if the station sends it. 802.11-2020: 9.3.3.6 to 9.3.3.12 with the
+# Kind, size with MAC header and FCS, and True if the robot sends it. 802.11-2020: 9.3.3.6 to 9.3.3.12 with the
 # elements of 802.11n and WPA2; 12.7.6 (an EAPOL-Key frame has 99 bytes and key data, and 8 bytes of LLC and SNAP).
 _ASSOCIATION: Final = (
     ("authentication", 34, True),
@@ -53,14 +53,14 @@ class _Association:
 
     Attributes:
         index: Index of the robot.
-        access_point: The access point with which it is associated, or associates; None without one.
+        access_point: The access point with which the robot is associated or is being associated, or None.
         scan: Schedule of its scans; None without an association.
         beacon_ns: Time of the last beacon.
         is_busy: True during a scan or an association.
-        exchange: Number that identifies the current step of an association, and outdates earlier events.
+        exchange: Number of the current step of an association; events of other steps are ignored.
         step: Index of the frame that is sent next.
         tries: Number of attempts at that step.
-        levels_dbm: Signals that the current scan has found, by access point.
+        levels_dbm: Signals that the last scan found, by access point.
     """
 
     index: int
@@ -102,13 +102,13 @@ class Roaming:
         self._dwell_ns, self._home_ns = round(options.dwell * 1e9), round(options.home * 1e9)
         self._processing_ns = round(options.processing * 1e9)
         self._has_started = False
-        delivery.serving = dict.fromkeys(delivery.robots)
+        delivery.serving_access_point = dict.fromkeys(delivery.robots)
         for access_point, phase_ns in phases_ns.items():
-            events.at(phase_ns, self._send_beacon, access_point)
+            events.schedule(phase_ns, self._send_beacon, access_point)
 
     @property
     def cells(self) -> Mapping[int, int | None]:
-        """Access point with which each robot is associated, by index; None during an association or without one."""
+        """Access point with which each robot is associated, by index; None if it is not, or not yet, associated."""
         return {
             robot: None if client.scan is None else client.access_point for robot, client in self._clients.items()
         }
@@ -116,20 +116,20 @@ class Roaming:
     def start(self, now_ns: int) -> None:
         """Associate each robot with the strongest access point; a second call does nothing.
 
-        Robots that cannot receive any access point yet scan until they find one.
+        Robots that cannot receive any access point scan until they find one.
         """
         if self._has_started:
             return
         self._has_started = True
         for client in self._clients.values():
             client.levels_dbm = self._levels_dbm(now_ns, client)
-            best = self._best(client)
-            if best is None:
-                self._events.at(now_ns, self._scan, client)
+            strongest = self._strongest(client)
+            if strongest is None:
+                self._events.schedule(now_ns, self._scan, client)
             else:
-                client.access_point = best
-                self._complete(now_ns, client)
-            self._events.at(now_ns + LINK_LOSS_NS, self._check_link, client)
+                client.access_point = strongest
+                self._complete_association(now_ns, client)
+            self._events.schedule(now_ns + LINK_LOSS_NS, self._check_link, client)
 
     def on_management(self, now_ns: int, transmitter: int, receiver: int, frame: ManagementFrame) -> None:
         """Implement `ManagementHandler`."""
@@ -143,11 +143,11 @@ class Roaming:
             client.exchange += 1
             client.step += 1
             client.tries = 0
-            self._events.at(now_ns + self._processing_ns, self._continue, client, client.exchange)
+            self._events.schedule(now_ns + self._processing_ns, self._send_next, client, client.exchange)
 
     def _send_beacon(self, now_ns: int, access_point: int) -> None:
-        self._events.at(now_ns + BEACON_INTERVAL_NS, self._send_beacon, access_point)
-        if not self._delivery.waiting_management(access_point):
+        self._events.schedule(now_ns + BEACON_INTERVAL_NS, self._send_beacon, access_point)
+        if not self._delivery.count_waiting_management(access_point):
             self._delivery.send_management(now_ns, access_point, None, ManagementFrame(BEACON), _BEACON_BYTES)
 
     def _on_beacon(self, now_ns: int, client: _Association, scan: BackgroundScan) -> None:
@@ -157,11 +157,11 @@ class Roaming:
             self._scan(now_ns, client)
 
     def _check_link(self, now_ns: int, client: _Association) -> None:
-        """Lose the association without beacons; a scan, during which beacons are missed, does not count."""
+        """End the association if no beacons arrive; the time of a scan, which misses beacons, does not count."""
         if client.scan is not None and not client.is_busy and now_ns >= client.beacon_ns + LINK_LOSS_NS:
             self._lose_link(now_ns, client)
         next_ns = max(client.beacon_ns + LINK_LOSS_NS, now_ns + BEACON_INTERVAL_NS)
-        self._events.at(next_ns, self._check_link, client)
+        self._events.schedule(next_ns, self._check_link, client)
 
     def _lose_link(self, now_ns: int, client: _Association) -> None:
         client.access_point = client.scan = None
@@ -174,16 +174,16 @@ class Roaming:
         client.levels_dbm = {}
         if client.scan is not None:
             client.scan.on_scan(now_ns)
-        self._visit(now_ns, client, 0 if client.scan is None else 1)
+        self._visit_channel(now_ns, client, 0 if client.scan is None else 1)
 
-    def _visit(self, now_ns: int, client: _Association, channel: int) -> None:
+    def _visit_channel(self, now_ns: int, client: _Association, channel: int) -> None:
         """Scan another channel."""
         if channel >= self._options.channels:
             self._finish_scan(now_ns, client)
             return
         if client.scan is not None:
             self._delivery.hold(now_ns, client.index)
-        self._events.at(now_ns + self._dwell_ns, self._leave_channel, client, channel)
+        self._events.schedule(now_ns + self._dwell_ns, self._leave_channel, client, channel)
 
     def _leave_channel(self, now_ns: int, client: _Association, channel: int) -> None:
         pause_ns = 0
@@ -191,24 +191,24 @@ class Roaming:
             self._delivery.release(now_ns, client.index)
             client.beacon_ns = now_ns
             pause_ns = self._home_ns if channel + 1 < self._options.channels else 0
-        self._events.at(now_ns + pause_ns, self._visit, client, channel + 1)
+        self._events.schedule(now_ns + pause_ns, self._visit_channel, client, channel + 1)
 
     def _finish_scan(self, now_ns: int, client: _Association) -> None:
         client.levels_dbm = self._levels_dbm(now_ns, client)
-        best = self._best(client)
+        strongest = self._strongest(client)
         if client.scan is None:
-            if best is None:
-                self._events.at(now_ns + _RESCAN_NS, self._scan, client)
+            if strongest is None:
+                self._events.schedule(now_ns + _RESCAN_NS, self._scan, client)
             else:
-                self._associate(now_ns, client, best)
+                self._associate(now_ns, client, strongest)
             return
         current_dbm = client.scan.average_dbm
         if (
-            best is not None
-            and best != client.access_point
-            and client.levels_dbm[best] >= current_dbm + required_difference_db(current_dbm)
+            strongest is not None
+            and strongest != client.access_point
+            and client.levels_dbm[strongest] >= current_dbm + required_difference_db(current_dbm)
         ):
-            self._associate(now_ns, client, best)
+            self._associate(now_ns, client, strongest)
         else:
             client.is_busy = False
 
@@ -217,14 +217,14 @@ class Roaming:
         client.step = client.tries = 0
         client.exchange += 1
         self._delivery.start_handover(now_ns, client.index)
-        self._continue(now_ns, client, client.exchange)
+        self._send_next(now_ns, client, client.exchange)
 
-    def _continue(self, now_ns: int, client: _Association, exchange: int) -> None:
+    def _send_next(self, now_ns: int, client: _Association, exchange: int) -> None:
         """Send the next frame of an association, or complete it."""
         if exchange != client.exchange or client.access_point is None:
             return
         if client.step == len(self._steps):
-            self._complete(now_ns, client)
+            self._complete_association(now_ns, client)
             return
         if client.tries == _MAX_TRIES:
             client.access_point = None
@@ -237,9 +237,9 @@ class Roaming:
         transmitter, receiver = ends if is_from_robot else ends[::-1]
         content = ManagementFrame(kind, exchange)
         self._delivery.send_management(now_ns, transmitter, receiver, content, size_bytes)
-        self._events.at(now_ns + _STEP_TIMEOUT_NS, self._continue, client, exchange)
+        self._events.schedule(now_ns + _STEP_TIMEOUT_NS, self._send_next, client, exchange)
 
-    def _complete(self, now_ns: int, client: _Association) -> None:
+    def _complete_association(self, now_ns: int, client: _Association) -> None:
         options = self._options
         client.is_busy = False
         client.exchange += 1
@@ -253,7 +253,7 @@ class Roaming:
         )
         self._delivery.associate(now_ns, client.index, client.access_point)
 
-    def _best(self, client: _Association) -> int | None:
+    def _strongest(self, client: _Association) -> int | None:
         return max(client.levels_dbm, key=client.levels_dbm.__getitem__, default=None)
 
     def _levels_dbm(self, now_ns: int, client: _Association) -> dict[int, float]:
@@ -261,7 +261,7 @@ class Roaming:
         return {
             access_point: self._level_dbm(now_ns, client, access_point)
             for access_point in self._delivery.access_points
-            if self._channel.linked(access_point, client.index)
+            if self._channel.are_linked(access_point, client.index)
         }
 
     def _level_dbm(self, now_ns: int, client: _Association, access_point: int | None) -> float:

@@ -29,7 +29,9 @@ def document(version: str, test: str, end: str) -> Any:  # noqa: ANN401 (of JSON
 def order(test: str) -> IperfSettings:
     tcp = test == "tcp"
     protocol = Protocol.TCP if tcp else Protocol.UDP
-    return IperfSettings(protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), lasts_s=3.0)
+    return IperfSettings(
+        protocol, streams=1 + tcp, payload_bytes=1400, reverse=test.endswith("reverse"), duration_s=3.0
+    )
 
 
 def contradictions(client: Any, server: Any, test: str) -> list[str]:  # noqa: ANN401 (of JSON)
@@ -108,9 +110,9 @@ def test_a_test_with_other_settings_is_a_contradiction(version: str, key: str, v
 
 def test_a_test_that_ended_too_early_or_is_from_another_time() -> None:
     client, server = (iperf3.parse(json.dumps(document("3.12", "tcp", end))) for end in ("client", "server"))
-    (reason,) = iperf3_checks.compare_ends(client, server, replace(order("tcp"), lasts_s=10.0))
+    (reason,) = iperf3_checks.compare_ends(client, server, replace(order("tcp"), duration_s=10.0))
     assert reason == "the client's intervals last 3.0 s in total instead of 10 s"
-    began_ns = 10**9 * (client.start.began_utc_s or 0)
+    began_ns = 10**9 * (client.start.start_utc_s or 0)
     assert iperf3_checks.date_problem(client, (began_ns - 10**9, began_ns + 5 * 10**9)) is None
     assert iperf3_checks.date_problem(client, None) is None
     hour_ns = 3600 * 10**9

@@ -62,7 +62,7 @@ class Link:
                 (folder / name).write_bytes(content)
             evidence = AttemptEvidence(folder)
             a_transfer = transfer(protocol) if captured else replace(transfer(protocol), captures=(None, None))
-            return list(transfer_checks.find(evidence, a_transfer, finished=finished))
+            return list(transfer_checks.find_contradictions(evidence, a_transfer, finished=finished))
 
 
 def file_of(frames: Iterable[Frame]) -> bytes:
@@ -175,7 +175,7 @@ def test_acknowledged_bytes_that_are_in_neither_capture() -> None:
     link.carry(frame(77, 301, ACK, back=True), back=True)
     del link.sent[2], link.received[2]
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(200), finished=False) == [
-        f"100 bytes were acknowledged that are not in the {role}'s capture" for role in ("sender", "receiver")
+        f"100 bytes were acknowledged, but are not in the {role}'s capture" for role in ("sender", "receiver")
     ]
 
 
@@ -190,7 +190,7 @@ def test_bytes_after_a_gap_may_be_missing_in_the_file() -> None:
     assert link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True) == []
     link.carry(segment(9, 0, flags=0x04, back=True), back=True)
     (reasons,) = link.contradictions(Protocol.TCP, bytes(300), bytes(100), finished=True)
-    assert reasons.endswith("although its listener ended normally"), "it stopped reading"
+    assert reasons.endswith("although its listener exited normally"), "it stopped reading"
 
 
 def test_a_fragment_of_another_program_is_not_part_of_the_transfer() -> None:

@@ -128,5 +128,5 @@ def test_a_station_dump_narrows_the_time_of_a_handover() -> None:
     )
     text += f"==> 102.60 station <==\n==> 102.80 link <==\n{link_text.format(new)}"
     (handover,) = handovers.find_handovers(robot_link_samples.parse(text))
-    assert (handover.before, handover.after) == (old, new)
+    assert (handover.old, handover.new) == (old, new)
     assert (handover.left_ns, handover.joined_ns) == (102_400_000_000, 102_800_000_000)

@@ -54,7 +54,7 @@ def test_each_column_has_a_value_or_a_reason() -> None:
     for recorded in ([], samples(SAMPLE), [LinkSample(0)]):
         measured_link = [link.measure(role, recorded) for role in link.ROLES]
         assert names == {name for item in measured_link for name in (*item.values, *item.missing)}
-    assert "no Wi-Fi, or no iw" in link.measure(Role.SENDER, []).missing["sender_signal_min_dbm"]
+    assert "no Wi-Fi or no iw" in link.measure(Role.SENDER, []).missing["sender_signal_min_dbm"]
     assert "tx_retries" not in measured(samples(SAMPLE)), "an increment needs two samples"
 
 

@@ -80,7 +80,7 @@ def test_a_truncated_file_of_a_testbed_is_an_error_and_an_earlier_format_is_read
     path, content = tmp_path / link_samples.FILE, link_samples.text(samples)
     count, *lines = content.splitlines(keepends=True)
     path.write_text("".join([count, *lines[:-1]]), encoding="ascii")
-    with pytest.raises(EvidenceError, match="has 2 lines of 3: truncated"):
+    with pytest.raises(EvidenceError, match="is truncated: it has 2 of 3 lines"):
         link_samples.read(path)
     path.write_text("".join(lines), encoding="ascii")
     assert link_samples.read(path) == samples

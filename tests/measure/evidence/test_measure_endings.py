@@ -19,7 +19,7 @@ send limit 130 1286154 12981.58
 def test_recorded_terminations_are_parsed() -> None:
     by_name = endings.parse(NOTED.splitlines())
     assert (by_name["capture"].cause, by_name["capture"].code) == (Cause.STOPPED, 0)
-    assert by_name["capture"].lasted_s == pytest.approx(2.25)
+    assert by_name["capture"].duration_s == pytest.approx(2.25)
     assert by_name["killed"] == Ending(Cause.EXITED, None, None)
     assert [by_name[name].cause for name in ("ping", "busy", "send")] == [Cause.EXITED, Cause.RUNNING, Cause.LIMIT]
 
@@ -44,7 +44,7 @@ def test_other_lines_are_ignored(line: str) -> None:
         ("job limit 137 100 9.00", {Cause.LIMIT}, 15.0, None),
         ("job asked 0 100 9.00", {Cause.EXITED}, 0.0, "was stopped by fieldkit before it had finished"),
         ("job itself 0 100 15.95", {Cause.EXITED}, 15.0, None),
-        ("job itself 0 100 9.00", {Cause.EXITED}, 15.0, "exited after 8.0 s of 15 s"),
+        ("job itself 0 100 9.00", {Cause.EXITED}, 15.0, "exited after 8.0 s instead of 15 s"),
         ("job itself - 100 -", {Cause.EXITED}, 15.0, "was killed"),
         ("job running - 100 -", {Cause.EXITED}, 0.0, "was still running when the evidence was collected"),
     ],

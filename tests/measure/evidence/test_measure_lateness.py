@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import EvidenceError
 from fieldkit.core.model import Lateness
 from fieldkit.measure.evidence import oracle_delays
-from sim_backends.emulated.medium.ports import rounded_up
+from sim_backends.emulated.medium.ports import round_up
 from tests.helpers.measures import Measures, measure
 
 TEXT = "bound 5000\nlate 1000 98\nlate 6000 1\nlate 8000 1\n"
@@ -77,7 +77,7 @@ def test_a_truncated_file_is_refused(tmp_path_factory: pytest.TempPathFactory, a
 
 @given(st.lists(st.integers(0, 10**10), min_size=1, max_size=300), st.floats(0.01, 1.0))
 def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share: float) -> None:
-    counted = Lateness(bound_ns=1, packets=Counter(map(rounded_up, late_ns)))
+    counted = Lateness(bound_ns=1, packets=Counter(map(round_up, late_ns)))
     quantile_ns = oracle_delays.lateness_quantile_ns(counted.packets, share)
     true_ns = int(np.quantile(late_ns, share, method="inverted_cdf"))
     assert quantile_ns is not None
@@ -86,4 +86,4 @@ def test_quantiles_are_those_of_the_packets_rounded_up(late_ns: list[int], share
 
 @given(st.sets(st.integers(0, 2**40), min_size=1))
 def test_rounded_lateness_has_few_values(late_ns: set[int]) -> None:
-    assert len({rounded_up(value) for value in late_ns}) <= 8 * 41
+    assert len({round_up(value) for value in late_ns}) <= 8 * 41

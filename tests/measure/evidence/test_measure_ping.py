@@ -22,12 +22,12 @@ def test_all_lines_of_real_outputs_are_parsed() -> None:
     outputs = sorted(set(OUTPUTS.iterdir()) - {OUTPUTS / "about.txt"})
     assert len(outputs) >= 10
     for path in outputs:
-        assert ping.read(path).unknown == (), path.name
+        assert ping.read(path).unknown_lines == (), path.name
 
 
 def test_outputs_of_other_pings_are_parsed_except_foreign_lines() -> None:
     unknown = {
-        path.name: ping.read(path).unknown
+        path.name: ping.read(path).unknown_lines
         for path in (*(DATA / "busybox/1.35.0").glob("ping-[!a]*.txt"), *(DATA / "ping/20101006").iterdir())
     }
     assert {name: lines for name, lines in unknown.items() if lines} == {
@@ -66,7 +66,7 @@ def test_a_normal_run() -> None:
         problems=(),
         transmitted=3,
         received=3,
-        unknown=(),
+        unknown_lines=(),
         summary_s=(0.052 / 1e3, 0.088 / 1e3, 0.159 / 1e3),
     )
 
@@ -136,7 +136,7 @@ def test_gaps_of_an_interrupted_run_end_at_the_last_known_number() -> None:
 
 def test_a_truncated_line_is_kept_unchanged() -> None:
     cut = "[1795206656.303416] 64 bytes from 127.0.0.1: icmp_seq=4 tt"
-    assert ping.parse(cut).unknown == (cut,)
+    assert ping.parse(cut).unknown_lines == (cut,)
 
 
 def test_a_missing_output_is_an_evidence_error(tmp_path: Path) -> None:

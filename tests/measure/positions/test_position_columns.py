@@ -131,7 +131,7 @@ def test_times_that_are_not_covered_are_missing_with_a_reason(
 def test_positions_in_a_gap_are_not_interpolated(attempt: Path) -> None:
     write_bag(attempt, AWAY[:2] + AWAY[3:])
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
-    reason = "the positions of the receiver from /where have a gap of 2.0 s, and 1.5 s are allowed"
+    reason = "the positions of the receiver from /where have a gap of 2.0 s, but at most 1.5 s are allowed"
     assert mean_m(attempt) == reason
 
 
@@ -149,7 +149,7 @@ def test_distances_over_time_use_the_senders_clock_and_are_none_in_a_gap(attempt
 def test_a_robot_without_a_source_has_no_distance(attempt: Path) -> None:
     write_bag(attempt, AWAY)
     write_sources(attempt, {RECEIVER: ODOMETRY})
-    assert mean_m(attempt) == "no source has the position of the sender"
+    assert mean_m(attempt) == "there is no source for the position of the sender"
     (attempt / "track.bag").unlink()
     write_sources(attempt, {SENDER: ORIGIN_SOURCE, RECEIVER: ODOMETRY})
     assert "cannot be read" in str(mean_m(attempt))
@@ -183,7 +183,7 @@ def test_wgs84_heights_are_used_only_if_requested(attempt: Path) -> None:
     (attempt / position_sources.FILE).write_text(
         position_sources.text(PositionSources(without_height, heights=True)), encoding="utf-8"
     )
-    assert mean_m(attempt) == "heights are required, but some positions have none"
+    assert mean_m(attempt) == "heights are required, but some positions have no height"
 
 
 FLOATS = st.floats(-1e9, 1e9)

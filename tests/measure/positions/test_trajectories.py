@@ -69,8 +69,8 @@ def test_noise_in_close_samples_is_not_a_speed() -> None:
     [
         (0, 4, None),
         (1, 1, None),
-        (4, 9.5, "have a gap of 5.0 s, and 3 s are allowed"),
-        (6, 7, "have a gap of 5.0 s, and 3 s are allowed"),
+        (4, 9.5, "have a gap of 5.0 s, but at most 3 s are allowed"),
+        (6, 7, "have a gap of 5.0 s, but at most 3 s are allowed"),
         (9.5, 10, None),
         (-1.5, 2, "begin 1.5 s too late"),
         (3, 12, "end 2.0 s too early"),

@@ -139,13 +139,15 @@ def test_the_program_with_a_source_is_chosen() -> None:
         {"chrony": output("chrony/none-4.3.csv"), "ptp": output("linuxptp/current-1.2.txt")},
     )
     assert [report.program for report in found] == ["chrony", "ptp4l"]
-    report = clock_states.chosen(found)
+    report = clock_states.choose_report(found)
     assert report is not None
     assert report.program == "ptp4l"
-    none = clock_states.chosen(clock_states.reports({"timedatectl": SourceOutput("NTP=no\nNTPSynchronized=no", 0)}))
+    none = clock_states.choose_report(
+        clock_states.reports({"timedatectl": SourceOutput("NTP=no\nNTPSynchronized=no", 0)})
+    )
     assert none is not None
     assert none.problem == "no program synchronizes the clock"
-    assert clock_states.chosen(clock_states.reports({})) is None
+    assert clock_states.choose_report(clock_states.reports({})) is None
 
 
 def test_a_source_cannot_print_the_output_of_another(tmp_path: Path) -> None:

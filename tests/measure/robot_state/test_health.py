@@ -90,7 +90,7 @@ def test_a_throttled_computer_marks_the_repeat(tmp_path: Path) -> None:
     measured = attempt_states.measure(AttemptEvidence(tmp_path), {Role.SENDER: "rover-1"}, Measured())
     assert measured.values["marks"] == "under-voltage and throttled"
     assert measured.values["marks_reason"] == (
-        "rover-1: the supply voltage is too low; rover-1: its processor is slowed down (throttled)"
+        "rover-1: the supply voltage is too low; rover-1: the processor is throttled (throttled)"
     )
     for column in (*state_columns.MARK_COLUMNS, *state_columns.declare_columns("sender")):
         assert (column.name in measured.values) != (column.name in measured.missing), column.name

@@ -145,16 +145,29 @@ def test_a_busy_channel_marks_the_repeat(tmp_path: Path) -> None:
         "sender_other_networks_max_dbm": -30.0,
         "sender_others_airtime_share": pytest.approx(0.6),
     }
-    assert list(attempt_states.problems(AttemptEvidence(tmp_path), names)) == []
+    assert list(attempt_states.problems(AttemptEvidence(tmp_path), names, {})) == []
 
 
 def test_a_changed_channel_is_a_problem(tmp_path: Path) -> None:
     write(tmp_path, "before", CHANNEL_1, 0)
     write(tmp_path, "after", CHANNEL_6, 0)
-    (problem,) = attempt_states.problems(AttemptEvidence(tmp_path), {Role.SENDER: "rover-1"})
+    (problem,) = attempt_states.problems(AttemptEvidence(tmp_path), {Role.SENDER: "rover-1"}, {})
     assert problem == (
         "rover-1: the channel of its radio changed during the repeat, from 1 (2412 MHz), width 20 MHz to "
         "6 (2437 MHz), width 40 MHz"
+    )
+
+
+def test_another_channel_than_at_the_start_of_the_trial_is_a_problem(tmp_path: Path) -> None:
+    write(tmp_path, "before", CHANNEL_6, 0)
+    write(tmp_path, "after", CHANNEL_6, 0)
+    names = {Role.SENDER: "rover-1"}
+    same, other = {"regulatory_domain": "HR"}, {"channel": "1 (2412 MHz), width 20 MHz"}
+    assert list(attempt_states.problems(AttemptEvidence(tmp_path), names, {Role.SENDER: same})) == []
+    (problem,) = attempt_states.problems(AttemptEvidence(tmp_path), names, {Role.SENDER: other})
+    assert problem == (
+        "rover-1: the channel of its radio is 6 (2437 MHz), width 40 MHz, but it was 1 (2412 MHz), width 20 MHz at "
+        "the start of the trial"
     )
 
 

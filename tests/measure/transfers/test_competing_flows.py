@@ -127,7 +127,7 @@ def test_each_transfer_counts_its_own_packets_even_with_equal_ids(
         evidence = AttemptEvidence(Path(place))
         for flow in flows:
             assert transfer_measures.incomparability_reason(evidence, flow.transfer) is None
-            assert not list(transfer_checks.find(evidence, flow.transfer, finished=True))
+            assert not list(transfer_checks.find_contradictions(evidence, flow.transfer, finished=True))
             values = transfer_measures.measure(evidence, flow.transfer).values
             counted = ("ip_packets_sent", "ip_packets_received", "datagrams_sent", "datagrams_received")
             assert [values[name] for name in counted] == [flow.sent, flow.arrived, flow.datagrams, flow.whole]

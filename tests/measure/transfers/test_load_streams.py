@@ -67,7 +67,7 @@ def test_streams_that_cannot_be_distinguished_have_no_stall() -> None:
 
 
 def test_a_test_longer_than_its_arrivals_has_a_lower_bound() -> None:
-    limited = replace(UDP, expected=replace(EVERY, lasts_s=10.0))
+    limited = replace(UDP, expected=replace(EVERY, duration_s=10.0))
     assert measured(limited, [control(), data()]) == {"stall_at_least_s": pytest.approx(6.0), "stalls": 2}
 
 

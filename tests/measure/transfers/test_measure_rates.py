@@ -37,13 +37,13 @@ def through_link(data: Sequence[bytes], start_ns: int = START_NS) -> list[Frame]
 
 
 def of_udp(sent: list[Frame], received: list[Frame]) -> Rates:
-    return rates.of_udp(udp.match_transfer(packets(sent), packets(received), transfer(Protocol.UDP)))
+    return rates.udp_rates(udp.match_transfer(packets(sent), packets(received), transfer(Protocol.UDP)))
 
 
 def of_tcp(sent: list[Frame], received: list[Frame]) -> Rates:
     sent_packets, received_packets, which = packets(sent), packets(received), transfer(Protocol.TCP)
     crossing = tcp.match_transfer(sent_packets, received_packets, which)
-    return rates.of_tcp(crossing, received_packets, which, tcp.count(crossing))
+    return rates.tcp_rates(crossing, received_packets, which, tcp.count(crossing))
 
 
 @given(sizes)

@@ -104,7 +104,7 @@ def test_a_stall_that_lasts_until_the_listener_ended_is_a_lower_bound() -> None:
     for again_ns in (200 * MS, 600 * MS, 1400 * MS):
         stream.segment(10, last_ns + again_ns, arrives=False)
     ended_ns = START + last_ns + 5 * SECOND
-    schedule = FlowSchedule(size_bytes=20_000, until_ns=ended_ns)
+    schedule = FlowSchedule(size_bytes=20_000, receiver_end_ns=ended_ns)
     result = measured(of_tcp(*captured([stream]), schedule))
     assert result == {"stall_at_least_s": pytest.approx(5.0 - stream.delay_ns / SECOND, abs=1e-6), "stalls": 1}
     # Without the end of its program, the stall lasts until the sender's last packet.
@@ -113,7 +113,7 @@ def test_a_stall_that_lasts_until_the_listener_ended_is_a_lower_bound() -> None:
 
 
 def test_a_file_that_is_complete_does_not_stall_until_its_listener_ends() -> None:
-    schedule = FlowSchedule(size_bytes=10_000, until_ns=START + 30 * SECOND)
+    schedule = FlowSchedule(size_bytes=10_000, receiver_end_ns=START + 30 * SECOND)
     assert measured(of_tcp(*captured([sends(10)]), schedule)) == {
         "stall_s": pytest.approx(0.01, abs=1e-6),
         "stalls": 0,
@@ -188,9 +188,9 @@ def test_a_flow_shorter_than_its_schedule_has_stalled_until_the_end_of_it() -> N
     stream = Stream()
     for number in range(100):  # the sender's kernel takes no more of them after 1 s: its interface is down
         stream.datagram(number, number * STEP_NS)
-    scheduled = FlowSchedule(interval_s=0.01, lasts_s=5.0)
+    scheduled = FlowSchedule(interval_s=0.01, duration_s=5.0)
     assert measured(of_udp(*captured([stream]), scheduled)) == {"stall_at_least_s": pytest.approx(4.0), "stalls": 1}
-    shortened = replace(scheduled, until_ns=START + 3 * SECOND)
+    shortened = replace(scheduled, receiver_end_ns=START + 3 * SECOND)
     assert measured(of_udp(*captured([stream]), shortened))["stall_at_least_s"] == pytest.approx(2.0, abs=0.01)
 
 

@@ -161,10 +161,13 @@ def oracle(folder: Path, far_m: float) -> AttemptEvidence:
 @pytest.mark.parametrize(("far_m", "agrees"), [(2.0, True), (2.1, True), (8.0, False), (0.0, False)])
 def test_the_farthest_position_agrees_with_the_testbed(far_m: float, agrees: bool, tmp_path: Path) -> None:
     during_ns = (START_NS, START_NS + 9 * 10**9)
-    reason = recorded_positions.distance_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
+    reason = recorded_positions.travel_contradiction(oracle(tmp_path, far_m), Role.RECEIVER, 2.0, 0.5, during_ns)
     assert (reason is None) is agrees
     if reason:
-        assert reason == f"it was 2.0 m from its place by its odometry, and {far_m:.1f} m by track.csv"
+        assert (
+            reason
+            == f"it was 2.0 m from its start according to its odometry, but {far_m:.1f} m according to track.csv"
+        )
 
 
 def test_the_deviation_at_a_corner_is_the_straight_distance() -> None:

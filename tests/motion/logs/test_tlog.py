@@ -269,5 +269,5 @@ def test_random_loss_is_measured_even_if_a_router_filters_messages(share: float,
                 continue
             numbers.append((100_000 * slot, sent % 256))
             streams.setdefault(name, []).append(StreamMessage(100_000 * slot, 100 * slot, len(numbers) - 1))
-    arrived, lacking = periodic.lost(numbers, streams, 0)
+    arrived, lacking = periodic.count_messages(numbers, streams, 0)
     assert (arrived, lacking) == (len(numbers), truth)

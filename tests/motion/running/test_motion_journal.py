@@ -103,7 +103,7 @@ def test_a_stop_by_the_operator_holds_the_robots_of_a_campaign(tmp_path: Path) -
 
 
 def test_a_kill_during_a_motion_holds_the_robots(tmp_path: Path) -> None:
-    MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.BEGUN, "rover-1")
+    MotionJournal(tmp_path / MOTION_FILE).add(MotionEvent.STARTED, "rover-1")
     with pytest.raises(MotionHeldError, match="fieldkit stopped while it moved"):
         open_origins(tmp_path).require()
 

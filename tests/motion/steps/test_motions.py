@@ -90,4 +90,4 @@ def test_abandoned_wait_does_not_wait_for_landing() -> None:
     with motions.moving(mover(shell)):
         motions.order_stop(lambda line: coming.set() if "coming down (return)" in line else None)
         assert coming.wait(60)
-        motions.abandon()
+        motions.cancel_wait()

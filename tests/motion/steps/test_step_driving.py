@@ -84,14 +84,14 @@ def test_without_permission_there_is_no_driver() -> None:
     (line, *_) = STEP.dry_run_notes(scene)
     assert "automatically" not in line
     (line, *_) = STEP.dry_run_notes(SCENE)
-    assert "it stops if the laptop is silent for 2 s, and 30 m from its place" in line
+    assert "it stops if no order arrives for 2 s, or 30 m from its origin" in line
 
 
 def test_path_beyond_fence_or_speed_is_refused() -> None:
     long_move = move("robot: receiver, path: [{away: 25m}, {left: 20m}], speed: 0.3m/s")
     speed, fence = long_move.refusals(SCENE)
     assert speed.what == "its top speed is 0.22 m/s, but the move needs 0.3 m/s"
-    assert fence.what == "its fence is 30 m from its place, but its path leads 32.0156 m away"
+    assert fence.what == "its fence is 30 m from its origin, but its path leads 32.0156 m away"
     by_person = long_move.refusals(replace(SCENE, cast=CAST))
     assert [refusal.what for refusal in by_person] == [speed.what], "no fence if a person moves it"
     round_trip = move("robot: receiver, path: [{away: 25m}, {towards: 25m}, {away: 25m}], speed: 0.2m/s")
@@ -283,7 +283,7 @@ def quick_scene() -> Scene:
 def driven(field: DrivingTestbed, body: Any) -> None:  # noqa: ANN401
     scene = quick_scene()
     first, *_ = STEP.jobs(scene)
-    with driving.driven(scene, field, first, STEP.motion, "out.{}"):
+    with driving.drive_robot(scene, field, first, STEP.motion, "out.{}"):
         body()
 
 

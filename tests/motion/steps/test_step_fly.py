@@ -25,7 +25,7 @@ DRONE = next(role for role, robot in CAST.items() if mavlink_of(robot.profile) i
 PERMITTED = {role: robot.model_copy(update={"abilities": frozenset({"mavlink"})}) for role, robot in CAST.items()}
 SCENE = Scene(Protocol.TCP, PERMITTED, "f")
 LOW = '{"what": "its battery has 10%", "remedy": "charge it", "grave": true}'
-MODE = '{"what": "PX4 refuses to be armed", "remedy": "remove the cause", "grave": false}'
+MODE = '{"what": "PX4 refuses to arm", "remedy": "remove the cause", "grave": false}'
 LIMITS = CAST[DRONE].profile.limits
 
 
@@ -173,7 +173,7 @@ steps: [{ping: {from: sender, to: receiver}}]
 def test_abort_notes_describe_the_action() -> None:
     flight = step(f"robot: {DRONE}, height: 2m")
     assert list(flight.abort_notes(SCENE)) == [
-        f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, also after fieldkit has exited"
+        f"{CAST[DRONE].name} lands, if it is in the air: this takes up to about 37 s, even if fieldkit has exited"
     ]
     returns = Scene(Protocol.TCP, PERMITTED, "f", sections={ON_ABORT: AbortActions({DRONE: OnAbort.RETURN})})
     (note,) = flight.abort_notes(returns)

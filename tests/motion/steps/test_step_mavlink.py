@@ -182,7 +182,7 @@ def test_global_positions_with_fixed_position_on_the_earth(tmp_path: Path) -> No
     ("log", "counters", "problem"),
     [
         (flight(10)[:-3], {}, "is truncated"),
-        (flight(10), {"frames": 9}, "mavlink.tlog has 203 frames, its recorder wrote 9"),
+        (flight(10), {"frames": 9}, "mavlink.tlog has 203 frames, but its recorder wrote 9"),
         (flight(10), {"left_out": 4}, "lacks 4 received frames"),
         (flight(10), {"refused": {"1": 2}}, "refused the request for SYS_STATUS"),
         (flight(10), {}, "no SYS_STATUS, which was requested"),

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldkit.backends.protocols import Cast, Testbed
-from fieldkit.cli.dry_run import in_shell, print_commands
+from fieldkit.cli.dry_run import print_commands, shell_line
 from fieldkit.config import schema
 from fieldkit.config.profiles import load_profile
 from fieldkit.core import geometry, model
@@ -92,8 +92,8 @@ def test_motion_is_in_metres_and_seconds() -> None:
     assert geometry.length_m(step.motion) == pytest.approx(2005.0)
     assert geometry.describe_move(step.motion) == "2000 m towards, then 3 m away and 4 m right, at 1 m/s"
     assert step.roles() == {Role.SENDER, Role.RECEIVER}
-    assert [in_shell(planned.job) for planned in step.jobs(SCENE)] == [
-        in_shell(planned.job) for planned in step.during[0].step.jobs(SCENE)
+    assert [shell_line(planned.job) for planned in step.jobs(SCENE)] == [
+        shell_line(planned.job) for planned in step.during[0].step.jobs(SCENE)
     ]
 
 

@@ -25,7 +25,7 @@ from fieldkit.core.errors import EvidenceError
 from fieldkit.ros.bags import bag_command, contents
 from fieldkit.ros.bags.bag import METADATA
 from fieldkit.ros.bags.formats import BagFormat
-from fieldkit.ros.bags.worker import types_of
+from fieldkit.ros.bags.worker import message_types
 from tests.helpers.paths import DATA
 
 KILLED = DATA / "rosbag/1.15.15/killed"
@@ -296,7 +296,7 @@ def test_single_mcap_file_is_a_bag(
     assert main(["bag", "check", str(alone)]) == EvidenceError.exit_code
     output_text = capsys.readouterr().err
     assert "there is no metadata.yaml" in output_text
-    assert "bytes before a record does" in output_text
+    assert "bytes before the end of a record" in output_text
     assert "messages can be recovered: fieldkit bag repair" in output_text
 
 
@@ -326,6 +326,6 @@ def test_sparse_file_is_reported_in_time(tmp_path: Path, capsys: pytest.CaptureF
 
 def test_command_line_accepts_all_distributions_of_the_library() -> None:
     assert all(
-        "sensor_msgs/msg/LaserScan" in types_of(connection).fielddefs for connection in bag_command.DISTRIBUTIONS
+        "sensor_msgs/msg/LaserScan" in message_types(connection).fielddefs for connection in bag_command.DISTRIBUTIONS
     )
     assert set(bag_command.STORAGES) == set(BagFormat) - {BagFormat.ROS1}

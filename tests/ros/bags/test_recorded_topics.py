@@ -128,9 +128,9 @@ def test_a_ros2_recorder_starts_discovery_of_all_topics_together(suffix: str, tm
 @given(st.integers(0, 9_999_999_999 * S), st.sampled_from([ROSBAG, ROS2]))
 def test_no_digit_of_a_stamp_is_lost(at_ns: int, text: str) -> None:
     text = text.format(s=at_ns // S, ns=at_ns % S, topic="/scan")
-    assert recorded_topics.subscribed_ns(text, ["/scan", "/imu"])["/scan"] == at_ns
+    assert recorded_topics.subscription_ns(text, ["/scan", "/imu"])["/scan"] == at_ns
 
 
 @given(st.text())
 def test_any_log_is_parsed_or_ignored(text: str) -> None:
-    assert recorded_topics.subscribed_ns(text, ["/scan"]).keys() <= {"/scan"}
+    assert recorded_topics.subscription_ns(text, ["/scan"]).keys() <= {"/scan"}

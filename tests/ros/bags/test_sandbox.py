@@ -92,7 +92,7 @@ def test_a_reader_that_is_killed_externally_is_restarted_and_leaves_no_files(
 def test_the_limit_of_an_answer_grows_with_the_file(unpacking_reader: sandbox.SandboxedReader) -> None:
     large = sandbox.ANSWER_BYTES + 1000
     assert len(unpacking_reader.query({"says": large}, 4096)["said"]) == large
-    with pytest.raises(sandbox.ReaderError, match="its contents exceed the limit for a file of its size"):
+    with pytest.raises(sandbox.ReaderError, match="its contents exceed the limit for a file of this size"):
         unpacking_reader.query({"says": large}, 10)
     assert len(unpacking_reader.query({"says": 10}, 10)["said"]) == 10, "the next query is answered"
 
@@ -170,7 +170,7 @@ def test_a_chunk_that_exceeds_the_memory_limit_is_refused(tmp_path: Path) -> Non
         connection = writer.add_connection(TOPIC, TYPE, typestore=store)
         writer.write(connection, 1, store.serialize_ros1(message(Stores.ROS1_NOETIC, 0.5), TYPE))
     assert bag.read(path).messages == 1
-    with pytest.raises(EvidenceError, match="more memory than the limit for a file of its size"):
+    with pytest.raises(EvidenceError, match="more memory than the limit for a file of this size"):
         bag.battery_share(path, TOPIC)
     assert bag.battery_share(ros1(Path(tempfile.mkdtemp(dir=tmp_path)), [0.5]), TOPIC) == 0.5
 

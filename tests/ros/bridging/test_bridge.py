@@ -23,7 +23,7 @@ from fieldkit.ros.bridging.bridge_command import MIDDLEWARES
 from fieldkit.ros.bridging.crossings import Crossing, parse_qos
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from tests.helpers.nightly import mark_nightly
 from tests.helpers.two_hosts import TestHost, two_connected_hosts
 
@@ -107,7 +107,7 @@ class Site:
 
     def wire(self, verb: str, middleware_name: str, quality: str = "") -> AbstractContextManager[Process]:
         """Run a publisher or subscriber without ROS 1 on the other host."""
-        topic = topics.describe(shipped(), "/scan", TYPE, parse_qos(quality), domain=DOMAIN, node=verb)
+        topic = topics.describe(standard_types(), "/scan", TYPE, parse_qos(quality), domain=DOMAIN, node=verb)
         settings = {"listen/endpoints": f'["tcp/{self.wire_host.address}:0"]'} if middleware_name == "zenoh" else {}
         network = {"address": self.wire_host.address, "domain": DOMAIN, "node": verb, "settings": settings}
         samples = self.folder / "samples"
@@ -129,11 +129,11 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 def scan(number: int) -> str:
     """Return a scan in the serialization of rosbags for ROS 2, hexadecimal."""
-    kinds = shipped().ros2.types
+    kinds = standard_types().ros2.types
     header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](number, 5), "base")
     ranges = np.array([number, 0.5], np.float32)
     message = kinds[TYPE](header, 0, 0, 0, 0, 0, 0, 0, ranges, np.array([], np.float32))
-    return bytes(shipped().ros2.serialize_cdr(message, TYPE)).hex()
+    return bytes(standard_types().ros2.serialize_cdr(message, TYPE)).hex()
 
 
 def received(subscriber: Process, number_of: Callable[[str], int]) -> list[tuple[int, str]]:
@@ -189,7 +189,7 @@ def test_scans_are_forwarded_both_ways_once_and_unchanged(site: Site, middleware
     report = {(counts["source"], counts["target"]): counts for counts in json.loads(output_text)}
     assert report.keys() == {("ros1", middleware_name), (middleware_name, "ros1")}
     size_bytes = {
-        "ros1": len(shipped().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)),
+        "ros1": len(standard_types().ros2.cdr_to_ros1(bytes.fromhex(scan(1)), TYPE)),
         middleware_name: len(scan(1)) // 2,
     }
     for (source, _), counts in report.items():
@@ -209,7 +209,9 @@ def test_late_subscriber_receives_the_latched_message_of_ros_1(site: Site, middl
         for _ in range(2):  # the second subscriber starts after the message was forwarded
             with site.wire("hear", middleware_name, late) as subscriber:
                 assert subscriber.stdout is not None
-                received: Any = shipped().ros2.deserialize_cdr(bytes.fromhex(subscriber.stdout.readline()), TYPE)
+                received: Any = standard_types().ros2.deserialize_cdr(
+                    bytes.fromhex(subscriber.stdout.readline()), TYPE
+                )
                 assert received.header.frame_id == "once"
 
 
@@ -249,7 +251,7 @@ def test_missing_master_is_reported(site: Site) -> None:
 @pytest.mark.parametrize("middleware_name", ["dds", "zenoh"])
 def test_topic_of_another_type_is_detected_without_a_master(middleware_name: str) -> None:
     def described(kind: str) -> Topic:
-        report = topics.describe(shipped(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
+        report = topics.describe(standard_types(), "/t", kind, PROFILES["default"], domain=DOMAIN, node="n")
         return Topic.from_json(report)
 
     settings = {"listen/endpoints": '["tcp/127.0.0.1:0"]'} if middleware_name == "zenoh" else {}
@@ -304,9 +306,11 @@ def test_invalid_messages_are_dropped_and_counted(monkeypatch: pytest.MonkeyPatc
     )
     network = Network("127.0.0.1")
     sample = bytes.fromhex(scan(7))
-    of_ros1 = bytes(shipped().ros2.cdr_to_ros1(sample, TYPE))
+    of_ros1 = bytes(standard_types().ros2.cdr_to_ros1(sample, TYPE))
     crossing = Crossing.parse(SCAN)
-    with bridge.bridged(Side("ros1", network), Side("dds", network), [crossing], shipped()) as (carrier,):
+    with bridge.bridge_topics(Side("ros1", network), Side("dds", network), [crossing], standard_types()) as (
+        carrier,
+    ):
         assert source.deliver is not None
         for data in (b"", of_ros1[:-1], of_ros1 + b"x", b"\xff" * 200, of_ros1):
             source.deliver(data, time.time_ns())

@@ -25,7 +25,7 @@ from fieldkit.remote.jobs import Job
 from fieldkit.ros.bridging import session_bridges
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from fieldkit.trial import session_jobs
 from fieldkit.trial.check import software
 from sim_backends.emulated import testbed
@@ -77,7 +77,7 @@ def first_heard(pid: int, address: str) -> bytes:
     """Return the first scan that a DDS node receives in a robot's network."""
     network = json.dumps({"address": address, "node": "ears", "domain": BRIDGE.domain})
     kind, profile = "sensor_msgs/LaserScan", PROFILES["sensor_data"]
-    topic = json.dumps(topics.describe(shipped(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
+    topic = json.dumps(topics.describe(standard_types(), "/scan", kind, profile, domain=BRIDGE.domain, node="ears"))
     inside = ("timeout", "-k", "10", str(LONG_S), "nsenter", "-t", str(pid), "-n")
     command = (*inside, sys.executable, str(WIRE_END), "hear", "dds", network, topic)
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as subscriber:
@@ -96,7 +96,9 @@ def test_dds_nodes_receive_ros_1_messages_during_the_session(emulation: Emulated
     with session_jobs.running(cast(), emulation.shells, "s1", sink=events.append):
         (list_running,) = jobs.list_running(shell, soon())
         assert f"/{session_bridges.folder_of('s1')}/" in list_running
-        scan: Any = shipped().ros2.deserialize_cdr(first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan")
+        scan: Any = standard_types().ros2.deserialize_cdr(
+            first_heard(drone.pid, drone.spec.ip), "sensor_msgs/msg/LaserScan"
+        )
     assert (scan.header.frame_id, len(scan.ranges)) == ("base_scan", 360)
     assert jobs.list_running(shell, soon()) == ()
     assert not [event for event in events if isinstance(event, Note)], "the bridge exited successfully"

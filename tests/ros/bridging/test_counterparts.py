@@ -11,7 +11,7 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.ros.bridging import bridge, counterparts
 from fieldkit.ros.bridging.bridge import Side
 from fieldkit.ros.bridging.crossings import Crossing
-from fieldkit.ros.interfaces.types import Distribution, MessageTypes, shipped
+from fieldkit.ros.interfaces.types import Distribution, MessageTypes, standard_types
 
 
 class FakeMiddleware:
@@ -61,7 +61,7 @@ def carried(
     network = Network("127.0.0.1")
     crossing = Crossing.parse(f"/t:{type_name}", back=back)
     source, target = (of_dds, of_ros1) if back else (of_ros1, of_dds)
-    with bridge.bridged(Side("ros1", network), Side("dds", network), [crossing], types):
+    with bridge.bridge_topics(Side("ros1", network), Side("dds", network), [crossing], types):
         assert source.deliver is not None
         source.deliver(sample, time.time_ns())
     (ros1_topic,), (dds_topic,) = of_ros1.topics, of_dds.topics
@@ -78,7 +78,7 @@ def carried(
 def test_time_types_are_bridged_under_their_names(
     monkeypatch: pytest.MonkeyPatch, name: str, md5: str, package: str, *, back: bool
 ) -> None:
-    types = shipped()
+    types = standard_types()
     seconds = -7 if name == "Duration" else 7
     value = types.ros1.types[f"builtin_interfaces/msg/{name}"](seconds, 999_999_999)
     ros1 = bytes(types.ros1.serialize_ros1(types.ros1.types[f"std_msgs/msg/{name}"](value), f"std_msgs/msg/{name}"))
@@ -92,7 +92,7 @@ def test_time_types_are_bridged_under_their_names(
 
 def ranges(variance: float) -> tuple[bytes, bytes]:
     """Return a range in the serialization of rosbags for Noetic and for Jazzy."""
-    types = shipped()
+    types = standard_types()
     messages = []
     for store, extra_fields in ((types.ros1, ()), (types.ros2, (variance,))):
         stamp = store.types["builtin_interfaces/msg/Time"](3, 4)
@@ -106,33 +106,33 @@ def ranges(variance: float) -> tuple[bytes, bytes]:
 
 def test_range_has_variance_0_in_ros_2_and_none_in_ros_1(monkeypatch: pytest.MonkeyPatch) -> None:
     of_noetic, of_jazzy = ranges(0.0)
-    written, md5, _ = carried(monkeypatch, "sensor_msgs/Range", of_noetic, shipped(), back=False)
+    written, md5, _ = carried(monkeypatch, "sensor_msgs/Range", of_noetic, standard_types(), back=False)
     assert written == [of_jazzy]
     assert md5 == "c005c34273dc426c67a020a87bc24148"
     _, measured = ranges(0.125)
     assert measured != of_jazzy
-    written, _, _ = carried(monkeypatch, "sensor_msgs/Range", measured, shipped(), back=True)
+    written, _, _ = carried(monkeypatch, "sensor_msgs/Range", measured, standard_types(), back=True)
     assert written == [of_noetic]
 
 
 @pytest.mark.parametrize("cut", [1, 4, 5, 20])
 def test_range_with_a_wrong_length_is_invalid(cut: int) -> None:
-    pair = counterparts.of_type(shipped(), "sensor_msgs/Range")
+    pair = counterparts.of_type(standard_types(), "sensor_msgs/Range")
     assert pair is not None
     of_noetic, of_jazzy = ranges(0.0)
     for data in (of_noetic[:-cut], of_noetic + bytes(cut)):
         with pytest.raises(SerdeError):
-            pair.to_ros2(shipped(), data)
+            pair.to_ros2(standard_types(), data)
     with pytest.raises(SerdeError):
-        pair.to_ros1(shipped(), of_jazzy[:-cut])
+        pair.to_ros1(standard_types(), of_jazzy[:-cut])
 
 
 def test_additional_members_depend_on_the_distribution() -> None:
-    added = {
-        distribution: counterparts.of_type(shipped(distribution), "sensor_msgs/Range")
+    pairs = {
+        distribution: counterparts.of_type(standard_types(distribution), "sensor_msgs/Range")
         for distribution in (Distribution.HUMBLE, Distribution.IRON)
     }
-    assert [pair.added if pair else None for pair in added.values()] == [b"", bytes(4)]
-    assert counterparts.of_type(shipped(), "visualization_msgs/Marker") is None
+    assert [pair.added_bytes if pair else None for pair in pairs.values()] == [b"", bytes(4)]
+    assert counterparts.of_type(standard_types(), "visualization_msgs/Marker") is None
     with pytest.raises(ConfigurationError, match="there is no message type"):
-        counterparts.of_type(shipped(), "sensor_msgs/Rnge")
+        counterparts.of_type(standard_types(), "sensor_msgs/Rnge")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.ros.bridging.crossings import Crossing, CrossingTally, parse_qos
 from fieldkit.ros.interfaces.qos import PROFILES, Durability, History, QosProfile, Reliability
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 
 SCAN = Crossing.parse("/scan:sensor_msgs/LaserScan")
 
@@ -94,4 +94,4 @@ def test_no_rate_and_no_delay_without_messages() -> None:
     ],
 )
 def test_types_that_differ_are_not_translatable(name: str, same: bool) -> None:
-    assert shipped().translatable(name) is same
+    assert standard_types().is_translatable(name) is same

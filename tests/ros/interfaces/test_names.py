@@ -5,7 +5,7 @@ import pytest
 from fieldkit.ros.interfaces import names
 from fieldkit.ros.interfaces.names import Endpoint, Entity, Token
 from fieldkit.ros.interfaces.qos import PROFILES, QosProfile
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 
 STRING = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = f"%chatter/std_msgs::msg::dds_::String_/{STRING}"
@@ -58,7 +58,7 @@ def test_user_data_contain_the_hash() -> None:
 
 def test_subscription_with_sensor_data() -> None:
     """As public projects define it for rmw_zenoh: best effort, 5 samples."""
-    hashed = shipped().get("std_msgs/Bool").rihs01
+    hashed = standard_types().get("std_msgs/Bool").rihs01
     endpoint = Endpoint("/rovi/arm", "std_msgs/msg/Bool", hashed, PROFILES["sensor_data"])
     assert Token(0, LISTENER, 0, 2, Entity.SUBSCRIPTION, "rovi", endpoint=endpoint).key.endswith(
         "/MS/%/%/rovi/%rovi%arm/std_msgs::msg::dds_::Bool_/"

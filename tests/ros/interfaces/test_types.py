@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import Distribution, MessageField, MessageTypes, shipped
+from fieldkit.ros.interfaces.types import Distribution, MessageField, MessageTypes, standard_types
 from tests.helpers.paths import DATA
 
 # Type hashes: std_msgs/String and its key expression from docs/design.md of ros2/rmw_zenoh; the others from key
@@ -42,7 +42,7 @@ PUBLISHED = {
 @pytest.mark.parametrize(("name", "published"), PUBLISHED.items())
 @pytest.mark.parametrize("distribution", Distribution)
 def test_hashes_are_the_published_ones(name: str, published: tuple[str, str], distribution: Distribution) -> None:
-    message_type = shipped(distribution).get(name)
+    message_type = standard_types(distribution).get(name)
     assert (message_type.rihs01, message_type.md5) == published
 
 
@@ -50,11 +50,11 @@ def test_hashes_are_those_of_a_real_ros_2() -> None:
     """The hashes that rosidl has written to the packages of ROS 2 Kilted."""
     published = json.loads((DATA / "ros2" / "kilted" / "type_hashes.json").read_text(encoding="utf-8"))
     assert len(published) > 100
-    assert {name: shipped().get(name).rihs01 for name in published} == published
+    assert {name: standard_types().get(name).rihs01 for name in published} == published
 
 
 def test_either_spelling_names_a_type() -> None:
-    assert shipped().get("sensor_msgs/LaserScan") == shipped().get("sensor_msgs/msg/LaserScan")
+    assert standard_types().get("sensor_msgs/LaserScan") == standard_types().get("sensor_msgs/msg/LaserScan")
 
 
 def test_custom_type() -> None:
@@ -82,12 +82,12 @@ def test_md5_sum_is_independent_of_the_name() -> None:
 def test_custom_types_do_not_affect_other_instances() -> None:
     MessageTypes(definitions={"lab_msgs/Once": "string data\n"})
     with pytest.raises(ConfigurationError):
-        shipped().get("lab_msgs/Once")
+        standard_types().get("lab_msgs/Once")
 
 
 def test_unknown_type_is_reported_with_the_nearest() -> None:
     with pytest.raises(ConfigurationError) as failed:
-        shipped().get("sensor_msgs/LaserScn")
+        standard_types().get("sensor_msgs/LaserScn")
     assert failed.value.remedy == "did you mean 'sensor_msgs/msg/LaserScan'?"
 
 

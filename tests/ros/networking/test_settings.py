@@ -76,7 +76,7 @@ OTHER_DOMAIN = RosProgram("talker", {"ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "5
         (robot_state(programs=(OTHER_DOMAIN,)), "ROS domain", Verdict.WARN, "of 1 running ROS programs: 1 with 5"),
         (robot_state(programs=(RosProgram("a", ZENOH),)), "RMW", Verdict.WARN, "1 with rmw_zenoh_cpp"),
         (robot_state(multicast_interface=None), "multicast route", Verdict.FAIL, "no route"),
-        (robot_state(multicast_interface="eth0"), "multicast route", Verdict.WARN, "leaves by eth0"),
+        (robot_state(multicast_interface="eth0"), "multicast route", Verdict.WARN, "leave by eth0"),
         (robot_state(rmw_interfaces=("eth0",)), "RMW settings", Verdict.FAIL, "limited to eth0"),
         (robot_state(rmw_interfaces=("eth0", "wlan0")), "RMW settings", Verdict.OK, "limited to eth0, wlan0"),
         (robot_state(unreadable_settings="head: x"), "RMW settings", Verdict.FAIL, "head: x"),
@@ -86,7 +86,7 @@ OTHER_DOMAIN = RosProgram("talker", {"ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "5
             robot_state(ZENOH | {"ZENOH_ROUTER_CONFIG_URI": "r.json5"}, tcp_ports=frozenset({7447})),
             "Zenoh router",
             Verdict.OK,
-            "configuration of its own",
+            "separate configuration file",
         ),
         (
             robot_state(kernel=GOOD_KERNEL | {"net/core/rmem_max": 212_992}),

@@ -92,9 +92,9 @@ def test_fast_dds_reads_its_file(tmp_path: Path, transports: str, *, loads: bool
 
 
 def test_setting_that_a_file_cannot_contain_is_rejected() -> None:
-    with pytest.raises(ConfigurationError, match="cannot hold FASTDDS_X"):
+    with pytest.raises(ConfigurationError, match="cannot contain FASTDDS_X"):
         configurations.configuration_text("ros2", "tcp", {"FASTDDS_X": "1"}, [])
-    with pytest.raises(ConfigurationError, match="cannot hold rmw_cyclonedds_cpp"):
+    with pytest.raises(ConfigurationError, match="cannot contain rmw_cyclonedds_cpp"):
         configurations.configuration_text("ros2", "tcp", {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, [])
     with pytest.raises(ConfigurationError, match="ros1 has no configuration file"):
         configurations.configuration_text("ros1", "tcp", {}, [])

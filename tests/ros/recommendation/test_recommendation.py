@@ -55,36 +55,36 @@ def test_a_repeat_at_the_bound_passes_and_one_above_fails() -> None:
     assert judge(cell([0, 1, 1, 0, 1])).passed
     assessment = judge(cell([0, 1, 2, 0, 1]))
     assert not assessment.passed
-    assert assessment.failed == (f"{PLACE}, 1000 B: loss <= 0.01 in 4 of 5 repeats, up to 0.02",)
+    assert assessment.failures == (f"{PLACE}, 1000 B: loss <= 0.01 in 4 of 5 repeats, up to 0.02",)
 
 
 def test_a_bound_is_compared_as_a_decimal() -> None:
     # In binary floating point, 2.9 times 0.01 is less than 29/1000.
     bound = parse_amount("2.9%", "share", "bound")
     assert judge(cell(5 * [29], sent=1000), criterion=LinkCriterion(bound)).passed
-    assert judge(cell(5 * [30], sent=1000), criterion=LinkCriterion(bound)).failed
+    assert judge(cell(5 * [30], sent=1000), criterion=LinkCriterion(bound)).failures
 
 
 def test_one_bad_repeat_fails_although_the_mean_is_low() -> None:
     # Bimodal: 1 of 200 repeats loses everything, 0.5 % on average.
-    assert judge(cell([100] + 199 * [0])).failed
+    assert judge(cell([100] + 199 * [0])).failures
 
 
 def test_samples_never_sent_are_lost() -> None:
     assert judge(cell(5 * [0], sent=99, never_sent=1)).passed
-    assert judge(cell(5 * [0], sent=98, never_sent=2)).failed
+    assert judge(cell(5 * [0], sent=98, never_sent=2)).failures
 
 
 def test_too_few_repeats_never_pass() -> None:
     assessment = judge(cell(4 * [0]))
-    assert assessment.lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
+    assert assessment.missing_evidence == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
     assert judge(cell(4 * [0]), criterion=replace(ONE_PERCENT, repeats=4)).passed
 
 
 def test_void_and_failed_repeats_do_not_count() -> None:
     measured_cell = cell(6 * [0], status=["valid", "void", "valid", "failed", "valid", "valid"])
     assert measured_cell.attempts == 6
-    assert judge(measured_cell).lacking == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
+    assert judge(measured_cell).missing_evidence == (f"{PLACE}, 1000 B: 4 of 5 valid repeats with samples; run more",)
     # The loss of a void repeat proves nothing either.
     assert judge(cell([0, 0, 0, 0, 0, 90], status=[*5 * ["valid"], "void"])).passed
 
@@ -92,17 +92,17 @@ def test_void_and_failed_repeats_do_not_count() -> None:
 def test_a_valid_repeat_without_a_loss_never_passes() -> None:
     assessment = judge(cell([*5 * [0], UNKNOWN]))
     assert not assessment.passed
-    assert "1 of 6 repeats have no value" in assessment.lacking[0]
+    assert "1 of 6 repeats have no value" in assessment.missing_evidence[0]
     # Nothing was sent: there was no subscription.
-    assert judge(cell(5 * [0], sent=0)).lacking
-    assert not judge(cell(5 * [0], sent=0)).failed
+    assert judge(cell(5 * [0], sent=0)).missing_evidence
+    assert not judge(cell(5 * [0], sent=0)).failures
 
 
 def test_no_valid_repeat_at_all_is_undecided() -> None:
     assessment = judge(cell([0, 0], status=["void", "void"]))
     assert not assessment.passed
-    assert not assessment.failed
-    assert f"{PLACE}, 1000 B: loss <= 0.01: no repeat is valid" in assessment.lacking
+    assert not assessment.failures
+    assert f"{PLACE}, 1000 B: loss <= 0.01: no repeat is valid" in assessment.missing_evidence
 
 
 @pytest.mark.parametrize(("largest_s", "passed"), [(0.2, True), (0.201, False)])
@@ -110,15 +110,15 @@ def test_a_delay_limit_applies_to_every_repeat(largest_s: float, passed: bool) -
     measured_cell = cell(5 * [0], delay_s=[0.01, 0.02, largest_s, 0.01, 0.01])
     assessment = judge(measured_cell, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
     assert assessment.passed == passed
-    assert bool(assessment.failed) == (not passed)
+    assert bool(assessment.failures) == (not passed)
     assert judge(measured_cell).passed
 
 
 def test_a_missing_delay_never_passes() -> None:
     measured_cell = cell(5 * [0], delay_s=[0.01, 0.02, UNKNOWN, 0.01, 0.01])
     assessment = judge(measured_cell, criterion=replace(ONE_PERCENT, max_delay_s=0.2))
-    assert not assessment.failed
-    assert "1 of 5 repeats have no value" in assessment.lacking[0]
+    assert not assessment.failures
+    assert "1 of 5 repeats have no value" in assessment.missing_evidence[0]
     assert judge(measured_cell).passed  # without a delay limit it is not needed
 
 
@@ -127,11 +127,11 @@ def test_a_censored_delay_never_passes() -> None:
     lenient = LinkCriterion(0.5, 0.2)
     measured_cell = cell(5 * [10], delay_sent_s=[0.01, UNKNOWN, 0.01, 0.01, 0.01])
     assessment = judge(measured_cell, criterion=lenient)
-    assert not assessment.failed
-    assert "in 1 of 5 repeats the figure is infinite because of lost items" in assessment.lacking[0]
+    assert not assessment.failures
+    assert "in 1 of 5 repeats the figure is infinite because of lost items" in assessment.missing_evidence[0]
     # The received samples were already late, so it fails whatever the lost ones would have been.
     late = cell(5 * [10], delay_s=5 * [0.3], delay_sent_s=5 * [UNKNOWN])
-    assert judge(late, criterion=lenient).failed
+    assert judge(late, criterion=lenient).failures
 
 
 @pytest.mark.parametrize(
@@ -148,15 +148,15 @@ def test_a_censored_delay_never_passes() -> None:
 def test_a_share_of_repeats_needs_confidence(lost: list[float], passed: bool, failed: bool) -> None:
     assessment = judge(cell(lost), criterion=replace(ONE_PERCENT, share=0.9))
     assert assessment.passed == passed
-    assert bool(assessment.failed) == failed
+    assert bool(assessment.failures) == failed
 
 
 def test_every_cell_must_pass_and_none_may_be_missing() -> None:
     good, bad = cell(5 * [0]), cell(5 * [9], size_bytes=1e6)
-    assert judge(good, bad).failed == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
+    assert judge(good, bad).failures == (f"{PLACE}, 1e+06 B: loss <= 0.01 in 0 of 5 repeats, up to 0.09",)
     expected = {(PLACE, SIZE), (PLACE, 1e6)}
     assessment = candidates.assess_candidate(DDS, [good], expected, ONE_PERCENT)
-    assert assessment.lacking == (f"{PLACE}, 1e+06 B: not measured, although other candidates were",)
+    assert assessment.missing_evidence == (f"{PLACE}, 1e+06 B: not measured, although other candidates were",)
 
 
 def test_the_rank_is_the_loss_of_the_worst_cell_and_then_the_delay() -> None:

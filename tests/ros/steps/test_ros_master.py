@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.backends import registry
 from fieldkit.backends.protocols import Cast
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
@@ -46,7 +46,7 @@ def site(text: str) -> tuple[Site, schema.Document]:
 def test_commands_have_address_of_master_and_own_radio_address() -> None:
     (record,) = steps_of(load_procedure("los"), RecordStep)
     (planned,) = record.jobs(Scene(Protocol.TCP, SHARED, "f"))
-    assert in_shell(planned.job) == (
+    assert shell_line(planned.job) == (
         """bash -c '. /opt/ros/noetic/setup.bash && exec "$@"' bash env ROS_MASTER_URI=http://10.42.0.3:11311 """
         "ROS_HOSTNAME=10.42.0.1 rosbag record --duration=15 -O scan /scan 2> sender-record.log"
     )

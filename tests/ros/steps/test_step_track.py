@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Protocol, Role, Scenario, Topology
@@ -72,7 +72,7 @@ def test_each_robot_records_with_its_recorder_until_stopped() -> None:
     step = track("{sender: {topic: /odom, facing: away}, receiver: {at: {lat: 48.1, lon: 11.5}}}")
     recording, _ = step.jobs(SCENE)
     assert (recording.role, recording.program) == (Role.SENDER, "rosbag")
-    assert in_shell(recording.job).endswith(
+    assert shell_line(recording.job).endswith(
         "rosbag record --duration=914 -O track_sender /odom 2> track_sender.sender-record.log"
     )
     assert recording.job.limit_s > 900

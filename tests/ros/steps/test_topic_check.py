@@ -13,7 +13,7 @@ from fieldkit.steps.scene import CommandResult
 from fieldkit.trial.check import software
 from fieldkit.trial.check.probe import Sections
 from fieldkit.trial.check.report import Report
-from fieldkit.trial.check.software import Probed
+from fieldkit.trial.check.software import ProbeResult
 from tests.helpers.casts import TURTLEBOT, ros_of
 from tests.trial.check.test_check_judges import (
     FAIL,
@@ -29,8 +29,8 @@ from tests.trial.check.test_check_judges import (
 )
 
 
-def probed(sections: Sections) -> Probed:
-    return Probed(sections, variants.expected(TURTLEBOT))
+def probed(sections: Sections) -> ProbeResult:
+    return ProbeResult(sections, variants.expected(TURTLEBOT))
 
 
 def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
@@ -42,7 +42,7 @@ def test_a_robot_without_ros_needs_no_recorder_and_no_topic() -> None:
     assert not any("ros" in " ".join(argv) for argv in software.commands(plan, Role.SENDER).values())
     assert topic_check.can_record(plan, Role.SENDER, probed(sections))
     assert topic_check.battery_of(robot) == ""
-    assert topic_check.recorded(plan, Role.SENDER) == ()
+    assert topic_check.required_topics(plan, Role.SENDER) == ()
 
 
 def test_a_recording_on_a_robot_without_ros_is_rejected() -> None:
@@ -70,19 +70,19 @@ def test_ros_1_without_a_master_is_a_warning() -> None:
     assert "ROS_MASTER_URI" in warned.detail
 
 
-def recorded(count: int, span_s: float) -> RecordingContents:
+def required_topics(count: int, span_s: float) -> RecordingContents:
     return RecordingContents(count, 0, span_s, MappingProxyType({"/scan": count}))
 
 
 @pytest.mark.parametrize(
     ("bag", "status"),
     [
-        (recorded(10, 1.8), OK),
-        (recorded(8, 1.5), OK),
-        (recorded(2, 1.9), WARN),
-        (recorded(30, 1.9), WARN),
-        (recorded(1, 0.0), OK),
-        (recorded(0, 0.0), FAIL),
+        (required_topics(10, 1.8), OK),
+        (required_topics(8, 1.5), OK),
+        (required_topics(2, 1.9), WARN),
+        (required_topics(30, 1.9), WARN),
+        (required_topics(1, 0.0), OK),
+        (required_topics(0, 0.0), FAIL),
         (None, FAIL),
     ],
 )
@@ -101,8 +101,8 @@ def test_a_topic_missing_in_the_profile_has_no_rate() -> None:
 
 
 def test_a_check_records_long_enough_for_the_slowest_topic() -> None:
-    assert topic_check.recorded(PLAN, Role.SENDER) == ("/scan",)
-    assert topic_check.recorded(PLAN, Role.RELAY) == ()
+    assert topic_check.required_topics(PLAN, Role.SENDER) == ("/scan",)
+    assert topic_check.required_topics(PLAN, Role.RELAY) == ()
     assert topic_check.recording(Role.SENDER, SENDER, ["/scan"]).duration == topic_check.RECORD_S
     assert topic_check.recording(Role.RELAY, RELAY, ["/pidrone/battery"]).duration == 2.0, "two messages of 1 Hz"
     topic = ros_of(RELAY.profile).topics[0].model_copy(update={"name": "/slow", "rate": 0.2})

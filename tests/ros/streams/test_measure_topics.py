@@ -33,7 +33,7 @@ def log(sequence: Sequence[int], at_ns: Sequence[int], **changes: int | None) ->
         sent_ns,
         np.array(at_ns, dtype=np.int64),
     )
-    times: dict[str, int | None] = {"begun_ns": START - SECOND, "matched_ns": START - SECOND // 2}
+    times: dict[str, int | None] = {"discovery_start_ns": START - SECOND, "matched_ns": START - SECOND // 2}
     counts = {"refused": 0, "skipped": 0, "foreign": 0}
     return TopicLog(samples, is_complete=True, **{**times, **counts, **changes})  # type: ignore[arg-type]
 

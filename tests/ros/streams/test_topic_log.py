@@ -14,7 +14,7 @@ from fieldkit.ros.streams import topic_samples
 
 def write_log(path: Path) -> bytes:
     log = Log(str(path))
-    log.note(records.BEGUN, 10)
+    log.note(records.DISCOVERY_STARTED, 10)
     log.note(records.MATCHED, 30)
     for sequence in range(3):
         log.note(records.SAMPLE, 105 + 10 * sequence, size=50, sequence=sequence, sent_ns=100 + 10 * sequence)
@@ -29,7 +29,7 @@ def write_log(path: Path) -> bytes:
 def test_logs_of_the_agent_are_read(tmp_path: Path) -> None:
     write_log(tmp_path / "log")
     parsed = topic_samples.read_log(tmp_path / "log")
-    assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
+    assert (parsed.discovery_start_ns, parsed.matched_ns) == (10, 30)
     assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.is_complete) == (1, 6, 1, True)
     assert parsed.samples.sequence.tolist() == [0, 1, 2]
     assert parsed.samples.size_bytes.tolist() == [50, 50, 50]
@@ -64,7 +64,7 @@ def test_zeros_after_the_last_record_are_ignored(
     content = write_log(log)
     log.write_bytes(content[: None if has_end else -topic_samples.RECORD_BYTES] + bytes(zeros))
     parsed = topic_samples.read_log(log)
-    assert (parsed.begun_ns, parsed.matched_ns) == (10, 30)
+    assert (parsed.discovery_start_ns, parsed.matched_ns) == (10, 30)
     assert (parsed.refused, parsed.skipped, parsed.foreign, parsed.is_complete) == (1, 6, 1, has_end)
     assert parsed.samples.sequence.tolist() == [0, 1, 2]
 

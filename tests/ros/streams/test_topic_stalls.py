@@ -15,7 +15,7 @@ from fieldkit.ros.streams import topic_stalls
 from fieldkit.ros.streams.topic_samples import TopicLog
 from tests.ros.streams.test_measure_topics import FLOW, arrived, captures, log, published
 
-EXPECTED = FlowSchedule(interval_s=0.1, lasts_s=9.9)
+EXPECTED = FlowSchedule(interval_s=0.1, duration_s=9.9)
 SECOND = 1_000_000_000
 
 

@@ -14,7 +14,7 @@ from sim_backends.cosim.packet_ledger import ABSENT
 from sim_backends.cosim.policies.registry import BUILTIN, make_policy
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Received
+from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.world.motion import State
 
 NAMES = ("a", "b", "c")
@@ -47,7 +47,7 @@ class ScheduledProgram:
     def next_wake_ns(self) -> int | None:
         return self._wake_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self._wakes.append((now_ns, self._name))
         self._wake_ns = self._next_ns(now_ns)
         return Action()
@@ -70,7 +70,7 @@ def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
     state = State((0.0, 0.0, 0.0))
     for now_ns, names in zip(RECEIVED_AT_NS, receivers, strict=True):
         for name in sorted(names):
-            agents.deliver(name, Received("x", None, now_ns, now_ns))
+            agents.deliver(name, ReceivedDatagram("x", None, now_ns, now_ns))
             programs[name].wake(now_ns, state, ())
         agents.advance(now_ns, now_ns + 9, now_ns + 9)
         for at_ns in range(now_ns, now_ns + 10):
@@ -104,7 +104,7 @@ def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy
     run = Coordinator(Agents(physics, programs), network, make, [("b", "a")]).advance(60 * MS)
     to_late = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
     assert len(to_late) >= 5
-    assert all(fate.assumed[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
+    assert all(fate.assumed_states[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
     assert not any(fate.reason for fate in run.fates.values())
 
 

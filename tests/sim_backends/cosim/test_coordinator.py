@@ -17,7 +17,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action
 from sim_backends.cosim.policies.sync_policy import Situation
 from sim_backends.cosim.run_record import EventDigest, Fate, Run, Window, WindowObserver
-from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
+from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, ReceivedDatagram
 from sim_backends.world.motion import State
 
 NAMES = ("a", "b", "c")
@@ -47,12 +47,12 @@ class ScriptedProgram:
         self._name = name
         self._sends = sorted(sends)[::-1]
         self._numbers: dict[str, int] = {}
-        self.received: list[tuple[int, Received]] = []
+        self.received: list[tuple[int, ReceivedDatagram]] = []
 
     def next_wake_ns(self) -> int | None:
         return self._sends[-1][0] if self._sends else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self.received += [(now_ns, datagram) for datagram in received]
         to = [datagram.source for datagram in received if datagram.payload == "request"]
         datagrams = [self._datagram(name, "reply") for name in to]
@@ -73,7 +73,7 @@ class DelayNetwork:
         self._delays_ns = delays_ns
         self._events: list[tuple[int, int, bool, str]] = []
         self._now_ns = 0
-        self.entered: list[Packet] = []
+        self.entered_fates: list[Packet] = []
 
     def advance(
         self, to_ns: int, packets: Sequence[Packet], states: Mapping[str, State]
@@ -84,7 +84,7 @@ class DelayNetwork:
             delay_ns = self._delays_ns[packet.packet_id % len(self._delays_ns)]
             event = packet.enters_ns + (delay_ns or 0), packet.packet_id, delay_ns is not LOST, packet.destination
             heapq.heappush(self._events, event)
-        self.entered += packets
+        self.entered_fates += packets
         self._now_ns = to_ns
         arrivals, drops = [], []
         while self._events and self._events[0][0] <= to_ns:
@@ -166,8 +166,8 @@ def test_packets_are_delivered_after_they_were_sent_and_decided_once(setting: Re
     lengths_ns = [end_ns - begin_ns for begin_ns, end_ns in pairwise([0, *run.windows_ns])]
     script = islice(cycle(setting.lengths_ns), 1, len(lengths_ns))
     assert lengths_ns[:-1] == list(script), "all windows but the last have the lengths of the policy"
-    assert [packet.packet_id for packet in setting.network.entered] == list(
-        range(1, len(setting.network.entered) + 1)
+    assert [packet.packet_id for packet in setting.network.entered_fates] == list(
+        range(1, len(setting.network.entered_fates) + 1)
     )
     for fate in run.fates.values():
         packet = fate.packet
@@ -198,14 +198,14 @@ class WindowRecorder:
     """An observer that keeps all windows."""
 
     windows: list[Window] = field(default_factory=list)
-    ended: list[tuple[tuple[str, int], int | None]] = field(default_factory=list)
+    decided_fates: list[tuple[tuple[str, int], int | None]] = field(default_factory=list)
 
     def begin(self, states: Mapping[str, State]) -> None:
         self.first = states
 
     def window(self, window: Window) -> None:
         self.windows.append(window)
-        self.ended += [(fate.packet.identity, fate.arrived_ns) for fate in window.ended]
+        self.decided_fates += [(fate.packet.identity, fate.arrived_ns) for fate in window.decided_fates]
 
 
 @given(SETTINGS)
@@ -214,10 +214,10 @@ def test_the_network_assumes_the_states_that_the_policy_determines(setting: Repe
     setting.run(watching)
     for window in watching.windows:
         assumed_at_ns = window.end_ns if setting.flags[1] else window.begin_ns
-        for fate in window.entered:
-            for assumed, true in zip(fate.assumed, fate.true, strict=True):
-                assert assumed.position_m[0] == assumed_at_ns // setting.step_ns * setting.step_ns
-                assert true.position_m[0] == fate.packet.sent_ns // setting.step_ns * setting.step_ns
+        for fate in window.entered_fates:
+            for assumed_states, true_states in zip(fate.assumed_states, fate.true_states, strict=True):
+                assert assumed_states.position_m[0] == assumed_at_ns // setting.step_ns * setting.step_ns
+                assert true_states.position_m[0] == fate.packet.sent_ns // setting.step_ns * setting.step_ns
 
 
 @given(SETTINGS)
@@ -233,15 +233,15 @@ def test_an_observer_receives_everything_once_and_in_order(setting: RepeatableRu
     run = setting.run(watching)
     assert [window.end_ns for window in watching.windows] == run.windows_ns
     assert [window.begin_ns for window in watching.windows] == [0, *run.windows_ns[:-1]]
-    entered = [fate for window in watching.windows for fate in window.entered]
-    assert entered == list(run.fates.values())
+    entered_fates = [fate for window in watching.windows for fate in window.entered_fates]
+    assert entered_fates == list(run.fates.values())
     decided: list[Fate] = [fate for fate in run.fates.values() if fate.is_decided]
-    assert sorted(watching.ended) == sorted((fate.packet.identity, fate.arrived_ns) for fate in decided)
+    assert sorted(watching.decided_fates) == sorted((fate.packet.identity, fate.arrived_ns) for fate in decided)
     for part, total_s in run.wall_s.items():
         assert sum(window.wall_s[part] for window in watching.windows) == pytest.approx(total_s)
     before = watching.first
     for window in watching.windows:
-        assert window.assumed == (window.states if setting.flags[1] else before)
+        assert window.assumed_states == (window.states if setting.flags[1] else before)
         before = window.states
 
 
@@ -259,10 +259,10 @@ SENT = Packet(7, "a", "b", 10, ("a to b", 3), 100, 110, "udp")
 ARRIVED = Fate(SENT, (ORIGIN, ORIGIN), (ORIGIN, ORIGIN), arrived_ns=120, counted_ns=130)
 
 
-def digest(entered: Sequence[Fate], left_network: Sequence[Fate], end_ns: int = 130) -> str:
+def digest(entered_fates: Sequence[Fate], left_network: Sequence[Fate], end_ns: int = 130) -> str:
     """Return the digest of one window."""
     event_digest = EventDigest()
-    event_digest.add_window(end_ns, entered, left_network)
+    event_digest.add_window(end_ns, entered_fates, left_network)
     return event_digest.hexdigest()
 
 

@@ -23,9 +23,9 @@ from sim_backends.cosim.policies.sync_policy import Situation, SyncPolicy
 from sim_backends.cosim.policies.window_policies import EventDriven, SlidingWindow
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.run_record import WindowObserver
-from sim_backends.cosim.wall_time import Stall, stalled
+from sim_backends.cosim.wall_time import Stall, with_stall
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, Received
+from sim_backends.network.packets import Arrival, Datagram, Drop, Packet, ReceivedDatagram
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import State, WayPoints
 
@@ -70,9 +70,9 @@ def pair(
 def test_a_timeout_names_the_federate_and_the_request(federate: str, message: str) -> None:
     stall = Stall(7 * MS, FOR_EVER_S, LIMIT_S)
     hanging = {
-        "physics": lambda: pair(physics=stalled(paths(), stall)),
-        "network": lambda: pair(network=stalled(Disc(1.0, MS), stall)),
-        "program": lambda: pair(program=stalled(periodic(), stall)),
+        "physics": lambda: pair(physics=with_stall(paths(), stall)),
+        "network": lambda: pair(network=with_stall(Disc(1.0, MS), stall)),
+        "program": lambda: pair(program=with_stall(periodic(), stall)),
     }[federate]()
     with pytest.raises(UnansweredError) as raised:
         hanging.advance(1000 * MS)
@@ -99,7 +99,9 @@ def test_an_error_of_a_policy_that_looks_ahead_has_the_time_that_the_window_has_
 def test_a_stall_below_the_deadline_only_adds_waiting_time(part: str) -> None:
     stall = Stall(7 * MS, 0.03, LIMIT_S)
     waiting = (
-        pair(physics=stalled(paths(), stall)) if part == "agents" else pair(network=stalled(Disc(1.0, MS), stall))
+        pair(physics=with_stall(paths(), stall))
+        if part == "agents"
+        else pair(network=with_stall(Disc(1.0, MS), stall))
     ).advance(1000 * MS)
     plain = pair().advance(1000 * MS)
     assert waiting.wall_s["wait"] >= 0.03
@@ -109,14 +111,14 @@ def test_a_stall_below_the_deadline_only_adds_waiting_time(part: str) -> None:
 
 
 def test_a_stalled_federate_can_be_copied_and_has_its_attributes() -> None:
-    copied = copy.deepcopy(stalled(paths(), Stall(7 * MS, 0.0)))
+    copied = copy.deepcopy(with_stall(paths(), Stall(7 * MS, 0.0)))
     assert copied.step_ns == paths().step_ns
     assert not hasattr(copied, "next_event_ns")
 
 
 def test_all_stalls_of_one_federate_count_as_waiting_time() -> None:
     network = Disc(1.0, MS)
-    twice = stalled(stalled(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
+    twice = with_stall(with_stall(network, Stall(7 * MS, 0.01)), Stall(20 * MS, 0.02))
     assert pair(network=twice).advance(1000 * MS).wall_s["wait"] >= 0.03
 
 
@@ -134,7 +136,7 @@ class FailingFederate:
             raise KeyError("wheel")
         return dict.fromkeys("ab", State((0.0, 0.0, 0.0)))
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         raise RuntimeError("no plan")
 
     def next_wake_ns(self) -> int:
@@ -245,7 +247,7 @@ def test_a_datagram_to_an_unknown_agent_or_with_a_used_number_is_refused() -> No
         pair(program=periodic("c")).advance(1000 * MS)
 
     class DuplicateSender(Periodic):
-        def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+        def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
             super().wake(now_ns, own_state, received)
             return Action((Datagram("b", 10, "ab", 7),))
 

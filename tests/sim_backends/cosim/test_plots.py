@@ -57,7 +57,7 @@ def test_each_curve_has_one_label_and_zeros_have_a_separate_line() -> None:
 
 def test_obstacles_are_drawn_and_paths_have_an_arrow() -> None:
     plain = run_figure("a run", PATHS_M, FLOWS, "svg").decode()
-    wall = ObstacleOutline([(0.0, 1.0), (2.0, 1.0), (2.0, 1.2), (0.0, 1.2)], is_light=False)
+    wall = ObstacleOutline([(0.0, 1.0), (2.0, 1.0), (2.0, 1.2), (0.0, 1.2)], is_passable=False)
     with_wall = run_figure("a run", PATHS_M, FLOWS, "svg", [wall]).decode()
     assert with_wall.count("<path") == plain.count("<path") + 1
     assert texts(with_wall.encode()) == texts(plain.encode()), "the axes are unchanged"
@@ -75,8 +75,8 @@ def test_arrows_have_the_last_direction_of_travel() -> None:
 def test_the_park_has_light_outlines_below_roofs_and_dark_ones_of_boxes() -> None:
     park = load_world("baylands")
     park_outlines = list(outlines(park))
-    assert any(outline.is_light for outline in park_outlines)
-    assert any(not outline.is_light for outline in park_outlines)
+    assert any(outline.is_passable for outline in park_outlines)
+    assert any(not outline.is_passable for outline in park_outlines)
     assert len(park_outlines) == sum(1 for obstacle in park.obstacles for _ in obstacle.parts())
 
 

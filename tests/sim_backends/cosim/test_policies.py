@@ -31,7 +31,7 @@ from sim_backends.cosim.policies.window_policies import (
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.run_record import Run
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import STILL, State, WayPoints
 
@@ -132,7 +132,11 @@ def test_exact_policies_agree_in_each_packet_and_only_sliding_windows_are_late()
     reference, merged = passing(EventDriven()), passing(VariableStepped())
     for identity, fate in reference.fates.items():
         other = merged.fates[identity]
-        assert (fate.arrived_ns, fate.reason, fate.assumed) == (other.arrived_ns, other.reason, other.assumed)
+        assert (fate.arrived_ns, fate.reason, fate.assumed_states) == (
+            other.arrived_ns,
+            other.reason,
+            other.assumed_states,
+        )
         held_m = 1.7 * (fate.packet.sent_ns % MS) / 1e9
         assert position_error_m(fate) == pytest.approx(held_m, abs=1e-9), "states are held for a step"
         assert not fate.late_ns
@@ -289,7 +293,7 @@ def test_error_bounded_keeps_its_bound_for_any_motion_within_the_limits(
         7 * MS,
     )
     if moves:
-        situation.assumed = situation.states
+        situation.assumed_states = situation.states
     try:
         end_ns = ErrorBounded(bound_m, 100.0).next_window(situation)
     except PolicyError:
@@ -321,7 +325,7 @@ class ReplyingProgram:
     def next_wake_ns(self) -> int | None:
         return 0 if self._begins else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self._begins = False
         self.received_ns += [now_ns for _ in received]
         self._left -= 1
@@ -356,7 +360,7 @@ class EndlessWakes:
     def next_wake_ns(self) -> int:
         return 5
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         return Action()
 
 

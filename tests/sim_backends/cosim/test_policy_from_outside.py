@@ -82,7 +82,7 @@ def test_a_policy_cannot_replace_a_built_in_one(install: Install) -> None:
 def test_errors_of_its_code_name_the_policy(install: Install) -> None:
     source, name, target = page_example()
     install(source.replace("window_s=0.001,", "window,"), name, target.replace("contact", "contact_argument"))
-    with pytest.raises(ConfigurationError, match=f"the sync policy '{name}' cannot be made: TypeError"):
+    with pytest.raises(ConfigurationError, match=f"the sync policy '{name}' cannot be created: TypeError"):
         registry.make_policy(name)
 
 

@@ -17,7 +17,7 @@ from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.cosim.run_record import WindowObserver
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import State, WayPoints
 
@@ -35,7 +35,7 @@ class BallProgram:
     def next_wake_ns(self) -> int | None:
         return BEGINS_NS if self._begins else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self._begins = False
         self.woken_ns.append(now_ns)
         if not self._remaining:

@@ -378,8 +378,8 @@ def test_given_path_losses_have_a_direction() -> None:
     assert channel.snr_db(0, 1) == pytest.approx(17 - 90 - noise_dbm)
     assert channel.snr_db(1, 0) == pytest.approx(17 - 100 - noise_dbm)
     assert channel.snr_db(1, 2) == before_db[1, 2]
-    assert not channel.linked(0, 1)
-    assert not channel.linked(1, 0), "at -83 dBm, below the sensitivity"
+    assert not channel.are_linked(0, 1)
+    assert not channel.are_linked(1, 0), "at -83 dBm, below the sensitivity"
     channel.use_path_losses({})
     assert {pair: channel.snr_db(*pair) for pair in before_db} == before_db
 

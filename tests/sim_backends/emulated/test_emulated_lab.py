@@ -26,7 +26,7 @@ from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
 from fieldkit.remote.shell import Shell
 from fieldkit.remote.ssh import SshShell
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
@@ -91,7 +91,7 @@ def in_ros(shell: Shell, *argv: str) -> str:
 
 
 def messages_in(bag: Path, topic: str) -> list[Any]:
-    store = shipped().ros1
+    store = standard_types().ros1
     with Reader(bag) as reader:
         chosen = [connection for connection in reader.connections if connection.topic == topic]
         return [store.deserialize_ros1(data, connection.msgtype) for connection, _, data in reader.messages(chosen)]

@@ -20,7 +20,7 @@ from fieldkit.config.site import Site
 from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.model import Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import emulated_options, placement, requirements
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
@@ -33,7 +33,7 @@ from sim_backends.ros1 import framing
 from sim_backends.world.world import load_world
 from tests.helpers.labs import replace_text
 
-STORE = shipped().ros1
+STORE = standard_types().ros1
 FIELDS = (
     ("sensor_msgs/LaserScan.angle_min", 0.0),
     ("sensor_msgs/LaserScan.time_increment", 0.2 / 360),

@@ -21,7 +21,7 @@ from fieldkit.report import figures
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions
 from sim_backends.emulated.interactive_lab import members_of, overview
-from sim_backends.emulated.placement import moved_m, square_m
+from sim_backends.emulated.placement import destination_m, square_m
 from sim_backends.world.shapes import Box, Cylinder, Solids
 from sim_backends.world.world import World, load_world
 
@@ -74,7 +74,7 @@ obstacles:
 )
 def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> None:
     hill = validate(parse(HILL, source="hill.yaml"), World)
-    assert moved_m((5, 5, 0.5), to, hill) == pytest.approx(expected_m)
+    assert destination_m((5, 5, 0.5), to, hill) == pytest.approx(expected_m)
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_a_robot_moves_over_the_ground(to: Destination, expected_m: Vector) -> N
 )
 def test_a_robot_stays_in_the_world_and_above_its_ground(to: Destination, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
-        moved_m((5, 5, 0.5), to, validate(parse(HILL, source="hill.yaml"), World))
+        destination_m((5, 5, 0.5), to, validate(parse(HILL, source="hill.yaml"), World))
 
 
 def test_an_overview_survives_packing_and_unpacking() -> None:

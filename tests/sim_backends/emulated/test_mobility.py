@@ -18,8 +18,8 @@ from fieldkit.core.units import parse_distance
 from sim_backends.emulated.medium.medium_client import MediumClient
 from sim_backends.emulated.mobility import STEP_M, Mobility
 from sim_backends.emulated.nodes import EmulatedRobot
+from sim_backends.emulated.ros.motion_record import RecordedMotion
 from sim_backends.emulated.ros.own_motion import AssignedPath
-from sim_backends.emulated.ros.steered import Steered
 from sim_backends.world.motion import STILL
 from sim_backends.world.world import load_world
 from tests.helpers.casts import CAST
@@ -198,16 +198,16 @@ class SteeringRobot:
 
     spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
     paths: list[AssignedPath] = field(default_factory=list)
-    recorded: Steered | None = None
+    recorded: RecordedMotion | None = None
 
     def move(self, path: AssignedPath) -> None:
         self.paths.append(path)
 
-    def steered(self) -> Steered | None:
+    def recorded_motion(self) -> RecordedMotion | None:
         return self.recorded
 
     def record(self, place_m: Vector, velocity_m_s: Vector = STILL) -> None:
-        self.recorded = Steered(time.monotonic_ns(), self.paths[-1].began_ns, place_m, velocity_m_s)
+        self.recorded = RecordedMotion(time.monotonic_ns(), self.paths[-1].start_ns, place_m, velocity_m_s)
 
 
 @pytest.fixture
@@ -234,7 +234,7 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
         assert medium.position_of(Role.RELAY) == (7.0, 8.0, 12.0)
         mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
         assert medium.position_of(Role.RELAY) == place
-        robot.recorded = Steered(time.monotonic_ns(), robot.paths[0].began_ns, (1.0, 2.0, 3.0))
+        robot.recorded = RecordedMotion(time.monotonic_ns(), robot.paths[0].start_ns, (1.0, 2.0, 3.0))
         mobility.set_out_of_range(None)
         assert medium.position_of(Role.RELAY) == place, "motion from before the placement is ignored"
     assert len(medium.calls) > calls

@@ -16,7 +16,7 @@ from fieldkit.core.deadline import Deadline
 from fieldkit.core.model import Fault, FaultKind, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
 from fieldkit.remote.command import with_environment
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice
@@ -118,7 +118,7 @@ def test_bagpy_reads_a_recording_as_rosbags_does(emulation: EmulatedTestbed, tmp
         types = {connection.topic: connection.msgtype.replace("/msg/", "/") for connection in reader.connections}
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
         connections = [connection for connection in reader.connections if connection.topic == "/odom"]
-        store = shipped().ros1
+        store = standard_types().ros1
         odom: list[Any] = [
             store.deserialize_ros1(data, connection.msgtype)
             for connection, _, data in reader.messages(connections=connections)

@@ -23,7 +23,7 @@ from fieldkit.core.model import Fault, FaultKind, Leg, Move, Placement, Role, Sc
 from fieldkit.core.units import parse_distance
 from fieldkit.ros.interfaces import topics
 from fieldkit.ros.interfaces.qos import PROFILES
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import testbed
 from sim_backends.emulated.backend import DEFAULT_SITE, EmulatedBackend
 from sim_backends.emulated.emulated_options import EmulatedOptions, RosChoice, load_options
@@ -112,7 +112,7 @@ def listening(
     """Yield the messages, of rosbags' types, that a node of DDS or Zenoh on the drone receives."""
     network_settings = {"address": emulation.robots[Role.RELAY].spec.ip, "node": "ears", **network}
     quality = offered_qos.LATCHED if topic == "/tf_static" else PROFILES["sensor_data"]
-    description = topics.describe(shipped(), topic, kind, quality, domain=0, node="ears")
+    description = topics.describe(standard_types(), topic, kind, quality, domain=0, node="ears")
     command = (
         sys.executable,
         str(WIRE_END),
@@ -127,7 +127,8 @@ def listening(
         assert process.stdout is not None
         try:
             yield (
-                shipped().ros2.deserialize_cdr(bytes.fromhex(line), description["type"]) for line in process.stdout
+                standard_types().ros2.deserialize_cdr(bytes.fromhex(line), description["type"])
+                for line in process.stdout
             )
         finally:
             process.terminate()
@@ -163,7 +164,7 @@ def test_a_real_ros_2_lists_the_topics_with_their_types_and_hashes(report: Mappi
         topic: [kind] for topic, kind in expected.items()
     }
     assert report["latched"] == ["TRANSIENT_LOCAL"]
-    assert report["hashes"] == {topic: [shipped().get(kind).rihs01] for topic, kind in expected.items()}
+    assert report["hashes"] == {topic: [standard_types().get(kind).rihs01] for topic, kind in expected.items()}
 
 
 @pytest.mark.emulated
@@ -353,8 +354,8 @@ def test_a_router_outside_the_cast_is_rejected() -> None:
 @pytest.mark.parametrize(
     ("ros2", "message"),
     [
-        ("{discovery: router}", "require each other"),
-        ("{router: duckiedrone-1}", "require each other"),
+        ("{discovery: router}", "must be given together"),
+        ("{router: duckiedrone-1}", "must be given together"),
         ("{discovery: router, router: drone}", "emulated.ros2.router names 'drone', which the lab does not have"),
         ("{discovery: magic}", "emulated.ros2.discovery"),
     ],

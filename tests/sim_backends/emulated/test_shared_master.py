@@ -154,14 +154,14 @@ def test_a_robot_alone_has_its_own_master() -> None:
         "rosmaster",
         "ros_relay",
     ]
-    assert spec.registered == ("/scan", "/odom", "/tf", "/imu", "/battery_state")
+    assert spec.registered_topics == ("/scan", "/odom", "/tf", "/imu", "/battery_state")
 
 
 def test_the_first_of_equal_robots_publishes_and_the_relay_runs_roscore() -> None:
     cast = backend().cast(Topology.MASTER)
     keys = KeyPair.make(), KeyPair.make()
     specs = {role: robot_spec(cast, role, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1]) for role in cast}
-    assert {role: bool(spec.registered) for role, spec in specs.items()} == {
+    assert {role: bool(spec.registered_topics) for role, spec in specs.items()} == {
         Role.SENDER: True,
         Role.RECEIVER: False,
         Role.RELAY: True,

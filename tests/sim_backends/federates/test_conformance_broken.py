@@ -197,8 +197,8 @@ class FliesForward(ChangesCommands):
 
 
 class IgnoresFrom(_Run):
-    def _advance_physics(self, current: _FederateCopy, body: bytes) -> bytes:
-        return super()._advance_physics(current, body[:8] + bytes(8) + body[16:])
+    def _advance_physics(self, federate_copy: _FederateCopy, body: bytes) -> bytes:
+        return super()._advance_physics(federate_copy, body[:8] + bytes(8) + body[16:])
 
 
 Outcome = tuple[list[Arrival], list[Drop]]
@@ -401,7 +401,7 @@ PHYSICS_CASES = [
     BrokenFederate("start", physics(StartsElsewhere), "ann starts 1 m away"),
     BrokenFederate("remainders", replace(physics(Carts), alter=later(MessageKind.STATES, 1)), "instead of 0 ns"),
     BrokenFederate("remainders", physics(LosesAnAgent), "there is no state of bob"),
-    BrokenFederate("remainders", physics(AddsAnAgent), "an agent appeared, dan"),
+    BrokenFederate("remainders", physics(AddsAnAgent), "the agent dan appeared"),
     BrokenFederate("remainders", replace(physics(Carts), alter=silent, deadline_s=0.2), "has not answered for 0.2 s"),
     BrokenFederate("remainders", physics(IsNotFinite), "with a malformed frame: byte 32: the state of agent 0"),
     BrokenFederate("drift", physics(DriftingPhysics), "windows instead of one: the positions of ann differ"),
@@ -409,7 +409,9 @@ PHYSICS_CASES = [
     BrokenFederate("motion", physics(JumpingPhysics), "moved by 3 m in a step"),
     BrokenFederate("motion", physics(IgnoresCommands), "moved by 0 m in 1000 steps"),
     BrokenFederate("limits", physics(HasWrongLimits), "its limit of 0.1 m/s^2 allows"),
-    BrokenFederate("command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command from 100000000 ns on"),
+    BrokenFederate(
+        "command_time", replace(physics(Carts), run_class=IgnoresFrom), "a command that applies from 100000000 ns"
+    ),
     BrokenFederate(
         "unknown_command", replace(physics(Carts), alter=as_answer(MessageKind.STATES)), "it must refuse a command"
     ),
@@ -421,7 +423,7 @@ PHYSICS_CASES = [
         "lifetimes", physics(LosesAnotherAgent, agents_disappear=True), "bob, which is always present, has no"
     ),
     BrokenFederate(
-        "lifetimes", physics(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from the start"
+        "lifetimes", physics(AppearsElsewhere, agents_disappear=True), "ann appears 2 m away from its requested start"
     ),
     BrokenFederate("fork", physics(IsShared), "the original"),
     BrokenFederate("drive_axes", physics(SwapsAxes), "0 rad, and moved by (0, 0.6, 0) m instead of 0.6 m east"),
@@ -458,7 +460,7 @@ NETWORK_CASES = [
     BrokenFederate("bye", replace(physics(DelayNetwork), stays=True), "it has not closed the connection"),
     BrokenFederate("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
     BrokenFederate(
-        "exactly_once", replace(physics(DelayNetwork), alter=later(MessageKind.OUTCOMES, 1)), "it advanced to"
+        "exactly_once", replace(physics(DelayNetwork), alter=later(MessageKind.OUTCOMES, 1)), "but advanced to"
     ),
     BrokenFederate("exactly_once", physics(net(lambda _, arrived, drops, to_ns: ([], drops))), "neither arrived nor"),
     BrokenFederate(
@@ -514,7 +516,7 @@ NETWORK_CASES = [
     BrokenFederate("fork", physics(SharedNet), "the copy and the original"),
     BrokenFederate("next_event", physics(AnnouncesTooLate), "before the announced next event"),
     BrokenFederate("next_event", physics(AnnouncesDropsTooLate), "packet 2 was dropped until 4000000 ns"),
-    BrokenFederate("next_event", physics(AnnouncesNothing), "it has no next event, and packets [1, 2, 3] neither"),
+    BrokenFederate("next_event", physics(AnnouncesNothing), "it has no next event, but packets [1, 2, 3] neither"),
     BrokenFederate("seed", physics(IgnoresSeed), "4 seeds gave the same arrivals and drops"),
 ]
 
@@ -545,8 +547,8 @@ def test_each_check_has_a_broken_federate() -> None:
 @pytest.mark.parametrize(
     ("make", "check", "message"),
     [
-        (DelayNetwork, "seed", "no random losses were seen"),
-        (LosesEverySecond, "seed", "no random losses were seen"),
+        (DelayNetwork, "seed", "no random losses occurred"),
+        (LosesEverySecond, "seed", "no random losses occurred"),
         (LosesInOrder, "removed_packets", "had another fate without other packets"),
     ],
 )

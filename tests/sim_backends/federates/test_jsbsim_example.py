@@ -15,7 +15,7 @@ from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.federates.conformance.probe import Target
 from sim_backends.federates.conformance.suite import checks, run_check
 from sim_backends.federates.frames import PHYSICS
-from sim_backends.federates.named import PythonFederate, named
+from sim_backends.federates.named import PythonFederate, named_federate
 from sim_backends.physics.body import Velocity
 from sim_backends.world.world import load_world
 from tests.helpers.federate_pairs import Pair
@@ -40,7 +40,7 @@ def _package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def federate() -> PythonFederate:
-    jsbsim = named("jsbsim", PHYSICS)
+    jsbsim = named_federate("jsbsim", PHYSICS)
     assert isinstance(jsbsim, PythonFederate)
     return jsbsim
 

@@ -72,7 +72,7 @@ def test_builtin_names_the_built_in_federates() -> None:
     [
         (NETWORK, "airwaves", "airwaves needs libair", "apt-get install libair"),
         (PHYSICS, "airwaves", "airwaves is a network, not a physics", "use --network airwaves"),
-        (PHYSICS, "cart", "there is no physics and no program 'cart'", "did you mean 'carts'?"),
+        (PHYSICS, "cart", "there is no physics and no program with the name 'cart'", "did you mean 'carts'?"),
         (PHYSICS, "wrong", "it is not a ProgramFederate or PythonFederate", plugins.REMEDY),
     ],
 )

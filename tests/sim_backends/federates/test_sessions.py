@@ -146,7 +146,7 @@ def test_a_federate_that_reports_that_it_computes_may_take_longer(monkeypatch: p
 @pytest.mark.parametrize(
     ("number", "message"),
     [
-        (signal.SIGKILL, "the connection was closed; its last time is 0 s; it was ended by SIGKILL"),
+        (signal.SIGKILL, "the connection was closed; its last time is 0 s; it was terminated by SIGKILL"),
         (signal.SIGSTOP, "has not answered for 2 s: request to advance from 0 s to 0.003 s"),
     ],
 )

@@ -133,6 +133,6 @@ def test_an_impossible_run_is_refused(changes: dict[str, object], message: str) 
 
 
 def test_it_is_found_by_its_name() -> None:
-    from sim_backends.federates.named import named  # noqa: PLC0415 (its entry point is under test)
+    from sim_backends.federates.named import named_federate  # noqa: PLC0415 (its entry point is under test)
 
-    assert isinstance(named("mujoco", PHYSICS), PythonFederate)
+    assert isinstance(named_federate("mujoco", PHYSICS), PythonFederate)

@@ -223,8 +223,8 @@ class BroadcastTransport:
     def receive(self, host: str, packet: IpPacket) -> None:
         self.received.append((self._wire.now_ns, host, packet.body))
 
-    def lost(self, packet: IpPacket, reason: str) -> None:
-        raise AssertionError("lost must not be called for broadcasts")
+    def record_loss(self, packet: IpPacket, reason: str) -> None:
+        raise AssertionError("record_loss must not be called for broadcasts")
 
 
 def broadcast(places_m: dict[str, tuple[float, float, float]], sent: Sequence[Packet]) -> list[tuple[int, str, int]]:
@@ -278,7 +278,7 @@ def test_simultaneous_events_run_in_the_documented_order() -> None:
         def receive(self, host: str, packet: IpPacket) -> None:
             order.append(f"gets {packet.identity[1]}")
 
-        def lost(self, packet: IpPacket, reason: str) -> None:
+        def record_loss(self, packet: IpPacket, reason: str) -> None:
             order.append(f"loses {packet.identity[1]}: {reason}")
 
     net = network(

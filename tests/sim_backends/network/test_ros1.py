@@ -183,7 +183,7 @@ def test_a_subscriber_without_messages_gives_up_and_reconnects() -> None:
     received_ns = wire.delivered[0]
     assert probes_ns == [received_ns + (60 + 10 * number) * SECOND for number in range(9)]
     # The publisher's TCP retries for longer, on a connection that the subscriber has given up.
-    assert wire.dropped == {1: "the subscriber has given this connection up"}
+    assert wire.dropped == {1: "the subscriber has given up this connection"}
     assert list(wire.delivered) == [0, 2]
 
 

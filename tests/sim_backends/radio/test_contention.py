@@ -17,9 +17,9 @@ class EventLog:
 def test_simultaneous_events_run_in_the_order_of_scheduling() -> None:
     event_log = EventLog()
     events = EventQueue(event_log.record)
-    events.at(10, event_log.record, "first")
+    events.schedule(10, event_log.record, "first")
     events.schedule_start(10, 1)
-    events.at(10, event_log.record, "third")
+    events.schedule(10, event_log.record, "third")
     events.schedule_start(10, 2)
     events.schedule_start(10, 1)
     events.advance(10)
@@ -41,7 +41,7 @@ def test_a_rescheduled_start_happens_once() -> None:
 
 def test_a_call_may_schedule_another_for_the_same_time() -> None:
     event_log = EventLog()
-    events = EventQueue(lambda at_ns, index: events.at(at_ns, event_log.record, index))
+    events = EventQueue(lambda at_ns, index: events.schedule(at_ns, event_log.record, index))
     events.schedule_start(10, 3)
     events.advance(10)
     assert event_log.events == [(10, 3)]
@@ -59,7 +59,7 @@ def test_events_run_in_order_of_time_and_then_of_scheduling(
             events.schedule_start(at_ns, index)
             expected[index] = at_ns, order
         else:
-            events.at(at_ns, event_log.record, f"event {order}")
+            events.schedule(at_ns, event_log.record, f"event {order}")
             expected[f"event {order}"] = at_ns, order
     for now_ns in range(0, 20 + step_ns, step_ns):
         events.advance(now_ns)

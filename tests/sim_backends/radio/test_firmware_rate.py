@@ -9,7 +9,7 @@ from fieldkit.config.profiles import Radio
 from fieldkit.config.wifi_phy import WifiRateControl
 from sim_backends.radio.antennas import Antenna, antenna_of, decode_antenna
 from sim_backends.radio.error_rates import packet_error
-from sim_backends.radio.firmware_rate import FirmwareRate, ladder, required_db
+from sim_backends.radio.firmware_rate import FirmwareRate, required_db, useful_modes
 from sim_backends.radio.frames import TransmissionAttempt, decibel
 from sim_backends.radio.high_throughput import PhyCapability, common_modes, format_modes
 from sim_backends.radio.modes import CW_MIN, SLOT_NS, WifiMode, response_ns
@@ -50,7 +50,7 @@ def test_losses_lower_the_mode_one_step_per_interval_and_success_raises_it_again
 
 
 def test_no_step_of_the_ladder_is_slower_or_needs_a_weaker_signal_than_the_one_below() -> None:
-    steps = ladder(common_modes(VHT80, VHT80))
+    steps = useful_modes(common_modes(VHT80, VHT80))
     assert [mode.rate_bit_s for mode in steps] == sorted({mode.rate_bit_s for mode in steps})
     assert [required_db(mode) for mode in steps] == sorted(required_db(mode) for mode in steps)
     for mode in common_modes(VHT80, VHT80):

@@ -27,7 +27,7 @@ def test_rates_are_those_of_the_standard() -> None:
 
 @MODES
 def test_data_bits_per_symbol_follow_from_modulation_and_code(mode: WifiMode) -> None:
-    subcarriers = 52 if mode.ht else 48
+    subcarriers = 52 if mode.is_high_throughput else 48
     bits = {"BPSK": 1, "QPSK": 2, "16-QAM": 4, "64-QAM": 6}[mode.modulation]
     assert mode.bits_per_symbol == subcarriers * bits * mode.code_rate
 

@@ -293,7 +293,7 @@ def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) ->
 
 def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
     class UnlinkedPowers(FixedPowers):
-        def linked(self, transmitter: int, receiver: int) -> bool:
+        def are_linked(self, transmitter: int, receiver: int) -> bool:
             return False
 
     wifi: Wifi[int] = Wifi(UnlinkedPowers("ab", G54), 1)

@@ -42,11 +42,11 @@ class Protecting(FixedPowers):
 
     @override
     def ifs_ns(self, station: int) -> int:
-        return self.band.best_effort_aifs_ns if self.mode.ht else self.band.difs_ns
+        return self.band.best_effort_aifs_ns if self.mode.is_high_throughput else self.band.difs_ns
 
     @override
     def ampdu_limits(self, transmitter: int, receiver: int) -> AmpduLimits | None:
-        return AMPDU_LIMITS["HT"] if self.mode.ht else None
+        return AMPDU_LIMITS["HT"] if self.mode.is_high_throughput else None
 
 
 def goodput(channel: Protecting, senders: Sequence[str], *, seconds: float, queued: int = 150) -> float:
@@ -64,7 +64,7 @@ def exchange_ns(mode: WifiMode, size_bytes: int, answer_bytes: int) -> tuple[int
 def test_goodput_of_one_station_equals_the_closed_form() -> None:
     """Mean backoff of 7.5 slots, then RTS, CTS, data and its answer."""
     for mode, size_bytes, answer_bytes, frames in ((HT20_7, 1072 * FRAMES - 2, 32, FRAMES), (G54, 1064, 14, 1)):
-        ifs_ns = BAND.best_effort_aifs_ns if mode.ht else BAND.difs_ns
+        ifs_ns = BAND.best_effort_aifs_ns if mode.is_high_throughput else BAND.difs_ns
         _, busy_ns = exchange_ns(mode, size_bytes, answer_bytes)
         expected = frames * 8000 / (ifs_ns + CW_MIN / 2 * SLOT_NS + busy_ns) * 1e9
         assert goodput(Protecting("ar", mode), ["a"], seconds=1.0) == pytest.approx(expected, rel=0.02)

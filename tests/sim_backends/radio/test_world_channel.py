@@ -30,8 +30,8 @@ def link_states(channel: WorldChannel) -> list[tuple[list[float], list[int], lis
     return [
         (
             channel.powers_mw(first, 10**12),
-            [channel.delay_ns(first, second) for second in stations if channel.linked(first, second)],
-            [channel.linked(first, second) for second in stations],
+            [channel.delay_ns(first, second) for second in stations if channel.are_linked(first, second)],
+            [channel.are_linked(first, second) for second in stations],
         )
         for first in stations
     ]
@@ -141,7 +141,7 @@ def test_links_of_many_moving_stations_are_computed_only_for_senders(monkeypatch
     assert not computed_counts
     channel.powers_mw(2, 100)
     assert computed_counts == [19]
-    channel.linked(2, 0)
+    channel.are_linked(2, 0)
     channel.delay_ns(2, 1)
     assert computed_counts == [19]
     channel.powers_mw(0, 100)

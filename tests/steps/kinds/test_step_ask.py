@@ -134,7 +134,7 @@ def test_unknown_answer_leaves_column_empty_and_repeat_valid(tmp_path: Path) -> 
     for operator in (ScriptedOperator("-"), None):
         step = ask(WIND)
         view = run_and_view(step, tmp_path / str(operator is None), operator)
-        assert step.measure(view).missing == {"wind": "the operator did not know"}
+        assert step.measure(view).missing == {"wind": "the operator answered: unknown"}
         assert not list(step.check(view))
 
 

@@ -6,7 +6,7 @@ from typing import cast
 import pytest
 
 from fieldkit.backends.protocols import Robot, Testbed
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.core import model
 from fieldkit.core.errors import ConfigurationError, LinkError
@@ -50,7 +50,7 @@ def fault(text: str) -> FaultStep:
 
 
 def lines(step: FaultStep, scene: Scene = SCENE) -> list[tuple[Role, str]]:
-    return [(planned.role, in_shell(planned.job)) for planned in step.jobs(scene)]
+    return [(planned.role, shell_line(planned.job)) for planned in step.jobs(scene)]
 
 
 @pytest.mark.parametrize(

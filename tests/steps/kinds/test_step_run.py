@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
@@ -49,7 +49,7 @@ def test_command_is_split_into_words_with_addresses() -> None:
     assert planned.program == "vendorctl"
     assert planned.job.argv == ("vendorctl", "of the", "10.42.0.1", "--json")
     assert (planned.job.stdout, planned.job.log, planned.job.limit_s) == ("battery.json", "receiver-run.log", 5.0)
-    assert in_shell(planned.job) == (
+    assert shell_line(planned.job) == (
         "vendorctl 'of the' 10.42.0.1 --json > battery.json 2> receiver-run.log  # at most 1048576 bytes of each"
     )
     assert run_step(BATTERY).roles() == {Role.RECEIVER, Role.SENDER}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldkit.cli.dry_run import in_shell
+from fieldkit.cli.dry_run import shell_line
 from fieldkit.config import schema
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError, RobotError
@@ -54,8 +54,8 @@ def test_command_lines_of_both_robots() -> None:
     make, listen, netcat = send("size: 2MB, port: 4000").jobs(SCENE)
     assert (make.role, make.program, make.job.stdout) == (Role.SENDER, "awk", "send.bin")
     assert make.job.argv[:5] == ("awk", "-v", "seed=1", "-v", "bytes=2000000")
-    assert in_shell(listen.job) == "nc.traditional -u -l -p 4000 -w 2 > recv.bin 2> receiver-listen.log"
-    assert in_shell(netcat.job) == "nc.traditional -u -q 0 10.42.0.2 4000 < send.bin 2> sender-send.log"
+    assert shell_line(listen.job) == "nc.traditional -u -l -p 4000 -w 2 > recv.bin 2> receiver-listen.log"
+    assert shell_line(netcat.job) == "nc.traditional -u -q 0 10.42.0.2 4000 < send.bin 2> sender-send.log"
 
 
 def test_name_is_prefix_of_jobs_and_files() -> None:

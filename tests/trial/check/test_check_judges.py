@@ -129,7 +129,7 @@ def test_a_station_whose_profile_has_an_access_point_is_a_warning() -> None:
     )
     finding = only(findings, "Wi-Fi")
     assert finding.status is WARN
-    assert finding.detail.endswith(": a station, but by its profile the robot runs an access point")
+    assert finding.detail.endswith(": a station, but according to its profile the robot runs an access point")
 
 
 def test_an_ad_hoc_cell_is_not_a_missing_network() -> None:
@@ -231,7 +231,9 @@ def test_evidence_that_takes_long_to_fetch_is_a_warning_with_size_and_rate(tmp_p
     system.judge_laptop(PLAN.model_copy(update={"procedure": procedure}), tmp_path, report)
     finding = only(report.findings, "fetch")
     assert finding.status is WARN
-    assert re.fullmatch(r"an attempt leaves about \d\.\d GB: \d+ min \d\d s to fetch at 2\.5 MB/s", finding.detail)
+    assert re.fullmatch(
+        r"an attempt leaves about \d\.\d GB, which takes \d+ min \d\d s to fetch at 2\.5 MB/s", finding.detail
+    )
 
 
 LISTENER = "   0: 00000000:04D2 00000000:0000 0A 00000000:00000000 00:00000000 00000000     0        0 1795259 1"
@@ -384,8 +386,8 @@ def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
     [
         ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file states"),
         ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
-        ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it arrives at 192.168.1.5"),
-        ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it arrives at 192.168.1.5"),
+        ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it connects to 192.168.1.5"),
+        ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it connects to 192.168.1.5"),
         ("", Control.SEPARATE, OK, "does not report the addresses"),
     ],
 )
@@ -433,7 +435,7 @@ def test_the_remedy_for_a_port_uses_an_available_tool() -> None:
     report = Report(RECEIVER.name)
     report.user_tools = system.user_tools({"user": CommandResult("0", 0), "means": CommandResult("netstat", 0)})
     system.judge(PLAN, Role.RECEIVER, {"listeners": CommandResult(LISTENER, 0)}, report)
-    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # shows it; stop it"
+    assert only(report.findings, "port 1234").remedy == "netstat -lntup | grep :1234 # find this program and stop it"
 
 
 def test_the_remedy_for_a_clock_uses_an_available_tool() -> None:

@@ -39,7 +39,7 @@ def incomplete(monkeypatch: pytest.MonkeyPatch) -> set[str]:
     robots_with_evidence(monkeypatch)
     names: set[str] = set()
 
-    def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def fetch(_self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         text = "" if remote.rpartition("/")[2].rpartition("-")[0] in names else PING
         (into / "ping.txt").write_text(text, encoding="utf-8")
         write_states(into)
@@ -122,7 +122,7 @@ def test_a_kill_at_any_write_is_recovered(stride: int, tmp_path: Path, incomplet
     for died in moments(folder, stride):
         count += stride
         resume_failed(died)
-        assert Status.FAILED not in {attempt.status for attempt in journal.ended(journal.read(died))}
+        assert Status.FAILED not in {attempt.status for attempt in journal.ended_attempts(journal.read(died))}
         assert [row["repeat"] for row in rows(died) if row["status"] == "valid"].count("1") == 1
         assert_consistent(died)
     assert count > 10, "too few writes were interrupted"

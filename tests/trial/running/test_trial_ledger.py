@@ -47,7 +47,7 @@ def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
     entry = to.begin(repeat)
     partial = store.open_attempt(folder, repeat)
     (partial / "ping.txt").write_text(PING, encoding="ascii")
-    to.measured(entry)
+    to.record_measured(entry)
     measured = gates.judge(plan, repeat, AttemptEvidence(partial)).measured
     to.commit(partial, replace(entry, status=Status.VALID), measured)
 
@@ -56,7 +56,7 @@ def keep(to: Ledger, plan: Plan, folder: Path, repeat: RepeatId) -> None:
 def trial(tmp_path: Path) -> Path:
     """A trial of three repeats, of which two have ended."""
     to, plan, folder = begin(tmp_path, 3)
-    for repeat in list(plan.order())[:2]:
+    for repeat in list(plan.repeats_in_order())[:2]:
         keep(to, plan, folder, repeat)
     to.summarize()
     return folder
@@ -87,10 +87,10 @@ def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypat
     monkeypatch.setattr(rows, "line", counted_line)
     for now in (60, 120):
         to, plan, folder = begin(tmp_path, now)
-        for repeat in plan.order():
+        for repeat in plan.repeats_in_order():
             keep(to, plan, folder, repeat)
         to.summarize()
-        assert to.done == now
+        assert to.finished_count == now
         assert rendered[now] == now
         assert verification.verify(folder) == []
     assert written[120] < 3 * written[60]
@@ -99,7 +99,7 @@ def test_written_bytes_and_rendered_rows_grow_linearly(tmp_path: Path, monkeypat
 def test_a_small_trial_writes_every_row_immediately(trial: Path) -> None:
     plan = plans.read_plan(trial)
     before = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
-    keep(reopened(trial), plan, trial, list(plan.order())[2])
+    keep(reopened(trial), plan, trial, list(plan.repeats_in_order())[2])
     after = (trial / store.TRIAL_CSV).read_text(encoding="utf-8")
     assert after.startswith(before)
     assert after.count("\n") == before.count("\n") + 1
@@ -117,7 +117,7 @@ def test_a_reopened_trial_measures_nothing_and_computes_no_checksum_again(
     monkeypatch.setattr(manifest.Manifest, "add", never)
     to = reopened(trial)
     assert to.differences == {}
-    assert (to.done, to.counts(Status.VALID)) == (2, 2)
+    assert (to.finished_count, to.counts(Status.VALID)) == (2, 2)
     to.summarize()
     assert (trial / store.TRIAL_CSV).read_bytes() == table
 
@@ -126,7 +126,7 @@ def test_rows_missing_in_the_table_after_a_kill_are_measured(trial: Path, monkey
     plan = plans.read_plan(trial)
     table = (trial / store.TRIAL_CSV).read_bytes()
     monkeypatch.setattr(ledger, "TABLE_SHARE", 2.0)
-    keep(reopened(trial), plan, trial, list(plan.order())[2])
+    keep(reopened(trial), plan, trial, list(plan.repeats_in_order())[2])
     assert (trial / store.TRIAL_CSV).read_bytes() == table, "the process is killed here"
     reopened(trial).summarize()
     assert verification.verify(trial) == []
@@ -139,7 +139,7 @@ def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.
     with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
         file.write("changed\n")
     reopened(trial).summarize()
-    head, line = rows.head, rows.line
+    head, line = rows.header, rows.line
     monkeypatch.setattr(rows, "head", lambda table: f"more,{head(table)}")
     monkeypatch.setattr(rows, "line", lambda row, table: f",{line(row, table)}")
     monkeypatch.setattr(rows, "write_summary", lambda folder, plan, table: ())

@@ -76,15 +76,15 @@ def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> N
 
 def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None:
     jobs.install(robot, Deadline.after(30))
-    assert locks.holder(robot) is None
+    assert locks.read_lock(robot) is None
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event, ttl_s=60):
-        lock = locks.holder(robot)
+        lock = locks.read_lock(robot)
         assert lock is not None
         assert lock.holder == ANNA
         assert 50 < lock.left_s <= 60
         alter(robot, (4, "0"))
-        assert locks.holder(robot) is None, "it has expired"
-    assert locks.holder(robot) is None
+        assert locks.read_lock(robot) is None, "it has expired"
+    assert locks.read_lock(robot) is None
 
 
 def test_the_same_trial_can_lock_its_robot_again(robot: LocalShell) -> None:
@@ -269,7 +269,7 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         begin(robot, ANNA)
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
-        lock = locks.holder(robot)
+        lock = locks.read_lock(robot)
         assert lock is not None
         assert lock.left_s > 7200
         fresh = record(robot)

@@ -53,7 +53,7 @@ def test_ctrl_c_closes_connections_and_waits_for_writers_of_evidence(tmp_path: P
     robots = Robots(plain_plan(), slow_testbed(tmp_path))
     threads_before = set(threading.enumerate())
     with pytest.raises(KeyboardInterrupt):
-        robots.fetch("x", into, clean=True)
+        robots.fetch("x", into, ended_normally=True)
     robots.close_connections()
     saved = into.rename(tmp_path / "kept")
     wait_until(lambda: threads_before.issuperset(threading.enumerate()), Deadline.after(60))
@@ -81,7 +81,7 @@ def test_unfetched_evidence_stays_on_its_robot(tmp_path: Path) -> None:
     robots = Robots(plan, IdleTestbed(shells))
     into = tmp_path / "into"
     into.mkdir()
-    assert robots.fetch(attempts["udp-01-1"], into, clean=True) == ["turtlebot-1: the connection broke"]
+    assert robots.fetch(attempts["udp-01-1"], into, ended_normally=True) == ["turtlebot-1: the connection broke"]
     assert {path.name for path in into.iterdir()} == {
         "receiver-before.txt",
         "receiver-after.txt",
@@ -116,10 +116,10 @@ def test_a_void_attempt_reports_that_its_robot_rebooted(tmp_path: Path) -> None:
         plain_plan(), IdleTestbed({role: RebootedRobot(tmp_path) for role in (Role.SENDER, Role.RECEIVER)})
     )
     robots.begin("x", old=None)
-    output_text = robots.fetch("x", tmp_path, clean=False)
+    output_text = robots.fetch("x", tmp_path, ended_normally=False)
     reasons = [f"{name}: the robot rebooted during the repeat" for name in ("turtlebot-2", "turtlebot-1")]
     assert sorted(output_text) == sorted(reasons)
-    listed = hosts.without_effects(
+    listed = hosts.drop_effects_of_reboots(
         ["turtlebot-1: no job in .jobs/capture", "scan.bag: there is no bag", *output_text]
     )
     assert sorted(listed) == sorted(["scan.bag: there is no bag", *reasons])
@@ -155,12 +155,12 @@ def test_no_segment_is_requested_after_the_connection_was_closed(tmp_path: Path)
     shells[Role.SENDER].on_command = robots.close_connections
     into = tmp_path / "into"
     into.mkdir()
-    assert robots.fetch(remote, into, clean=True) == ["the fetch was cancelled"]
+    assert robots.fetch(remote, into, ended_normally=True) == ["the fetch was cancelled"]
     assert shells[Role.SENDER].pieces == 1
     shells[Role.SENDER].on_command = lambda: None
     for path in into.glob("*.txt"):
         path.unlink()
-    assert robots.fetch(remote, into, clean=True) == []
+    assert robots.fetch(remote, into, ended_normally=True) == []
     assert shells[Role.SENDER].pieces == 3, "fetching resumes at the same segment"
 
 
@@ -180,7 +180,7 @@ def test_completely_fetched_evidence_is_deleted_even_if_a_job_failed(tmp_path: P
     robots = Robots(plan, IdleTestbed(shells))
     into = tmp_path / "into"
     into.mkdir()
-    (output_text,) = robots.fetch(remote, into, clean=True)
+    (output_text,) = robots.fetch(remote, into, ended_normally=True)
     assert output_text.endswith("job capture ended with exit code 3")
     assert "exit code 1" not in output_text, "the message is from the robot"
     assert robots.unfetched.by_robot() == {}

@@ -79,9 +79,9 @@ def test_the_repeat_that_ctrl_c_lets_finish_is_reported(
 ) -> None:
     stop, fetch = Stop(), Robots.fetch
 
-    def recorded_fetch(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def recorded_fetch(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         stop.after_repeat = not remote.endswith("tcp-01-1")
-        return fetch(self, remote, into, clean=clean)
+        return fetch(self, remote, into, ended_normally=ended_normally)
 
     monkeypatch.setattr(Robots, "fetch", recorded_fetch)
     with pytest.raises(KeyboardInterrupt):
@@ -120,7 +120,7 @@ def test_an_aborted_attempt_does_not_count(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(Robots, "delete_remote", lambda _, remote=None: removed.append(remote))
     with pytest.raises(LockLostError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    (cut,) = journal.ended(journal.read(only(tmp_path)))
+    (cut,) = journal.ended_attempts(journal.read(only(tmp_path)))
     assert (cut.status, cut.excused) == (Status.VOID, True)
     assert cut.reason == "turtlebot-1: the trial was aborted by anna@one at 12:00:00 UTC"
     assert removed == [f".fieldkit/{of_two().trial}/tcp-01-1"]
@@ -151,13 +151,13 @@ def test_an_unexpected_exception_of_a_step_is_not_an_interruption(
     monkeypatch.setattr(Robots, "measure", measure)
     with pytest.raises(KeyError):
         run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
-    (cut,) = journal.ended(journal.read(only(tmp_path)))
+    (cut,) = journal.ended_attempts(journal.read(only(tmp_path)))
     assert (cut.status, cut.excused, cut.reason) == (Status.VOID, True, "KeyError: 'load'")
 
 
 def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = store.create(tmp_path, of_two())
-    (repeat, _) = of_two().order()
+    (repeat, _) = of_two().repeats_in_order()
     journal.append(
         folder,
         JournalEntry(1, repeat.protocol, 1, 0, Status.PLANNED),
@@ -166,12 +166,12 @@ def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch:
     )
     fetch, message = Robots.fetch, "turtlebot-1: it has no folder .fieldkit/x/tcp-01-1 any more"
 
-    def gone_once(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
-        return [message] if remote.endswith("tcp-01-1") else fetch(self, remote, into, clean=clean)
+    def gone_once(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
+        return [message] if remote.endswith("tcp-01-1") else fetch(self, remote, into, ended_normally=ended_normally)
 
     monkeypatch.setattr(Robots, "fetch", gone_once)
     resume_trial(folder, IdleTestbed(), lambda _: None)
-    first = journal.ended(journal.read(folder))[0]
+    first = journal.ended_attempts(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
     assert (
         first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {message}"
@@ -183,7 +183,7 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
 ) -> None:
     fetch = Robots.fetch
 
-    def leave_first(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def leave_first(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         if remote.endswith("tcp-01-1"):
             self.unfetched.mark(Role.SENDER, remote, into, "the link broke \udcff")
             return ["the link broke"]
@@ -243,10 +243,10 @@ def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
         with pytest.raises(KeyboardInterrupt):
             run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     folder = only(tmp_path)
-    assert [cut.status for cut in journal.interrupted(journal.read(folder))] == [Status.MEASURED]
+    assert [cut.status for cut in journal.interrupted_attempts(journal.read(folder))] == [Status.MEASURED]
     fetched: list[str] = []
 
-    def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def fetch(_self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         fetched.append(remote)
         (into / "ping.txt").write_text(PING, encoding="utf-8")
         write_states(into)
@@ -254,7 +254,7 @@ def test_an_attempt_stopped_during_fetching_is_fetched_by_resume(
 
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), lambda _: None)
-    first, second = journal.ended(journal.read(folder))
+    first, second = journal.ended_attempts(journal.read(folder))
     assert (first.status, first.number, second.repeat.number) == (Status.VALID, 1, 2)
     assert fetched[0] == first.remote(folder.name)
 
@@ -316,7 +316,9 @@ def test_a_disk_may_be_full_at_any_write(stride: int, tmp_path: Path, monkeypatc
             resume_trial(folder, IdleTestbed(), lambda _: None)
             assert verification.verify(folder) == []
             assert rebuild(folder).changed == ()
-            assert sum(attempt.status is Status.VALID for attempt in journal.ended(journal.read(folder))) == 1
+            assert (
+                sum(attempt.status is Status.VALID for attempt in journal.ended_attempts(journal.read(folder))) == 1
+            )
         shutil.rmtree(out, ignore_errors=True)
     assert moment > 30, "too few writes were interrupted"
 
@@ -326,8 +328,8 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
 ) -> None:
     fetch = Robots.fetch
 
-    def moving(self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
-        output_text = fetch(self, remote, into, clean=clean)
+    def moving(self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
+        output_text = fetch(self, remote, into, ended_normally=ended_normally)
         if remote.endswith("tcp-02-1"):
             only(tmp_path).rename(tmp_path / "moved")
         return output_text
@@ -339,7 +341,7 @@ def test_a_moved_folder_stops_the_trial_which_can_be_resumed_there(
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(tmp_path / "moved", IdleTestbed(), lambda _: None)
     assert verification.verify(tmp_path / "moved") == []
-    assert [attempt.status for attempt in journal.ended(journal.read(tmp_path / "moved"))] == [
+    assert [attempt.status for attempt in journal.ended_attempts(journal.read(tmp_path / "moved"))] == [
         "void",
         "valid",
         "valid",

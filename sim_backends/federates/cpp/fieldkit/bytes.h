@@ -1,4 +1,4 @@
-// Numbers and texts in the body of a frame, little endian on every machine.
+// Numbers and texts in the body of a frame; they are little endian on every machine.
 
 #ifndef FIELDKIT_FEDERATES_BYTES_H
 #define FIELDKIT_FEDERATES_BYTES_H
@@ -21,7 +21,7 @@ struct Refusal : std::runtime_error
     using std::runtime_error::runtime_error;
 };
 
-// A frame that is not as the protocol describes it; positions are counted from the beginning of the frame.
+// A frame that does not follow the protocol; positions are counted from the beginning of the frame.
 struct MalformedFrame : Refusal
 {
     MalformedFrame(size_t position, const std::string& what)
@@ -30,7 +30,7 @@ struct MalformedFrame : Refusal
     }
 };
 
-// Reads a body in order, and checks each length before it is used. The body must exist as long as the reader.
+// Reads a body in order, and checks each length before it is used. The body must outlive the reader.
 class Reader
 {
   public:
@@ -43,22 +43,22 @@ class Reader
     // Position of the next byte, from the beginning of the frame.
     size_t Position() const
     {
-        return m_start + m_at;
+        return m_start + m_offset;
     }
 
     std::string Bytes(size_t count)
     {
-        return std::string(Take(count), count);
+        return std::string(Consume(count), count);
     }
 
     template <class Value> Value Get()
     {
         static_assert(std::is_arithmetic_v<Value>);
-        const char* bytes = Take(sizeof(Value));
+        const char* bytes = Consume(sizeof(Value));
         uint64_t bits = 0;
-        for (size_t place = sizeof(Value); place-- > 0;)
+        for (size_t byte_index = sizeof(Value); byte_index-- > 0;)
         {
-            bits = bits << 8 | static_cast<uint8_t>(bytes[place]);
+            bits = bits << 8 | static_cast<uint8_t>(bytes[byte_index]);
         }
         if constexpr (std::is_floating_point_v<Value>)
         {
@@ -90,7 +90,7 @@ class Reader
     {
         size_t position = Position();
         auto count = Get<uint32_t>();
-        if (count > (m_body.size() - m_at) / item_bytes)
+        if (count > (m_body.size() - m_offset) / item_bytes)
         {
             throw MalformedFrame(position, std::to_string(count) + " items of at least " + std::to_string(item_bytes) +
                                                " bytes do not fit in the rest of the frame");
@@ -98,29 +98,29 @@ class Reader
         return count;
     }
 
-    // Check that nothing follows.
+    // Check that there are no more bytes.
     void End() const
     {
-        if (m_at != m_body.size())
+        if (m_offset != m_body.size())
         {
-            throw MalformedFrame(Position(), std::to_string(m_body.size() - m_at) + " bytes follow the message");
+            throw MalformedFrame(Position(), std::to_string(m_body.size() - m_offset) + " bytes follow the message");
         }
     }
 
   private:
-    const char* Take(size_t count)
+    const char* Consume(size_t count)
     {
-        if (count > m_body.size() - m_at)
+        if (count > m_body.size() - m_offset)
         {
             throw MalformedFrame(m_start + m_body.size(), "the frame ends too early");
         }
-        m_at += count;
-        return m_body.data() + m_at - count;
+        m_offset += count;
+        return m_body.data() + m_offset - count;
     }
 
     const std::string& m_body;
     size_t m_start;
-    size_t m_at = 0;
+    size_t m_offset = 0;
 };
 
 // Writes a body in order.
@@ -140,14 +140,14 @@ class Writer
         {
             bits = static_cast<uint64_t>(value);
         }
-        for (size_t place = 0; place < sizeof value; place++)
+        for (size_t byte_index = 0; byte_index < sizeof value; byte_index++)
         {
-            data.push_back(static_cast<char>(bits >> 8 * place & 0xff));
+            data.push_back(static_cast<char>(bits >> 8 * byte_index & 0xff));
         }
         return *this;
     }
 
-    // A text that is too long is cut between two characters.
+    // A text that is too long is truncated between two characters.
     Writer& PutText(const std::string& text)
     {
         size_t size = text.size();

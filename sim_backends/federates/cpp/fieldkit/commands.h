@@ -32,7 +32,7 @@ struct PhysicsRequest
     std::vector<Command> commands;
 };
 
-// The request of a body in a run that has this number of agents.
+// Return the request in a body; `agents` is the number of agents in the run.
 inline PhysicsRequest
 ReadPhysicsRequest(const std::string& body, size_t agents)
 {
@@ -57,9 +57,9 @@ ReadPhysicsRequest(const std::string& body, size_t agents)
             throw MalformedFrame(position, "a command of type " + std::to_string(command.type) + " and " +
                                                std::to_string(size) + " bytes is not supported");
         }
-        for (size_t place = 0; place < size / 8; place++)
+        for (size_t index = 0; index < size / 8; index++)
         {
-            command.values[place] = reader.Get<double>();
+            command.values[index] = reader.Get<double>();
         }
     }
     reader.End();

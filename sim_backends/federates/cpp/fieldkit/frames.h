@@ -43,7 +43,7 @@ struct Frame
     std::string body;
 };
 
-// Read a frame; false at the end of the stream.
+// Read a frame; return false at the end of the stream.
 inline bool
 ReadFrame(std::FILE* stream, Frame& frame)
 {
@@ -75,7 +75,7 @@ ReadFrame(std::FILE* stream, Frame& frame)
     return std::fread(frame.body.data(), 1, size, stream) == size;
 }
 
-// Write the answer to a request; false if the coordinator has closed the connection.
+// Write the answer to a request; return false if the coordinator has closed the connection.
 inline bool
 WriteFrame(std::FILE* stream, const Frame& request, Kind kind, const std::string& body)
 {

@@ -33,7 +33,7 @@ struct Agent
     std::string name;
     std::string profile;
     bool flies = false;
-    double antenna_m = 0; // its height above the body's position
+    double antenna_m = 0; // height of the antenna above the body's position
     State start;
 };
 
@@ -50,7 +50,7 @@ struct Hello
     std::string configuration; // JSON
 };
 
-// Hello of a body, which must be for a federate of this role.
+// Return the hello in a body; it must be for a federate of this role.
 inline Hello
 ReadHello(const std::string& body, Role role)
 {
@@ -106,12 +106,12 @@ struct Welcome
     uint32_t capabilities = 0;
     int64_t step_ns = 0;
     int64_t next_event_ns = -1;
-    std::string configuration_hash; // that of hello
+    std::string configuration_hash; // the hash in hello
     std::string name;
     std::string software;
     std::vector<uint16_t> commands;
     std::vector<std::string> transports;
-    std::vector<uint32_t> transmitters; // agents
+    std::vector<uint32_t> transmitters; // indices of agents
     std::vector<std::array<double, 3>> emitters_m;
 };
 

@@ -15,11 +15,11 @@ struct RadioSample
 {
     uint32_t agent = 0;
     double noise_dbm = NAN;
-    int64_t active_ns = 0; // time for which it has listened
-    int64_t busy_ns = 0; // part of it in which the channel was busy
+    int64_t active_ns = 0; // time during which the radio was on the channel
+    int64_t busy_ns = 0; // part of that time in which the channel was busy
 };
 
-// The link of an agent to a peer; an unknown number is NaN.
+// The link of an agent to a peer; a number that is not known is NaN.
 struct LinkSample
 {
     uint32_t agent = 0;
@@ -30,7 +30,7 @@ struct LinkSample
     uint64_t tx_packets = 0;
     uint64_t rx_packets = 0;
     uint64_t tx_retries = 0;
-    uint64_t tx_failures = 0; // packets given up after the last retry
+    uint64_t tx_failures = 0; // packets dropped after the last retry
 };
 
 inline std::string

@@ -1,4 +1,4 @@
-// Requests to a network, with the packets that enter it, and its answers, with what became of packets.
+// Requests to a network, with the packets that enter it; and its answers, with arrivals and drops.
 
 #ifndef FIELDKIT_FEDERATES_PACKETS_H
 #define FIELDKIT_FEDERATES_PACKETS_H
@@ -17,8 +17,8 @@ struct Packet
     uint64_t size_bytes = 0;
     int64_t sent_ns = 0;
     int64_t enters_ns = 0;
-    uint32_t source = 0; // agents
-    uint32_t destination = 0;
+    uint32_t source = 0; // index of an agent
+    uint32_t destination = 0; // index of an agent
     std::string flow;
     std::string protocol;
 };
@@ -60,7 +60,7 @@ ReadNetworkRequest(const std::string& body)
     return request;
 }
 
-// Parts of the delay of a packet in the network; the processing in hosts is what remains of it.
+// Parts of the delay of a packet in the network; the rest of the delay is processing in hosts.
 struct DelayParts
 {
     int64_t queuing_ns = 0;
@@ -78,7 +78,7 @@ class Outcomes
         m_arrivalCount++;
     }
 
-    // As above, with the parts of the delay. A network that reports those of an arrival reports those of each.
+    // As above, with the parts of the delay. A network must report the parts of all arrivals or of none.
     void Arrive(uint64_t id, int64_t at_ns, uint32_t agent, const DelayParts& parts)
     {
         Arrive(id, at_ns, agent);
@@ -101,7 +101,7 @@ class Outcomes
         return m_dropCount;
     }
 
-    // Body of the answer; the collection is empty afterwards. Without a next event, its time is -1.
+    // Return the body of the answer, and clear the collection. `next_event_ns` is -1 if there is no next event.
     std::string TakeBody(int64_t to_ns, int64_t next_event_ns)
     {
         Writer body;

@@ -1,4 +1,4 @@
-// A session with the coordinator: requests and their answers on streams, and reports while a request takes long.
+// A session with the coordinator: requests and their answers on streams, and `busy` messages during long requests.
 
 #ifndef FIELDKIT_FEDERATES_SERVING_H
 #define FIELDKIT_FEDERATES_SERVING_H
@@ -24,7 +24,7 @@ class Heartbeat
         m_interval = std::chrono::milliseconds(std::clamp<uint32_t>(milliseconds, 1, 60'000));
     }
 
-    // A request begins, whose answer is for this stream.
+    // Start the interval of a request whose answer is written to `stream`.
     void Begin(std::FILE* stream, const Frame& request)
     {
         m_stream = stream;
@@ -32,13 +32,13 @@ class Heartbeat
         m_last = Clock::now();
     }
 
-    // When the next report is due.
+    // Return the time at which the next `busy` message is due.
     Clock::time_point Due() const
     {
         return m_last + m_interval;
     }
 
-    // Report the time that the run has reached, if a report is due.
+    // Send `busy` with the time that the run has reached, if it is due.
     void Check(int64_t at_ns)
     {
         if (Clock::now() >= Due())
@@ -69,16 +69,16 @@ struct Answer
     std::string body;
 };
 
-// The stream of the protocol. What a library prints to standard output from now on goes to standard error.
+// Return the stream of the protocol. Redirect standard output to standard error, because libraries may print to it.
 inline std::FILE*
-TakeStandardOutput()
+RedirectStandardOutput()
 {
     std::FILE* stream = ::fdopen(::dup(STDOUT_FILENO), "wb");
     ::dup2(STDERR_FILENO, STDOUT_FILENO);
     return stream;
 }
 
-// Answer requests until the coordinator ends the run; false if a request was refused.
+// Answer requests until the coordinator ends the run; return false if a request was refused.
 //
 // `answer` is called with each request other than ping, release and bye; its exceptions are sent to the coordinator.
 inline bool
@@ -98,16 +98,16 @@ Serve(std::FILE* input, std::FILE* output, Heartbeat& heartbeat, const std::func
                 continue;
             }
             heartbeat.Begin(output, request);
-            Answer done{kPong, request.body};
+            Answer result{kPong, request.body};
             if (request.kind != kPing)
             {
-                done = answer(request);
+                result = answer(request);
             }
             else if (request.body.size() != 8)
             {
                 throw MalformedFrame(kHeaderBytes + std::min<size_t>(request.body.size(), 8), "ping has 8 bytes");
             }
-            if (!WriteFrame(output, request, done.kind, done.body))
+            if (!WriteFrame(output, request, result.kind, result.body))
             {
                 return true; // the coordinator has closed the connection
             }

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from fieldkit.core import executors
 from fieldkit.core.events import Event
 from fieldkit.core.executors import Workers
 from sim_backends.cosim import build, load_scenario
 from sim_backends.cosim.commands import execution
-from sim_backends.cosim.commands.execution import between_windows
+from sim_backends.cosim.commands.execution import interrupt_between_windows
 from sim_backends.cosim.real_time import Pace
 from sim_backends.cosim.run_record import EventDigest, Window
 from sim_backends.world.motion import State
@@ -51,7 +52,7 @@ def test_a_window_is_both_hashed_and_recorded_or_neither(
             os.kill(os.getpid(), signal.SIGINT)
 
         monkeypatch.setattr(EventDigest, "add_window", interrupted)
-    with pytest.raises(KeyboardInterrupt), between_windows(coordinator):
+    with pytest.raises(KeyboardInterrupt), interrupt_between_windows(coordinator):
         simulation.run()
     digest = coordinator._digest
     assert observer.windows == digest._windows + len(digest.quiet_ends_ns) == len(coordinator.run.windows_ns) > 0
@@ -79,7 +80,7 @@ def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyP
         return simulation
 
     monkeypatch.setattr(execution, "build", interrupted)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
+    monkeypatch.setattr(executors, "usable_processors", lambda: 1)
     scenario = load_scenario("baylands", {"duration": "50ms"})
     results, ended = execution.simulate_all(scenario, "scheduled", [1, 2, 3], None, sink=ignore)
     assert (started, ended) == ([1, 2], True)

@@ -35,7 +35,13 @@ def test_the_result_of_a_flow_follows_from_its_packets() -> None:
     (flow,) = flow_results(
         run_of(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, decided=False))
     )
-    assert (flow.sent, flow.arrived, flow.under_way, flow.sent_bytes, flow.arrived_bytes) == (4, 3, 1, 400, 300)
+    assert (flow.sent_packets, flow.arrived_packets, flow.packets_under_way, flow.sent_bytes, flow.arrived_bytes) == (
+        4,
+        3,
+        1,
+        400,
+        300,
+    )
     assert flow.loss == pytest.approx(0.25)
     delay_s = flow.delay_s
     assert (delay_s.minimum, delay_s.median, delay_s.mean, delay_s.maximum) == pytest.approx(
@@ -55,7 +61,7 @@ def test_jitter_equals_that_of_the_harness_in_the_order_of_arrival() -> None:
 
 
 def test_values_without_arrivals_are_nan() -> None:
-    ends = fate(0, None).true
+    ends = fate(0, None).true_states
     under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), ends, ends)
     lost, waiting = flow_results(run_of(fate(0, None), under_way))
     assert (lost.loss, lost.arrived_bytes) == (1.0, 0)
@@ -79,7 +85,7 @@ def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided()
     flow, reply_flow = flow_results(run_of(*requests, *map(as_reply, replies)))
     trips = flow.round_trips
     assert trips is not None
-    assert (trips.sent, trips.answered) == (4, 2)
+    assert (trips.request_count, trips.reply_count) == (4, 2)
     spread_s = trips.network_s
     assert (spread_s.minimum, spread_s.mean, spread_s.maximum) == pytest.approx((0.004, 0.0055, 0.007))
     assert trips.jitter_s == pytest.approx(0.003)
@@ -89,4 +95,4 @@ def test_a_round_trip_is_the_time_in_the_network_and_counts_when_it_is_decided()
 def test_flows_are_sorted_by_name_and_immutable() -> None:
     assert [flow.name for flow in flow_results(Run())] == []
     with pytest.raises(AttributeError):
-        flow_results(run_of(fate(0, 1.0)))[0].sent = 3  # type: ignore[misc]
+        flow_results(run_of(fate(0, 1.0)))[0].sent_packets = 3  # type: ignore[misc]

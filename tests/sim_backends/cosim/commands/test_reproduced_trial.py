@@ -75,8 +75,8 @@ def test_a_part_of_the_run_has_the_rows_of_what_was_sent(tmp_path: Path) -> None
         ({"traffic.0.port": "1235"}, "the port of the transfer is 1235, and 1234 in the procedure los"),
         ({"trial.procedure": "topics"}, "a simulation cannot reproduce the procedure"),
         ({"trial.udp.ping": "ping"}, "there is no traffic 'ping'; did you mean"),
-        ({"trial.udp.ping": "scan-udp"}, "scan-udp is not a ping by udp"),
-        ({"traffic.2.start": "6s"}, "the traffic of one protocol starts before that of the other"),
+        ({"trial.udp.ping": "scan-udp"}, "scan-udp is not traffic of kind ping with protocol udp"),
+        ({"traffic.2.start": "6s"}, "the traffic of one protocol starts before all traffic of the other protocol"),
     ],
 )
 def test_a_contradiction_to_the_procedure_is_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:

@@ -16,7 +16,7 @@ from sim_backends.cosim.packet_ledger import position_error_m
 from sim_backends.cosim.policies.error_bounded import ErrorBounded
 from sim_backends.cosim.policies.sync_policy import PolicyError, Situation
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist
 from sim_backends.physics.differential_drive import DifferentialDrive
@@ -49,7 +49,7 @@ class Driver:
     def next_send_ns(self) -> int:
         return self._number * self._period_ns
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self._steps = now_ns // STEP_NS + 1
         command = self._twists[now_ns // 200_000_000 % len(self._twists)]
         if now_ns < self.next_send_ns():
@@ -141,9 +141,9 @@ def test_a_window_continues_until_the_error_leaves_less_than_a_step() -> None:
     assert policy.next_window(begin) == 100 * STEP_NS, "at a constant velocity there is no error"
 
     def extended_ns(error_m: float, sends_ns: int = 0) -> int:
-        assumed = states | {"b": State((5.0 - error_m, 0.0, 0.0))}
+        assumed_states = states | {"b": State((5.0 - error_m, 0.0, 0.0))}
         now_ns = 30 * STEP_NS
-        situation = replace(begin, now_ns=now_ns, assumed=assumed, next_send_ns=max(sends_ns, now_ns))
+        situation = replace(begin, now_ns=now_ns, assumed_states=assumed_states, next_send_ns=max(sends_ns, now_ns))
         return policy.extended_end_ns(situation)
 
     assert extended_ns(0.0) == extended_ns(0.0, 35 * STEP_NS) == 40 * STEP_NS
@@ -165,9 +165,9 @@ def window_ns(
 ) -> int:
     """Return the length of a window in which b moves at another velocity than the network assumes."""
     states = {"a": State((0.0, 0.0, 0.0)), "b": State((separation_m, 0.0, 0.0), velocity_m_s)}
-    assumed = states | {"b": State((separation_m, 0.0, 0.0), assumed_m_s)}
+    assumed_states = states | {"b": State((separation_m, 0.0, 0.0), assumed_m_s)}
     limits = dict.fromkeys("ab", 0.0)
-    situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, assumed)
+    situation = Situation(0, states, [("a", "b")], lambda: 0, lambda: None, STEP_NS, limits, 0, assumed_states)
     return ErrorBounded(longest_s=10.0, bound_db=bound_db, exponent=EXPONENT).next_window(situation)
 
 

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim.federates import Action, Program
 from sim_backends.cosim.programs.senders import Periodic
-from sim_backends.cosim.programs.wrappers import AgentClock, Clocked
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.cosim.programs.wrappers import AgentClock, ProgramWithClock
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.world.motion import State
 
 ORIGIN = State((0.0, 0.0, 0.0))
@@ -56,12 +56,12 @@ class Listener:
     """Keeps received datagrams with the time of its own clock."""
 
     def __init__(self) -> None:
-        self.received: list[tuple[int, Received]] = []
+        self.received: list[tuple[int, ReceivedDatagram]] = []
 
     def next_wake_ns(self) -> None:
         return None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self.received += [(now_ns, datagram) for datagram in received]
         return Action()
 
@@ -76,25 +76,25 @@ def sent(program: Program, to_ns: int) -> list[tuple[int, Datagram]]:
 
 def test_a_program_with_a_fast_clock_sends_more_often_and_stamps_the_reading() -> None:
     fast = AgentClock(rate_ppb=100_000_000)
-    packets = sent(Clocked(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
+    packets = sent(ProgramWithClock(Periodic("a", "b", period_ns=11 * MS), fast), 100 * MS)
     assert [at_ns for at_ns, _ in packets] == [number * 10 * MS for number in range(11)]
     listener = Listener()
     slow = AgentClock(offset_ns=-5 * MS)
-    program = Clocked(listener, slow)
+    program = ProgramWithClock(listener, slow)
     for at_ns, datagram in packets[:2]:
-        program.wake(at_ns + 7 * MS, ORIGIN, [Received("a", datagram.payload, at_ns, at_ns + 6 * MS)])
+        program.wake(at_ns + 7 * MS, ORIGIN, [ReceivedDatagram("a", datagram.payload, at_ns, at_ns + 6 * MS)])
     assert listener.received == [
-        (2 * MS, Received("a", ORIGIN, 0, 1 * MS)),
-        (12 * MS, Received("a", ORIGIN, 11 * MS, 11 * MS)),
+        (2 * MS, ReceivedDatagram("a", ORIGIN, 0, 1 * MS)),
+        (12 * MS, ReceivedDatagram("a", ORIGIN, 11 * MS, 11 * MS)),
     ]
 
 
 def test_after_a_clock_was_set_right_no_datagram_is_repeated_or_sent_later() -> None:
     ahead = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
-    times_ns = [at_ns for at_ns, _ in sent(Clocked(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)]
+    times_ns = [at_ns for at_ns, _ in sent(ProgramWithClock(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)]
     # The reading is 35 ms at 20 ms. At 50 ms it is 50 again after it has been 60, so the next datagram is due at 70.
     assert times_ns == [0, 10 * MS, 20 * MS, 25 * MS, 35 * MS, 45 * MS, 70 * MS, 80 * MS, 90 * MS, 100 * MS]
     behind = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
-    packets = sent(Clocked(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
+    packets = sent(ProgramWithClock(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
     assert [at_ns for at_ns, _ in packets[-3:]] == [9_999 * MS, 10_000 * MS, 10_001 * MS]
     assert [datagram.number for _, datagram in packets] == list(range(len(packets)))

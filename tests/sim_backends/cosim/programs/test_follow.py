@@ -15,7 +15,7 @@ from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.programs.way_points import ProfileLeg, VelocityProfile
 from sim_backends.cosim.programs.wrappers import CombinedProgram
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Received
+from sim_backends.network.packets import ReceivedDatagram
 from sim_backends.physics.bodies import Bodies
 from sim_backends.physics.body import Twist, Velocity
 from sim_backends.physics.differential_drive import DifferentialDrive
@@ -29,8 +29,8 @@ S = 1000 * MS
 
 def state_of(
     place_m: Vector, velocity_m_s: Vector = (0.0, 0.0, 0.0), *, sent_ns: int = 0, source: str = "a"
-) -> Received:
-    return Received(source, State(place_m, velocity_m_s), sent_ns, sent_ns)
+) -> ReceivedDatagram:
+    return ReceivedDatagram(source, State(place_m, velocity_m_s), sent_ns, sent_ns)
 
 
 FOLLOWER_STATE = State((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
@@ -54,7 +54,7 @@ def test_older_states_and_other_datagrams_are_ignored() -> None:
     ignored = [
         state_of((9.0, 0.0, 0.0), sent_ns=30 * MS),
         state_of((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
-        Received("a", "hello", 50 * MS, 50 * MS),
+        ReceivedDatagram("a", "hello", 50 * MS, 50 * MS),
     ]
     assert program.wake(50 * MS, FOLLOWER_STATE, [latest, *ignored]) == expected
 

@@ -20,7 +20,7 @@ from sim_backends.cosim.programs.senders import (
 )
 from sim_backends.cosim.programs.wrappers import CombinedProgram, Outage
 from sim_backends.cosim.scenario.agent_plans import BagTraffic
-from sim_backends.network.packets import Datagram, Received
+from sim_backends.network.packets import Datagram, ReceivedDatagram
 from sim_backends.radio.random_streams import RandomStream
 from sim_backends.world.motion import State
 
@@ -98,8 +98,8 @@ def test_a_ping_sends_its_requests_and_every_request_gets_an_equal_reply() -> No
         EchoRequester("p/b", "b", count=3, interval_ns=100 * MS, size_bytes=56, first_ns=MS, protocol="tcp"), 10**12
     )
     assert [at_ns for at_ns, _ in requests] == [MS, 101 * MS, 201 * MS]
-    arrived = [Received("a", request.payload, at_ns, at_ns + MS) for at_ns, request in requests]
-    other = Received("a", ORIGIN, 0, MS)
+    arrived = [ReceivedDatagram("a", request.payload, at_ns, at_ns + MS) for at_ns, request in requests]
+    other = ReceivedDatagram("a", ORIGIN, 0, MS)
     replies = EchoResponder().wake(202 * MS, ORIGIN, [*arrived, other]).datagrams
     assert replies == [Datagram("a", 56, "p/b/reply", number, None, "tcp") for number in range(3)]
     assert all(isinstance(request.payload, PingRequest) for _, request in requests)
@@ -116,12 +116,12 @@ class CommandingProgram:
     def __init__(self, command: str, *wakes_ns: int) -> None:
         self._command = command
         self._wakes_ns = list(wakes_ns)
-        self.received: list[Received] = []
+        self.received: list[ReceivedDatagram] = []
 
     def next_wake_ns(self) -> int | None:
         return self._wakes_ns[0] if self._wakes_ns else None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self.received += received
         if self._wakes_ns and self._wakes_ns[0] <= now_ns:
             self._wakes_ns.pop(0)
@@ -136,7 +136,7 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
     while (wake_ns := program.next_wake_ns()) is not None:
         commands.append((wake_ns, program.wake(wake_ns, ORIGIN, ()).command))
     assert commands == [(3, "first"), (5, "second"), (7, "second")]
-    received = [Received("a", None, 0, 9)]
+    received = [ReceivedDatagram("a", None, 0, 9)]
     assert program.wake(9, ORIGIN, received) == Action()
     assert first.received == second.received == received
     # With a fast clock a program may wake later than planned.
@@ -165,7 +165,7 @@ def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() 
         (40, [4], None),
         (50, [5], None),
     ]
-    during, after = Received("a", 1, 0, 29), Received("a", 2, 0, 31)
+    during, after = ReceivedDatagram("a", 1, 0, 29), ReceivedDatagram("a", 2, 0, 31)
     outage = Outage(steers, 12, 31)
     assert outage.wake(29, ORIGIN, [during]) == Action()
     outage.wake(31, ORIGIN, [after])

@@ -19,7 +19,7 @@ from sim_backends.cosim.agents import Agents
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.programs.senders import Periodic
-from sim_backends.cosim.recording.captures import CapturedFlow, Captures, IpEncoder, between
+from sim_backends.cosim.recording.captures import CapturedFlow, Captures, IpEncoder, packets_between
 from sim_backends.cosim.recording.recorder import RunRecorder
 from sim_backends.cosim.recording.replay import read_recording
 from sim_backends.network.disc import Disc
@@ -290,7 +290,7 @@ def test_pings_are_icmp_and_a_given_port_is_used(tmp_path: Path) -> None:
     captures.flush()
     captures.close()
     content = (tmp_path / "captures" / "alpha.pcap").read_bytes()
-    (tmp_path / "part.pcap").write_bytes(between(content, MS, 3 * MS))
+    (tmp_path / "part.pcap").write_bytes(packets_between(content, MS, 3 * MS))
     frames = list(PcapReader(str(tmp_path / "captures" / "alpha.pcap")))
     assert frames[0][UDP].dport == 1234
     request, reply, other = (frame[ICMP] for frame in frames[1:])

@@ -62,7 +62,7 @@ def test_a_recording_reproduces_every_number(tmp_path: Path, policy: SyncPolicy)
     assert recording.run == live
     assert repr(errors(reference, recording.run)) == repr(errors(reference, live)), "also if values are nan"
     assert list(recording.run.fates) == list(live.fates), "in the same order, which affects the rounding of means"
-    assert recording.manifest.ending is RunEnding.WHOLE
+    assert recording.manifest.ending is RunEnding.COMPLETE
     assert recording.manifest.about == ABOUT
     # States are at 10 Hz, at the first end of a window from then on; a drives at 1 m/s, in steps of 1 ms.
     of_a = [(at_ns, state) for at_ns, agent, state in recording.states if agent == "a"]

@@ -45,12 +45,12 @@ WRONG = [
     ("window: 5ms", "window: 0ms", 5, "greater than 0"),
     ("window: 5ms", "window: -5ms", 5, "duration '-5ms' is below zero; write for example 15s or 15ms"),
     ("window: 5ms", "window: 5", 5, "'5' has no unit; write for example 5s or 5ms"),
-    ("window: 5ms", "window: 0.5ms", 5, "window of 0.0005 s is shorter than the physics' own step of 0.001 s"),
+    ("window: 5ms", "window: 0.5ms", 5, "window of 0.0005 s is shorter than the step of the physics, 0.001 s"),
     (
         "window: 5ms",
         "window: 0.9999999ms",
         5,
-        "window of 0.0009999999 s is shorter than the physics' own step of 0.001 s",
+        "window of 0.0009999999 s is shorter than the step of the physics, 0.001 s",
     ),
     ("window: 5ms", "windows: 5ms", 5, "unknown key windows; did you mean 'window'"),
     ("world: open", "world: opem", 3, "no world 'opem'.*\n.*did you mean 'open'"),
@@ -78,17 +78,27 @@ WRONG = [
     ("kind: follow", "kind: folow", 12, "no kind 'folow'; did you mean 'follow'"),
     ("      kind: follow\n", "", 12, "required key 'kind' is missing"),
     ("leader: one", "leader: noone", 14, "no agent 'noone'; did you mean 'one'"),
-    ("leader: one", "leader: [one, three]", 12, "two follows three and receives no states of it; add to the traffic"),
+    (
+        "leader: one",
+        "leader: [one, three]",
+        12,
+        "two follows three, but receives no states from it; add to the traffic",
+    ),
     ("distance: 2m", "distance: 0m", 15, "greater than 0"),
     ("from: one, to: two", "from: one, to: twö", 18, "'twö' is not a name of at most 31 lower-case letters"),
     ("from: one, to: two", "from: one, to: tow", 18, "no agent 'tow'; did you mean 'two'"),
-    ("from: one, to: two", "from: one, to: one", 18, "one sends to itself"),
+    ("from: one, to: two", "from: one, to: one", 18, "one is both the sender and a receiver"),
     ("from: one, to: two", "from: one, to: []", 18, "at least 1 item"),
     ("from: one, to: two", "from: one, to: [two, two]", 18, "listed twice"),
-    ("to: [one]", "to: [three]", 16, "three sends, receives or relays and has no radio"),
+    ("to: [one]", "to: [three]", 16, "three sends, receives or relays packets, but has no radio"),
     ("to: two, rate", "to: two, protocol: dds, rate", 18, "'dds' is not one of: udp, tcp, topic, ros1, ros1-udp"),
-    ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: name its host by relay: AGENT"),
-    ("to: two, rate", "to: two, qos: {depth: 3}, rate", 18, "only a topic has a qos, and the protocol is udp"),
+    ("to: two, rate", "to: two, protocol: ros1, rate", 18, "ros1 needs a master: set its host with relay: AGENT"),
+    (
+        "to: two, rate",
+        "to: two, qos: {depth: 3}, rate",
+        18,
+        "only the protocol topic has a qos, but the protocol is udp",
+    ),
     ("rate: 10Hz", "rate: 10", 18, "'10' has no unit; write for example 10Hz"),
     ("rate: 10Hz", "rate: 10Hz, size_bytes: 70000", 18, "less than or equal to 65000"),
     ("kind: bag", "name: one-stream\n    kind: bag", 19, "two entries of the traffic have the name 'one-stream'"),
@@ -101,7 +111,7 @@ WRONG = [
     ("stream, from: one, to: two, rate: 10Hz", "ping, from: one, to: two, interval: 1us", 18, "equal to 0.00001"),
     ("kind: node-loss", "kind: nodeloss", 24, "no kind 'nodeloss'; did you mean 'node-loss'"),
     ("agent: one, from", "agent: on, from", 24, "no agent 'on'; did you mean 'one'"),
-    ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "ends at 1 s, not after it begins at 2 s"),
+    ("from: 500ms, to: 1s", "from: 2s, to: 1s", 24, "the end at 1 s is not after the beginning at 2 s"),
     ("node-loss, agent: one", "jammer, power_dbm: 20", 24, r"needs either at_m: \[EAST, NORTH\], or an agent: NAME"),
     ("node-loss, agent: one", "link-cut, between: [one]", 24, "this list needs more values"),
     ("node-loss, agent: one", "link-cut, between: [one, one]", 24, "one has no link to itself"),
@@ -158,7 +168,7 @@ def test_a_robot_that_drives_cannot_follow_several_leaders(tmp_path: Path) -> No
 def test_an_unknown_scenario_is_reported_with_the_existing_ones() -> None:
     with pytest.raises(ConfigurationError, match=r"no scenario 'bayland'.*\n.*did you mean 'baylands'"):
         load_scenario("bayland")
-    with pytest.raises(ConfigurationError, match=r"scenarios: baylands, .*; or name a file that ends in .yaml"):
+    with pytest.raises(ConfigurationError, match=r"scenarios: baylands, .*; or give a file that ends in .yaml"):
         load_scenario("xyz")
     with pytest.raises(ConfigurationError, match=r"nowhere.yaml: cannot be read"):
         load_scenario("nowhere.yaml")

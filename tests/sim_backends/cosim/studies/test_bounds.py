@@ -9,7 +9,7 @@ from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.run_record import Run
-from sim_backends.cosim.studies.bounds import FixedCost, bound_cost, longest_for_all
+from sim_backends.cosim.studies.bounds import FixedCost, bound_cost, longest_sufficient_window
 from sim_backends.network.disc import Disc
 from sim_backends.physics.paths import Paths
 from sim_backends.world.motion import Motion, State, WayPoints
@@ -68,10 +68,10 @@ def test_the_window_for_all_runs_keeps_the_bound_in_each() -> None:
         other_m = 0.0 if 0.01 < window_s < 0.011 else 2 * window_s
         return [FixedCost(window_s, round(1 / window_s)), FixedCost(other_m, round(1 / window_s))]
 
-    window_s, fixed = longest_for_all([0.017, 0.0105], costs, 0.0105)
+    window_s, fixed = longest_sufficient_window([0.017, 0.0105], costs, 0.0105)
     assert fixed == costs(window_s)
     assert window_s == 0.0105
-    window_s, fixed = longest_for_all([0.009, 0.0105], costs, 0.0105)
+    window_s, fixed = longest_sufficient_window([0.009, 0.0105], costs, 0.0105)
     assert 0.00525 / 1.02 <= window_s <= 0.00525
     assert [cost.exchanges for cost in fixed] == [round(1 / window_s)] * 2
-    assert longest_for_all([0.01, math.nan], costs, 0.01)[1] == ()
+    assert longest_sufficient_window([0.01, math.nan], costs, 0.01)[1] == ()

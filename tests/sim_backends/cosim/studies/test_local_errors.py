@@ -26,7 +26,7 @@ from sim_backends.cosim.programs.senders import Periodic
 from sim_backends.cosim.studies.formation import SampledPhysics, Tracks
 from sim_backends.cosim.studies.local_errors import MEASURES, local_errors, low_discrepancy_times_ns, pool
 from sim_backends.network.disc import Disc
-from sim_backends.network.packets import Arrival, Drop, Packet, Received
+from sim_backends.network.packets import Arrival, Drop, Packet, ReceivedDatagram
 from sim_backends.world.motion import State
 from tests.helpers.moving_pair import DELAY_NS, LEAVES_NS, PERIOD_NS, SPEED_M_S, STEP_NS, moving_pair
 
@@ -135,7 +135,7 @@ class AcceleratingProgram:
     def next_wake_ns(self) -> None:
         return None
 
-    def wake(self, now_ns: int, own_state: State, received: Sequence[Received]) -> Action:
+    def wake(self, now_ns: int, own_state: State, received: Sequence[ReceivedDatagram]) -> Action:
         self._speed_m_s += 0.001 * len(received)
         return Action(command=self._speed_m_s)
 

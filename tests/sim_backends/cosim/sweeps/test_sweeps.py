@@ -54,7 +54,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("window=1xs", "unknown unit 'xs'"),
         ("radio.exponnt=2", "did you mean 'exponent'"),
         ("agents.husky-9.along=1m", "did you mean 'agents.husky-"),
-        ("window=1ms,1ms", "has a value twice"),
+        ("window=1ms,1ms", "has the same value twice"),
         ("window=1ms,0.001s", "are the same setting: window=1ms; and window=0.001s"),
         ("window", "is not NAME=VALUE"),
         ("distance=20kg", "unit 'kg'"),

@@ -146,7 +146,7 @@ def test_a_velocity_times_out_and_a_fence_breach_returns_home(gcs: GroundStation
 
 @pytest.mark.parametrize("seconds", [0, 200])
 def test_it_reports_why_it_cannot_be_armed(gcs: GroundStation, seconds: int) -> None:
-    gcs.autopilot.vehicle.battery.left -= seconds / 1000
+    gcs.autopilot.vehicle.battery.charge -= seconds / 1000
     gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, b"BATT_ARM_VOLT", 12.5, d.MAV_PARAM_TYPE_REAL32))
     low = bool(seconds)
     assert gcs.command(d.MAV_CMD_RUN_PREARM_CHECKS) == OK

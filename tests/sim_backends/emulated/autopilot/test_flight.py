@@ -30,7 +30,7 @@ quadrotors = st.sampled_from([DUCKIEDRONE, IRIS])
 def flying(limits: QuadrotorLimits = DUCKIEDRONE, heading_rad: float = 0.0) -> Airframe:
     """Return a drone that hovers 10 m above the ground, where its home is."""
     body = Airframe(limits, (3.0, 4.0, 10.0), heading_rad, FLOOR, 0)
-    body.driven = True
+    body.motors_on = True
     body.step((0.0, 0.0, 0.0), limits)
     return body
 
@@ -81,7 +81,7 @@ def test_without_motors_it_falls_with_drag_and_comes_to_rest() -> None:
     """Linear drag alone, from rest: v(t) = g m / c (1 - exp(-c t / m))."""
     limits = replace(DUCKIEDRONE, drag_n_s2_m2=0.0)
     body = flying(limits)
-    body.driven = False
+    body.motors_on = False
     fallen = []
     while not body.on_ground:
         body.step((0.0, 0.0, 5.0), limits)
@@ -113,7 +113,7 @@ def house() -> Sequence[Footprint]:
 
 def test_it_lands_on_the_roof_below_it_and_a_wall_stops_it() -> None:
     body = Airframe(DUCKIEDRONE, (0.0, 0.0, 0.0), 0.0, house(), 0)
-    body.driven = True
+    body.motors_on = True
     for _ in range(2_000):
         body.step(velocity_to((6.0, 0.0, 1.5), body, DUCKIEDRONE), DUCKIEDRONE)
     assert body.place_m[0] == pytest.approx(4.0 - DUCKIEDRONE.radius_m, abs=1e-3), "the wall"

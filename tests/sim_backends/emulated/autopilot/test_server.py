@@ -27,7 +27,7 @@ from sim_backends.world.world import load_world
 port, folder = int(sys.argv[1]), Path(sys.argv[2])
 world = load_world("lawn").model_dump_json()
 drone = Drone(7, port, "px4", "duckiedrone", 3.0, max_height_m=30.0, fence_m=100.0, antenna_m=0.1, world=world)
-serve(drone, motion=folder / "motion", steered=folder / "steered", ready=folder / "ready")
+serve(drone, assigned_paths=folder / "motion", motion_record=folder / "steered", ready=folder / "ready")
 """
 
 

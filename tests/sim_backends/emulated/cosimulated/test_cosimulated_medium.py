@@ -19,7 +19,7 @@ from fieldkit.measure.evidence import oracle_delays
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.steered import SILENT_NS
+from sim_backends.emulated.ros.motion_record import SILENT_NS
 from sim_backends.federates.frames import NETWORK
 from sim_backends.federates.named import command_line, default_options
 from sim_backends.world.world import load_world
@@ -170,18 +170,18 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
         bench.driven.drive(0.2, 1.0)
         os.kill(pid, signal.SIGSTOP)
         last = bench.driven.drive(0.2, SILENT_NS / 1e9)
-        assert last.moves
+        assert last.is_moving
         at_rest = last.at(time.monotonic_ns() + SILENT_NS)
-        assert not at_rest.moves
+        assert not at_rest.is_moving
         assert distance_m(at_rest, last.place_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
         os.kill(pid, signal.SIGCONT)
-        wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.moves, Deadline.after(60))
-        wait_until(lambda: bench.driven.drive(0.2, 0.5).moves, Deadline.after(60))
+        wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.is_moving, Deadline.after(60))
+        wait_until(lambda: bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="killed by SIGKILL"):
             bench.medium.place(PLACES)
         motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
-        assert not motion.at(time.monotonic_ns() + SILENT_NS).moves
+        assert not motion.at(time.monotonic_ns() + SILENT_NS).is_moving
 
 
 def test_a_robot_cannot_be_put_into_the_wall(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from fieldkit.core.errors import TestbedLostError
 from fieldkit.core.model import Vector
 from sim_backends.emulated.emulated_options import SyncOptions
 from sim_backends.emulated.robot.spec import ANTENNA_M
-from sim_backends.emulated.ros.steered import SILENT_NS
+from sim_backends.emulated.ros.motion_record import SILENT_NS
 from sim_backends.federates.frames import PHYSICS
 from sim_backends.federates.named import command_line, default_options
 from sim_backends.gazebo.sdf import SdfRobot, world_sdf
@@ -55,7 +55,7 @@ def test_it_puts_robots_at_places_and_drives_them_into_the_wall(server: GazeboSe
         places_m={**PLACES, "a": NEAR_WALL_M},
     ) as bench:
         wait_until(lambda: bench.driven.drive(0.2, 2.0).place_m[0] > 3.75, Deadline.after(60))
-        wait_until(lambda: not bench.driven.drive(0.2, 0.5).moves, Deadline.after(60))
+        wait_until(lambda: not bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
         stopped = bench.driven.drive(0.2, 0.5)
         assert stopped.place_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis has 69 mm in front"
         bench.driven.assign(PLACES["a"])
@@ -68,4 +68,4 @@ def test_it_puts_robots_at_places_and_drives_them_into_the_wall(server: GazeboSe
         os.kill(server.process.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="Gazebo"):
             wait_until(lambda: fails(bench), Deadline.after(60))
-        assert not bench.driven.drive(0.2, 0.1).at(time.monotonic_ns() + SILENT_NS).moves
+        assert not bench.driven.drive(0.2, 0.1).at(time.monotonic_ns() + SILENT_NS).is_moving

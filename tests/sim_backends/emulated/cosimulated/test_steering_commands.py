@@ -1,4 +1,4 @@
-"""Commanded velocities of a robot, also while the simulation lags behind real time."""
+"""VelocityCommand velocities of a robot, also while the simulation lags behind real time."""
 
 import time
 from collections.abc import Iterator
@@ -8,8 +8,8 @@ import pytest
 
 from sim_backends.emulated.cosimulated.steering import Command, GroundSteering
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
-from sim_backends.emulated.robot.commanded import Commanded, CommandedRecord
 from sim_backends.emulated.robot.spec import ANTENNA_M
+from sim_backends.emulated.robot.velocity_command import VelocityCommand, VelocityCommandRecord
 from sim_backends.physics.body import Twist
 from tests.helpers.cosim_benches import Driven
 
@@ -24,8 +24,8 @@ def driven(tmp_path: Path) -> Driven:
 
 
 @pytest.fixture
-def record(driven: Driven) -> Iterator[CommandedRecord]:
-    record = CommandedRecord.open(driven.folder / "commanded")
+def record(driven: Driven) -> Iterator[VelocityCommandRecord]:
+    record = VelocityCommandRecord.open(driven.folder / "commanded")
     yield record
     record.close()
 
@@ -38,30 +38,34 @@ def placed(driven: Driven) -> tuple[GroundSteering, int]:
     return steering, start_ns
 
 
-def test_a_simulation_that_lags_applies_every_velocity_at_its_time(driven: Driven, record: CommandedRecord) -> None:
+def test_a_simulation_that_lags_applies_every_velocity_at_its_time(
+    driven: Driven, record: VelocityCommandRecord
+) -> None:
     """It lags by 200 ms, more than the interval of the velocities, 50 ms: each is read before it applies."""
     steering, start_ns = placed(driven)
     applied: list[tuple[int, Command]] = []
     for command in range(1, 21):
         at_ns = start_ns + 50 * MS * command
-        record.write(Commanded(at_ns, 0.01 * command, 0.0))
+        record.write(VelocityCommand(at_ns, 0.01 * command, 0.0))
         applied += steering.commands(at_ns - 200 * MS)
     assert applied == [(start_ns + 50 * MS * command, Twist(0.01 * command)) for command in range(1, 17)]
 
 
-def test_the_stop_after_a_missing_velocity_precedes_a_later_one(driven: Driven, record: CommandedRecord) -> None:
+def test_the_stop_after_a_missing_velocity_precedes_a_later_one(
+    driven: Driven, record: VelocityCommandRecord
+) -> None:
     steering, start_ns = placed(driven)
     first_ns, later_ns = start_ns + MS, start_ns + MS + 2 * TIMEOUT_NS
-    record.write(Commanded(first_ns, 0.2, 0.1))
+    record.write(VelocityCommand(first_ns, 0.2, 0.1))
     assert list(steering.commands(first_ns)) == [(first_ns, Twist(0.2, 0.1))]
-    record.write(Commanded(later_ns, 0.1, 0.0))
+    record.write(VelocityCommand(later_ns, 0.1, 0.0))
     assert list(steering.commands(later_ns)) == [(first_ns + TIMEOUT_NS, Twist()), (later_ns, Twist(0.1))]
     assert list(steering.commands(later_ns + TIMEOUT_NS)) == [(later_ns + TIMEOUT_NS, Twist())]
 
 
-def test_a_velocity_from_before_a_placement_is_dropped(driven: Driven, record: CommandedRecord) -> None:
+def test_a_velocity_from_before_a_placement_is_dropped(driven: Driven, record: VelocityCommandRecord) -> None:
     steering, start_ns = placed(driven)
-    record.write(Commanded(start_ns + 10 * MS, 0.2, 0.0))
+    record.write(VelocityCommand(start_ns + 10 * MS, 0.2, 0.0))
     assert list(steering.commands(start_ns)) == []
     driven.assign((3.0, 2.0, ANTENNA_M))
     assert steering.poll_placement(start_ns + 20 * MS) is not None

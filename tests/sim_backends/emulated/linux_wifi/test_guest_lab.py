@@ -83,7 +83,7 @@ def test_ssh_logs_in_on_a_robot_through_the_channel(lab: GuestLab, directory: Pa
     def join() -> None:
         client, _ = listener.accept()
         with client, robot:
-            lab_relay._join(client, robot)
+            lab_relay._copy_both_ways(client, robot)
 
     with listener:
         thread = threading.Thread(target=join)

@@ -32,7 +32,7 @@ def parts(
     robots: dict[Role, Robot], *, radio: Mapping[str, object] = MappingProxyType({}), **settings: object
 ) -> dict[Role, WifiSpec]:
     options = EmulatedOptions.model_validate({"wifi": "linux", "linux_wifi": settings, "radio": dict(radio)})
-    return lab.parts(robots, options.linux_wifi, options.radio)
+    return lab.wifi_specs(robots, options.linux_wifi, options.radio)
 
 
 def settings_of(text: str) -> dict[str, str]:

@@ -158,7 +158,7 @@ def in_a_fade(options: RadioOptions) -> dict[str, Vector]:
     for centimetres in range(7700, 7900):
         places: dict[str, Vector] = {"b": (0.0, 0.0, 0.0), "r": (centimetres / 100, 0.0, 0.0)}
         channel.move(0, places)
-        if channel.linked(0, 1) and channel.powers_mw(0, 0)[1] < channel.sensitivity_mw[1] / 2:
+        if channel.are_linked(0, 1) and channel.powers_mw(0, 0)[1] < channel.sensitivity_mw[1] / 2:
             return places
     raise AssertionError("no fade in this range")
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Vector
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated.provisioning import laser_targets, neighbour
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.laser import Neighbourhood, PlacesWriter, ranges_m
@@ -172,7 +172,7 @@ def test_the_range_to_a_robot_is_its_distance_less_its_radius(writer: PlacesWrit
     def scan(**places_m: Vector) -> np.ndarray:
         writer.write(places_m)
         data = source.message(0, 0, own_motion)
-        message: Any = shipped().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan")
+        message: Any = standard_types().ros1.deserialize_ros1(data, "sensor_msgs/msg/LaserScan")
         return np.asarray(message.ranges)
 
     for distance_m in (2.0, 3.0, 1.0):

@@ -16,7 +16,7 @@ from fieldkit.config import locations
 from fieldkit.config.profiles import load_profile
 from fieldkit.core.model import Leg, Move, Placement, Role, Scenario, Topology
 from fieldkit.core.units import parse_distance
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated import placement as places
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import own_motion
@@ -34,7 +34,7 @@ ANGLES: Final = st.floats(-math.pi, math.pi)
 MOTIONS: Final = st.builds(
     OwnMotion, METRES, METRES, ANGLES, st.floats(-2, 2), st.tuples(METRES, METRES, st.floats(0, 100)), ANGLES, ANGLES
 )
-STORE: Final = shipped().ros1
+STORE: Final = standard_types().ros1
 
 
 @cache

@@ -66,9 +66,9 @@ def test_a_missing_file_or_an_incomplete_line_is_ignored(tmp_path: Path) -> None
     path = tmp_path / "motion"
     odometer = Odometer(path, 0)
     assert odometer.at(S) == AT_REST
-    path.write_text('{"began_ns": 0, "points_m": [[1.0,', encoding="ascii")
+    path.write_text('{"start_ns": 0, "points_m": [[1.0,', encoding="ascii")
     assert odometer.at(2 * S) == AT_REST
-    path.write_text('{"began_ns": 0, "points_m": [[1.0, 2.0, 0.2]], "speed_m_s": 1.0, "facing_rad": 0.0}\n')
+    path.write_text('{"start_ns": 0, "points_m": [[1.0, 2.0, 0.2]], "speed_m_s": 1.0, "facing_rad": 0.0}\n')
     assert odometer.at(3 * S).place_m == (1.0, 2.0, UP_M)
 
 

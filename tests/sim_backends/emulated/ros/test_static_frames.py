@@ -6,7 +6,7 @@ import pytest
 
 from fieldkit.config import locations
 from fieldkit.config.profiles import load_profile
-from fieldkit.ros.interfaces.types import shipped
+from fieldkit.ros.interfaces.types import standard_types
 from sim_backends.emulated.provisioning import _sensor
 from sim_backends.emulated.ros import static_frames
 
@@ -41,7 +41,9 @@ def test_a_turtlebots_frames_are_those_of_its_description() -> None:
 
 def test_the_message_can_be_deserialized_by_ros_1() -> None:
     links = (("base_link", "a"), ("base_link", "b"))
-    read: Any = shipped().ros1.deserialize_ros1(static_frames.message(links, 3_000_000_004), "tf2_msgs/msg/TFMessage")
+    read: Any = standard_types().ros1.deserialize_ros1(
+        static_frames.message(links, 3_000_000_004), "tf2_msgs/msg/TFMessage"
+    )
     for (parent, child), transform in zip(links, read.transforms, strict=True):
         assert (transform.header.frame_id, transform.child_frame_id) == (parent, child)
         assert (transform.header.stamp.sec, transform.header.stamp.nanosec) == (3, 4)

@@ -128,4 +128,4 @@ def test_unsupported_types_are_rejected_with_a_remedy(published: PublishedTopic,
 def test_a_template_has_serialized_head_and_tail() -> None:
     template = templates.template_of(topic("type: sensor_msgs/CompressedImage, size: 5B"))
     assert bytes.fromhex(template.head) == struct.pack("<I", 4) + b"jpeg" + struct.pack("<I", 5)
-    assert (template.tail, template.size_bytes, template.stamped, template.floats) == ("", 5, True, False)
+    assert (template.tail, template.size_bytes, template.has_header, template.floats) == ("", 5, True, False)

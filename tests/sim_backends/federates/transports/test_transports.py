@@ -36,7 +36,7 @@ WRITE_EARLY: Final = """
 import sys
 from sim_backends.federates.transports.dds import DdsBus, parse
 
-bus = DdsBus(parse(sys.argv[1]), reads="requests", writes="answers")
+bus = DdsBus(parse(sys.argv[1]), read_topic="requests", write_topic="answers")
 for sample in (b"busy", b"error", b"end"):
     bus.write(sample, None)
 print("written", flush=True)
@@ -127,7 +127,7 @@ def test_the_last_answers_reach_a_coordinator_that_discovers_their_writer_late()
     ) as writer:
         assert writer.stdout is not None
         assert writer.stdout.readline() == "written\n"
-        bus = DdsBus(parse_dds(address), reads="answers", writes="requests")
+        bus = DdsBus(parse_dds(address), read_topic="answers", write_topic="requests")
         try:
             assert [bus.receive(time.monotonic() + 60) for _ in range(2)] == [b"error", b"end"]
             bus.write(b"live", time.monotonic() + 60)

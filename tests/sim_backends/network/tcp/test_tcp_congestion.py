@@ -31,7 +31,7 @@ def test_slow_start_grows_by_acknowledged_bytes_up_to_the_threshold(make: Callab
     for count in range(40):
         assert control.window_bytes == (10 + count) * MSS
         control.on_ack(count * MS, MSS, 20 * MS)
-    control.on_timeout(50 * MSS, again=False)
+    control.on_timeout(50 * MSS, is_repeated=False)
     threshold_bytes = control.threshold_bytes
     assert threshold_bytes is not None
     assert control.window_bytes == MSS
@@ -59,8 +59,8 @@ def test_reno_halves_the_flight_and_grows_by_a_segment_per_round_trip() -> None:
 
 def test_a_repeated_timeout_keeps_the_threshold() -> None:
     control = NewReno(TcpOptions())
-    control.on_timeout(100 * MSS, again=False)
-    control.on_timeout(MSS, again=True)
+    control.on_timeout(100 * MSS, is_repeated=False)
+    control.on_timeout(MSS, is_repeated=True)
     assert (control.window_bytes, control.threshold_bytes) == (MSS, 50 * MSS)
 
 
@@ -105,7 +105,7 @@ def test_cubic_lowers_its_plateau_when_its_peak_falls() -> None:
 
 def test_cubic_starts_at_its_plateau_after_a_timeout() -> None:
     control = after_a_loss(1000)
-    control.on_timeout(500 * MSS, again=False)
+    control.on_timeout(500 * MSS, is_repeated=False)
     control.on_ack(SECOND, 349 * MSS, 100 * MS)
     assert control.window_bytes == control.threshold_bytes == 350 * MSS
     # RFC 9438, 4.8: K is 0 and W_max is the current window. The first ACK of congestion avoidance starts the epoch.

@@ -75,7 +75,7 @@ def test_after_one_loss_half_as_much_is_sent_as_arrives() -> None:
     reduction, pipe, sent = ProportionalReduction(50, 100, 1), 96, []
     for _ in range(90):
         pipe -= 1
-        sent.append(reduction.window_bytes(pipe, 1, safe=False) - pipe)
+        sent.append(reduction.window_bytes(pipe, 1, is_safe=False) - pipe)
         reduction.on_sent(sent[-1])
         pipe += sent[-1]
     assert sent[:8] == [1, 0, 1, 0, 1, 0, 1, 0]
@@ -85,14 +85,14 @@ def test_after_one_loss_half_as_much_is_sent_as_arrives() -> None:
 def test_after_many_losses_as_much_is_sent_as_arrives_and_one_more_per_safe_ack() -> None:
     # 60 of 100 are lost: the bytes in flight are below the threshold from the start.
     reduction = ProportionalReduction(50, 100, 1)
-    assert reduction.window_bytes(37, 1, safe=False) == 38
+    assert reduction.window_bytes(37, 1, is_safe=False) == 38
     reduction.on_sent(1)
-    assert reduction.window_bytes(37, 1, safe=False) == 38
+    assert reduction.window_bytes(37, 1, is_safe=False) == 38
     reduction.on_sent(1)
-    assert reduction.window_bytes(37, 1, safe=True) == 39
+    assert reduction.window_bytes(37, 1, is_safe=True) == 39
     reduction.on_sent(2)
     # Never beyond the threshold.
-    assert reduction.window_bytes(49, 9, safe=True) == 50
+    assert reduction.window_bytes(49, 9, is_safe=True) == 50
 
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3)), max_size=80))
@@ -101,7 +101,7 @@ def test_no_more_is_sent_than_arrives_while_losses_are_detected(acks: list[tuple
     for delivered, lost in acks:
         arrived += delivered
         pipe = max(pipe - delivered - lost, 0)
-        allowed = reduction.window_bytes(pipe, delivered, safe=False) - pipe
+        allowed = reduction.window_bytes(pipe, delivered, is_safe=False) - pipe
         reduction.on_sent(allowed)
         pipe, sent = pipe + allowed, sent + allowed
         assert 0 <= sent <= arrived
@@ -109,27 +109,27 @@ def test_no_more_is_sent_than_arrives_while_losses_are_detected(acks: list[tuple
 
 def test_at_the_threshold_nothing_more_is_sent() -> None:
     # By the proportional share, which applies above the threshold, one would be sent.
-    assert ProportionalReduction(50, 100, 1).window_bytes(50, 1, safe=True) == 50
-    assert ProportionalReduction(50, 100, 1).window_bytes(51, 1, safe=True) == 52
+    assert ProportionalReduction(50, 100, 1).window_bytes(50, 1, is_safe=True) == 50
+    assert ProportionalReduction(50, 100, 1).window_bytes(51, 1, is_safe=True) == 52
 
 
 def test_a_sender_that_sent_more_than_arrived_waits() -> None:
     for pipe in (60, 40):
         reduction = ProportionalReduction(50, 100, 1)
         reduction.on_sent(3)
-        assert reduction.window_bytes(pipe, 1, safe=False) == pipe
+        assert reduction.window_bytes(pipe, 1, is_safe=False) == pipe
 
 
 def test_a_safe_ack_allows_one_segment_more_than_it_delivers() -> None:
     """For any amount sent before: MAX(prr_delivered - prr_out, DeliveredData) + MSS, in bytes."""
     reduction = ProportionalReduction(50_000, 100_000, 1448)
     reduction.on_sent(9 * 1448)
-    assert reduction.window_bytes(10_000, 2 * 1448, safe=True) == 10_000 + 3 * 1448
-    assert reduction.window_bytes(10_000, 2 * 1448, safe=False) == 10_000
+    assert reduction.window_bytes(10_000, 2 * 1448, is_safe=True) == 10_000 + 3 * 1448
+    assert reduction.window_bytes(10_000, 2 * 1448, is_safe=False) == 10_000
     # With 15 more that arrived, 10 may be sent in addition to the one.
-    assert reduction.window_bytes(10_000, 15 * 1448, safe=True) == 10_000 + 16 * 1448
+    assert reduction.window_bytes(10_000, 15 * 1448, is_safe=True) == 10_000 + 16 * 1448
     reduction.on_sent(5 * 1448)
-    assert reduction.window_bytes(10_000, 1448, safe=True) == 10_000 + 7 * 1448
+    assert reduction.window_bytes(10_000, 1448, is_safe=True) == 10_000 + 7 * 1448
 
 
 STEPS = st.lists(st.tuples(st.integers(0, 120), st.integers(0, 9), st.booleans(), st.integers(0, 9)), max_size=30)
@@ -140,15 +140,15 @@ def test_the_window_equals_the_equations_of_the_rfc(
     threshold: int, flight: int, segment: int, steps: list[tuple[int, int, bool, int]]
 ) -> None:
     reduction, delivered_so_far, sent_so_far = ProportionalReduction(threshold, flight, segment), 0, 0
-    for pipe, delivered, safe, sent in steps:
+    for pipe, delivered, is_safe, sent in steps:
         delivered_so_far += delivered
         if pipe > threshold:
             count = math.ceil(Fraction(delivered_so_far * threshold, flight)) - sent_so_far
         else:
             limit = delivered_so_far - sent_so_far
-            if safe:
+            if is_safe:
                 limit = max(limit, delivered) + segment
             count = min(threshold - pipe, limit)
-        assert reduction.window_bytes(pipe, delivered, safe=safe) == max(pipe, pipe + count)
+        assert reduction.window_bytes(pipe, delivered, is_safe=is_safe) == max(pipe, pipe + count)
         reduction.on_sent(sent)
         sent_so_far += sent

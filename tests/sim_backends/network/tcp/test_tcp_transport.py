@@ -250,7 +250,7 @@ def test_the_stream_arrives_in_order_once_or_is_given_up_after_any_loss_reorderi
     wire.run()
     for connection in transport._connections.values():
         scoreboard = connection._sender.scoreboard
-        assert (len(scoreboard), scoreboard.pipe_bytes, len(scoreboard._arrived)) == (0, 0, 0)
+        assert (len(scoreboard), scoreboard.pipe_bytes, len(scoreboard._arrived_ranges)) == (0, 0, 0)
         assert connection._sender._timer.due_ns is None
         assert connection._sender._reordering_timer.due_ns is None
     assert list(wire.delivered) == sorted(wire.delivered)

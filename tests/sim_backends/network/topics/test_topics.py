@@ -159,7 +159,7 @@ def test_a_large_sample_is_repaired_first_by_one_fragment_then_by_the_missing_on
     assert wire.delivered[1] == 2 * PERIOD_NS + 5 * DELAY_NS
 
 
-EVICTED = "pushed out of the writer's history before it was acknowledged"
+EVICTED = "evicted from the writer's history before it was acknowledged"
 
 
 def test_samples_evicted_from_the_history_are_lost() -> None:

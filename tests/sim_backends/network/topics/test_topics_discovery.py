@@ -44,7 +44,7 @@ def session(wire: ScriptedWire) -> TopicSession:
 
 def run_until_matched(wire: ScriptedWire) -> None:
     topic_session = session(wire)
-    while not (topic_session.writer.matched and topic_session.reader.matched):
+    while not (topic_session.writer.is_matched and topic_session.reader.is_matched):
         wire.run(wire.next_event_ns())
         assert wire.now_ns < 1000 * SECOND
 
@@ -122,12 +122,12 @@ def test_a_participant_is_removed_after_its_lease_and_discovered_again() -> None
     publish(wire, [at_ns * SECOND for at_ns in (10, 25, 50, 75)])
     run_until_matched(wire)
     wire.run(50 * SECOND - 1)
-    assert not session(wire).writer.matched
-    assert not session(wire).reader.matched
+    assert not session(wire).writer.is_matched
+    assert not session(wire).reader.is_matched
     # The last packet received from b was the announcement at 16.1 s, so the second sample is given up at 26.1 s.
-    assert wire.dropped == {1: "the subscriber's lease ran out"}
+    assert wire.dropped == {1: "the lease of the subscriber expired"}
     wire.run(80 * SECOND)
-    assert wire.dropped == {1: "the subscriber's lease ran out", 2: "not matched yet"}
+    assert wire.dropped == {1: "the lease of the subscriber expired", 2: "not matched yet"}
     assert list(wire.delivered) == [0, 3]
 
 
@@ -145,10 +145,10 @@ def test_a_participant_removed_on_one_side_only_is_discovered_again(sources: str
         if sources == "a"
         else (topic_session.writer, topic_session.reader)
     )
-    assert (unmatched_end.matched, matched_end.matched) == (False, True)
+    assert (unmatched_end.is_matched, matched_end.is_matched) == (False, True)
     wire.run(120 * SECOND)
-    assert topic_session.writer.matched
-    assert topic_session.reader.matched
+    assert topic_session.writer.is_matched
+    assert topic_session.reader.is_matched
     assert wire.delivered.keys() >= set(range(70, 99))
     assert sorted([*wire.delivered, *wire.dropped]) == list(range(99))
 
@@ -269,4 +269,6 @@ def test_many_participants_all_match() -> None:
     wire = ScriptedWire(DELAY_NS, hosts=hosts, script=losing_with(0.1, 1))
     topics = wire.transports["topic"] = Topics(wire, flows)
     wire.run(30 * SECOND)
-    assert all(topics._sessions[name].writer.matched and topics._sessions[name].reader.matched for name in flows)
+    assert all(
+        topics._sessions[name].writer.is_matched and topics._sessions[name].reader.is_matched for name in flows
+    )

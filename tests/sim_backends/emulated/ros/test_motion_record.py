@@ -11,15 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros.motion_record import SILENT_NS, MotionRecord, RecordedMotion
 from sim_backends.emulated.ros.own_motion import AssignedPath, MotionReporter, Odometer
-from sim_backends.emulated.ros.steered import SILENT_NS, Steered, SteeredRecord
 
 S = 10**9
 FLOATS = st.floats(-1e3, 1e3)
 VECTORS = st.tuples(FLOATS, FLOATS, FLOATS)
 TIMES = st.integers(0, 10**18)
 MOTIONS = st.builds(
-    Steered, TIMES, TIMES, VECTORS, VECTORS, heading_rad=FLOATS, turn_rad_s=st.floats(-3, 3), odometry=VECTORS
+    RecordedMotion, TIMES, TIMES, VECTORS, VECTORS, heading_rad=FLOATS, turn_rad_s=st.floats(-3, 3), odometry=VECTORS
 )
 
 
@@ -34,27 +34,27 @@ def fresh(folder: Path) -> Path:
 
 
 @given(st.lists(MOTIONS, max_size=5))
-def test_readers_get_the_last_motion(folder: Path, motions: list[Steered]) -> None:
+def test_readers_get_the_last_motion(folder: Path, motions: list[RecordedMotion]) -> None:
     path = fresh(folder)
-    writer, reader = SteeredRecord.open(path), SteeredRecord.open(path)
+    writer, reader = MotionRecord.open(path), MotionRecord.open(path)
     assert reader.read() is None
     for motion in motions:
         writer.write(motion)
         assert reader.read() == motion
-    late = SteeredRecord.open(path)
+    late = MotionRecord.open(path)
     assert late.read() == (motions[-1] if motions else None)
-    late.write(Steered(1, 2, (3.0, 4.0, 5.0)))  # a new process continues after a killed one
-    assert reader.read() == Steered(1, 2, (3.0, 4.0, 5.0))
+    late.write(RecordedMotion(1, 2, (3.0, 4.0, 5.0)))  # a new process continues after a killed one
+    assert reader.read() == RecordedMotion(1, 2, (3.0, 4.0, 5.0))
     for record in (writer, reader, late):
         record.close()
 
 
 @given(MOTIONS, MOTIONS, st.data())
 def test_a_partly_written_record_is_ignored(
-    folder: Path, first: Steered, second: Steered, data: st.DataObject
+    folder: Path, first: RecordedMotion, second: RecordedMotion, data: st.DataObject
 ) -> None:
     path = fresh(folder)
-    writer = SteeredRecord.open(path)
+    writer = MotionRecord.open(path)
     writer.write(first)
     before = path.read_bytes()
     writer.write(second)
@@ -62,7 +62,7 @@ def test_a_partly_written_record_is_ignored(
     written = after[: len(after) // 2]  # its slot is the first of both
     cut = data.draw(st.integers(0, len(written) - 1))
     path.write_bytes(written[:cut] + bytes(len(written) - cut) + before[len(written) :])
-    reader = SteeredRecord.open(path)
+    reader = MotionRecord.open(path)
     is_complete = not any(written[cut:])  # the missing bytes are zeros
     assert reader.read() == (second if is_complete else first)
     path.write_bytes(b"")
@@ -72,14 +72,14 @@ def test_a_partly_written_record_is_ignored(
 
 
 @given(MOTIONS, st.integers(0, 2 * SILENT_NS))
-def test_motion_is_extrapolated_until_the_timeout(motion: Steered, late_ns: int) -> None:
+def test_motion_is_extrapolated_until_the_timeout(motion: RecordedMotion, late_ns: int) -> None:
     now = motion.at(motion.time_ns + late_ns)
     for_s = min(late_ns, SILENT_NS) / 1e9
     assert now.place_m == pytest.approx(
         [p + v * for_s for p, v in zip(motion.place_m, motion.velocity_m_s, strict=True)], abs=1e-6
     )
     assert now.heading_rad == pytest.approx(motion.heading_rad + motion.turn_rad_s * for_s)
-    assert now.moves == (motion.moves and late_ns < SILENT_NS)
+    assert now.is_moving == (motion.is_moving and late_ns < SILENT_NS)
     assert motion.at(motion.time_ns - late_ns).place_m == motion.place_m, "never extrapolated into the past"
     x, y, _ = now.odometry
     assert math.hypot(x - motion.odometry[0], y - motion.odometry[1]) == pytest.approx(
@@ -130,12 +130,12 @@ def test_a_restarted_helm_continues_where_it_was(tmp_path: Path) -> None:
 def test_extrapolated_odometry_agrees_with_the_helm(folder: Path, driven: list[tuple[float, float]]) -> None:
     """With a record twenty times a second, the error of readers is far less than a centimetre."""
     path, step_s = fresh(folder), 0.05
-    record, pose = SteeredRecord.open(path), (0.0, 0.0, 0.0)
+    record, pose = MotionRecord.open(path), (0.0, 0.0, 0.0)
     motions = []
     for number, (speed, turn) in enumerate(driven):
         x, y, yaw = pose
         velocity = (speed * math.cos(yaw), speed * math.sin(yaw), 0.0)
-        motions.append(Steered(round(number * step_s * S), 0, (x, y, 0.0), velocity, yaw, turn, pose))
+        motions.append(RecordedMotion(round(number * step_s * S), 0, (x, y, 0.0), velocity, yaw, turn, pose))
         pose = x + speed * step_s * math.cos(yaw), y + speed * step_s * math.sin(yaw), yaw + turn * step_s
     for motion, after in pairwise(motions):
         record.write(motion)
@@ -148,4 +148,4 @@ def test_extrapolated_odometry_agrees_with_the_helm(folder: Path, driven: list[t
 def test_a_file_without_a_valid_record_is_none(tmp_path: Path) -> None:
     path = tmp_path / "record"
     path.write_bytes(struct.pack("<Q", 7) + os.urandom(300))
-    assert SteeredRecord.open(path).read() is None
+    assert MotionRecord.open(path).read() is None

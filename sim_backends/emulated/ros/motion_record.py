@@ -1,7 +1,7 @@
-"""Record of the motion of a robot that steers itself, read by its sensors and by the lab.
+"""Record of the motion of a robot that steers itself. The robot's sensors and the lab read it.
 
-One process of a robot writes it: its base controller, or its autopilot. Each record has the position and velocity and
-a time of the monotonic clock, which all processes of a machine share; readers extrapolate from there.
+One process of a robot writes it: its base controller, or its autopilot. Each record has the position, the velocity
+and a time of the monotonic clock, which all processes of a machine share. Readers extrapolate the motion.
 """
 
 import math
@@ -12,24 +12,24 @@ from sim_backends.emulated.ros.slots import Record
 from sim_backends.world.motion import STILL, State
 
 SILENT_NS: Final = 500_000_000
-"""Timeout: a robot that moves writes much more often than this, and one that has not written for this long stops."""
+"""A robot that has not written a record for this long counts as stopped. A moving robot writes much more often."""
 
 _LAYOUT: Final = "2q11d"
 
 
-class Steered(NamedTuple):
+class RecordedMotion(NamedTuple):
     """Motion of a robot that steers itself, at one time.
 
     Attributes:
         time_ns: The time, by the monotonic clock.
-        path_start_ns: Start of the assigned path (`AssignedPath.began_ns`) that put the robot at the start of this
-            motion; 0 without one. If the lab has assigned another path since, the record is invalid.
+        path_start_ns: Start of the assigned path (`AssignedPath.start_ns`) that put the robot at the start of this
+            motion; 0 if there was none. If the lab has assigned another path since, the record is invalid.
         place_m: Position, metres east, north, up.
         velocity_m_s: Velocity, east, north, up.
         heading_rad: Heading, from east towards north.
         turn_rad_s: Turn rate to the left.
-        odometry: Metres ahead from where the robot was switched on, metres to the left of that, and the angle turned
-            to the left since, in radians.
+        odometry: Metres ahead of the place where the robot was switched on, metres to the left of its heading at that
+            time, and the angle to the left of that heading in radians.
     """
 
     time_ns: int
@@ -52,19 +52,19 @@ class Steered(NamedTuple):
         return State(self.place_m, self.velocity_m_s, self.heading_rad)
 
     @property
-    def moves(self) -> bool:
+    def is_moving(self) -> bool:
         """True if the robot moves or turns."""
         return self.velocity_m_s != STILL or self.turn_rad_s != 0.0
 
-    def at(self, now_ns: int) -> "Steered":
-        """Return the motion at a later time by dead reckoning; a robot stops `SILENT_NS` after its last record."""
+    def at(self, now_ns: int) -> "RecordedMotion":
+        """Return the motion at a later time by dead reckoning. The robot stops `SILENT_NS` after its last record."""
         is_silent = now_ns - self.time_ns >= SILENT_NS
         elapsed_s = min(max(now_ns - self.time_ns, 0), SILENT_NS) / 1e9
         x_m, y_m, yaw_rad = self.odometry
         ahead_m = self.speed_m_s * elapsed_s
         later = self._replace(
             time_ns=max(now_ns, self.time_ns),
-            place_m=_moved(self.place_m, self.velocity_m_s, elapsed_s),
+            place_m=_extrapolated(self.place_m, self.velocity_m_s, elapsed_s),
             heading_rad=self.heading_rad + self.turn_rad_s * elapsed_s,
             odometry=(
                 x_m + ahead_m * math.cos(yaw_rad),
@@ -75,7 +75,7 @@ class Steered(NamedTuple):
         return later._replace(velocity_m_s=STILL, turn_rad_s=0.0) if is_silent else later
 
 
-class SteeredRecord(Record):
+class MotionRecord(Record):
     """The record in a file, with one writer and any number of readers."""
 
     layout = _LAYOUT
@@ -83,9 +83,9 @@ class SteeredRecord(Record):
     def __init__(self, fd: int) -> None:
         super().__init__(fd)
         self._values: tuple[Any, ...] | None = None
-        self._last: Steered | None = None
+        self._last: RecordedMotion | None = None
 
-    def write(self, motion: Steered) -> None:
+    def write(self, motion: RecordedMotion) -> None:
         """Write the robot's motion.
 
         Raises:
@@ -101,7 +101,7 @@ class SteeredRecord(Record):
             *motion.odometry,
         )
 
-    def read(self) -> Steered | None:
+    def read(self) -> RecordedMotion | None:
         """Return the newest motion, or None if the robot never steered itself.
 
         Raises:
@@ -109,17 +109,17 @@ class SteeredRecord(Record):
         """
         values = self._slots.read()
         if values is not None and values is not self._values:
-            self._values, self._last = values, _steered(*values)
+            self._values, self._last = values, _to_motion(*values)
         return self._last
 
 
-def _steered(time_ns: int, path_start_ns: int, *values: float) -> Steered:
+def _to_motion(time_ns: int, path_start_ns: int, *values: float) -> RecordedMotion:
     place, velocity, odometry = (_vector(values[index : index + 3]) for index in (0, 3, 8))
     heading_rad, turn_rad_s = values[6:8]
-    return Steered(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
+    return RecordedMotion(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
 
 
-def _moved(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
+def _extrapolated(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
     (east, north, up), (e, n, u) = place_m, velocity_m_s
     return east + e * for_s, north + n * for_s, up + u * for_s
 

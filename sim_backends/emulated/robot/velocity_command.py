@@ -1,6 +1,6 @@
-"""Record of the last velocity command to a robot's base, read by the physics that moves the robot.
+"""Record of the last velocity command to a robot's base, which the physics that moves the robot reads.
 
-Only the standard library is imported, because the base process is imported under Debian's Python, too.
+Only the standard library is imported, because programs under Debian's Python import this module, too.
 """
 
 from pathlib import Path
@@ -9,12 +9,12 @@ from typing import Final, NamedTuple
 from sim_backends.emulated.robot.spec import STATE
 from sim_backends.emulated.ros.slots import Record
 
-COMMANDED: Final = Path(STATE, "commanded")
+VELOCITY_COMMAND: Final = Path(STATE, "commanded")
 """The file of the record in the robot."""
 
 
-class Commanded(NamedTuple):
-    """Velocity command.
+class VelocityCommand(NamedTuple):
+    """A velocity command.
 
     Attributes:
         time_ns: Time at which the base received it, by the monotonic clock.
@@ -27,24 +27,24 @@ class Commanded(NamedTuple):
     turn_rad_s: float
 
 
-class CommandedRecord(Record):
+class VelocityCommandRecord(Record):
     """The record in a file, with one writer and any number of readers."""
 
     layout = "q2d"
 
-    def write(self, commanded: Commanded) -> None:
-        """Write a commanded velocity.
+    def write(self, command: VelocityCommand) -> None:
+        """Write a command.
 
         Raises:
             OSError: There is no space for it.
         """
-        self._slots.write(*commanded)
+        self._slots.write(*command)
 
-    def read(self) -> Commanded | None:
-        """Return the last commanded velocity, or None if there is none.
+    def read(self) -> VelocityCommand | None:
+        """Return the last command, or None if there is none.
 
         Raises:
             OSError: The file cannot be read.
         """
         values = self._slots.read()
-        return None if values is None else Commanded(*values)
+        return None if values is None else VelocityCommand(*values)
