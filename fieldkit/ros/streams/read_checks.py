@@ -45,7 +45,9 @@ def cross_checks(prefix: str, stream: str) -> tuple[CrossCheck, ...]:
         prefix: Prefix of the columns.
         stream: `topic`, or `video` for a stream over RTP.
     """
-    columns = tuple(f"{prefix}_{name}" for name in ("age_*", "blank", "repeated", "distinct", "never", "gap*"))
+    columns = tuple(
+        f"{prefix}_{name}" for name in ("age_*", "withheld", "blank", "repeated", "distinct", "never", "gap*")
+    )
     log = f"`ROLE-{stream}.bin` of the subscriber"
     return (
         CrossCheck(
