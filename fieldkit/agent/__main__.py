@@ -37,17 +37,17 @@ class StopRequest(threading.Event):
     suspended (SIGSTOP) when the signal arrived sends nothing after it is resumed.
     """
 
-    _signalled = False
+    _is_signalled = False
 
     def set_from_signal(self) -> None:
         """Set the event from a signal handler."""
-        self._signalled = True
+        self._is_signalled = True
         # In a separate thread: the main thread may be inside `wait` and hold the lock that `set` needs.
         threading.Thread(target=self.set).start()
 
     def is_set(self) -> bool:
         """Return True if the program must stop."""
-        return self._signalled or super().is_set()
+        return self._is_signalled or super().is_set()
 
 
 def main(argv: Sequence[str]) -> int:

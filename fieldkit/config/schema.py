@@ -4,7 +4,6 @@ This is the only module that imports pydantic. Profiles, procedures, site files 
 `Strict`, loaded by `load`.
 """
 
-import os
 from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
 from decimal import Decimal
@@ -86,9 +85,6 @@ __all__ = [
     "validate",
     "validation_error",
 ]
-
-# Before it builds its first model, pydantic searches the files of all installed packages for plugins: 25 ms.
-os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 Quantity = TypeVar("Quantity")
 

@@ -47,7 +47,7 @@ def add(parser: Parser) -> None:
 _WITHIN_S: Final = 10.0
 """Time limit for each robot; a reachable robot answers within a second."""
 _FIELD: Final = "field"
-_EMULATED: Final = (
+_EMULATED_REMEDY: Final = (
     "emulated robots of a trial belong to the fieldkit process of that trial: stop that process by Ctrl-C"
 )
 
@@ -65,7 +65,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     with _robots(arguments) as robots:
         if not robots:
-            raise ConfigurationError("there are no robots here that another program can stop", remedy=_EMULATED)
+            raise ConfigurationError(
+                "there are no robots here that another program can stop", remedy=_EMULATED_REMEDY
+            )
         for name in arguments.robots:
             if name not in robots:
                 raise ConfigurationError(

@@ -228,7 +228,8 @@ left() {
 
 strays() { # list processes in deleted folders of jobs, and send them signal $1 if it is given
     home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
-    ls -ld /proc/[0-9]*/cwd 2>/dev/null | while read -r line; do
+    # grep reads the list of a computer with many processes much faster than the shell.
+    ls -ld /proc/[0-9]*/cwd 2>/dev/null | grep -F "/cwd -> $home/" | while read -r line; do
         case $line in *"/cwd -> $home/"*" (deleted)") ;; *) continue ;; esac
         pid=${line%%/cwd -> *} where=${line#*"/cwd -> $home/"}
         pid=${pid##*/} where=${where% (deleted)}

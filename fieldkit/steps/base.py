@@ -155,16 +155,16 @@ def _load(point: EntryPoint) -> type[Step]:
     Raises:
         ConfigurationError: The class cannot be loaded, or is not a complete subclass of `Step`.
     """
-    loaded, location, remedy = plugins.load(point), plugins.location(point), plugins.REMEDY
-    if not (isinstance(loaded, type) and issubclass(loaded, Step)):
+    step_class, location, remedy = plugins.load(point), plugins.location(point), plugins.REMEDY
+    if not (isinstance(step_class, type) and issubclass(step_class, Step)):
         raise ConfigurationError("a kind of step must be a subclass of Step", where=location, remedy=remedy)
-    if isabstract(loaded):
-        missing = ", ".join(sorted(loaded.__abstractmethods__))
+    if isabstract(step_class):
+        missing = ", ".join(sorted(step_class.__abstractmethods__))
         raise ConfigurationError(f"the kind of step lacks {missing}", where=location, remedy=remedy)
-    if missing := ", ".join(capabilities.missing_methods(loaded)):
+    if missing := ", ".join(capabilities.missing_methods(step_class)):
         reason = f"the kind of step has only a part of a capability: it lacks {missing}"
         raise ConfigurationError(reason, where=location, remedy=remedy)
-    return loaded
+    return step_class
 
 
 @cache

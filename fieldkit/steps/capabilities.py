@@ -30,7 +30,7 @@ class Capability(ABC):  # noqa: B024 (its subclasses have the abstract methods)
     @override
     def __subclasshook__(cls, candidate: type) -> bool:
         # A step that derives from a capability inherits this method.
-        if Capability in cls.__bases__ and not _undefined(cls, candidate):
+        if Capability in cls.__bases__ and not _undefined_methods(cls, candidate):
             return True
         return NotImplemented  # type: ignore[no-any-return]
 
@@ -267,9 +267,9 @@ def missing_methods(kind: type) -> tuple[str, ...]:
     """
     missing = set[str]()
     for capability in CAPABILITIES:
-        undefined = _undefined(capability, kind)
-        if undefined < _methods(capability):
-            missing |= undefined
+        undefined_methods = _undefined_methods(capability, kind)
+        if undefined_methods < _methods(capability):
+            missing |= undefined_methods
     return tuple(sorted(missing))
 
 
@@ -277,6 +277,6 @@ def _methods(capability: type[Capability]) -> frozenset[str]:
     return frozenset(name for name in vars(capability) if not name.startswith("_"))
 
 
-def _undefined(capability: type[Capability], candidate: type) -> frozenset[str]:
+def _undefined_methods(capability: type[Capability], candidate: type) -> frozenset[str]:
     """Return the methods of a capability that a class does not define."""
     return frozenset(name for name in _methods(capability) if not callable(getattr(candidate, name, None)))

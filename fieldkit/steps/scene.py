@@ -263,7 +263,7 @@ class Flow:
         frames: Approximate number of Ethernet frames including answers, from `frames`.
         protocol: Transport protocol; None for the protocol under test.
         group: A multicast group to which either of them also sends; None without multicast.
-        served: Whether a program that the step does not start listens on the source.
+        has_other_listener: Whether a program that the step does not start listens on the source.
         link: Name of the link that carries them; empty for the radio under test.
     """
 
@@ -273,7 +273,7 @@ class Flow:
     frames: float = 0.0
     protocol: Protocol | None = None
     group: str | None = None
-    served: bool = False
+    has_other_listener: bool = False
     link: str = ""
 
 

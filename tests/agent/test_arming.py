@@ -76,7 +76,7 @@ def test_no_faults_for_a_ready_autopilot() -> None:
     ("replaced", "fault"),
     [
         ({"first": beat(d.MAV_AUTOPILOT_GENERIC)}, "its autopilot is neither PX4 nor ArduCopter (0, 2)"),
-        ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors turn"),
+        ({"first": beat(d.MAV_AUTOPILOT_PX4, base=d.MAV_MODE_FLAG_SAFETY_ARMED)}, "its motors are running"),
         ({"place": None}, "it does not report its position"),
         (
             {"estimate": d.MAVLink_ekf_status_report_message(0xA7, 1, 1, 1, 1, 1)},
@@ -107,7 +107,7 @@ def test_text_in_pieces_is_joined() -> None:
     long = b"PreArm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT"
     pieces = {f"text{n}": d.MAVLink_statustext_message(2, long[50 * n :][:50], 5, n) for n in range(2)}
     (fault,) = faults(**pieces)
-    assert fault.endswith("armed: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT")
+    assert fault.endswith("to arm: Battery 1 below minimum arming voltage, which is set by BATT_ARM_VOLT")
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUCOPTER])

@@ -72,7 +72,7 @@ def test_position_beyond_fence_and_margin_is_a_breach() -> None:
     out_m = 20.0 + FENCE_MARGIN_M
     assert not fence.breach((FIRST.x_m + out_m - 0.1, FIRST.y_m, -4.0))
     assert "from its origin" in fence.breach((FIRST.x_m + out_m + 0.1, FIRST.y_m, -4.0))
-    assert "high" in fence.breach((FIRST.x_m, FIRST.y_m, -5.1 - FENCE_MARGIN_M))
+    assert "above the ground" in fence.breach((FIRST.x_m, FIRST.y_m, -5.1 - FENCE_MARGIN_M))
 
 
 @given(metres, metres)

@@ -1,12 +1,17 @@
-"""Every benchmark runs at its smallest size, see `tests/helpers/smallest.py`."""
+"""Every benchmark runs at its smallest size, see `tests/helpers/smallest.py`; a few only in `make nightly`."""
 
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 from tests.helpers.smallest import CASES, run_minimally
+
+HERE = [name for name, case in CASES.items() if not case.emulated]
+ONLY_NIGHTLY = {"archive", "high_throughput_vs_ns3", "sweep", "tcp_vs_ns3"}
+"""CI runs similar ones: `aggregate`, `radio_vs_ns3`, `studies.combinations` and `cosim_vs_ns3`."""
 
 NOT_RUN = {
     "firmware_flights": "needs simulated firmware, not available in CI; test_firmware_flights.py tests its rows",
@@ -36,7 +41,7 @@ PARTS = {
 """Modules that other benchmarks import or start."""
 
 
-@pytest.mark.parametrize("name", [name for name, case in CASES.items() if not case.emulated])
+@pytest.mark.parametrize("name", mark_nightly(HERE, in_ci=set(HERE) - ONLY_NIGHTLY))
 def test_a_benchmark_runs_at_its_smallest_size(name: str, tmp_path: Path) -> None:
     run_minimally(name, tmp_path)
 

@@ -65,6 +65,6 @@ def test_faults_of_the_ros_network_are_reported_with_evidence(
     assert details["turtlebot-1", "multicast from turtlebot-2"] == "20 of 20 datagrams"
     assert details["turtlebot-2", "UDP from turtlebot-1"] == "20 of 20 datagrams"
     assert details["turtlebot-1", "fragments from turtlebot-2"] == "20 of 20 datagrams of 8000 B (6 fragments)"
-    assert details["duckiedrone-1", "ROS network"].endswith("its topics reach no other robot")
+    assert details["duckiedrone-1", "ROS network"].endswith("its topics do not reach other robots")
     assert (tmp_path / SITE_FILE).is_file()
     assert not (tmp_path / "trials").exists()

@@ -45,12 +45,12 @@ def folder(tmp_path: Path) -> Iterator[Path]:
     shutil.copytree(EXAMPLE, folder)
     assert fieldkit(folder, "lab", "up").code == 0
     try:
-        (folder / "lab.ssh").write_text(fieldkit(folder, "lab", "ssh-config").out, encoding="utf-8")
+        (folder / "lab.ssh").write_text(run_here(folder, "lab", "ssh-config").out, encoding="utf-8")
         for robot, program in (("leader", "lead.py"), ("follower", "follow.py")):
             subprocess.run(("scp", "-q", "-F", "lab.ssh", program, f"{robot}:"), cwd=folder, check=True)
         yield folder
     finally:
-        assert fieldkit(folder, "lab", "down").code == 0
+        assert run_here(folder, "lab", "down").code == 0
 
 
 def places_m(folder: Path) -> Floats:

@@ -35,8 +35,9 @@ DEBIAN_ROS = {"README.md", "tutorial.md"}
 OWN_SITE = re.compile(r"fieldkit\.yaml|^ls|fieldkit (init|lab)|fieldkit --?")
 """Commands that need a folder without a site file."""
 
-PLAIN = re.compile(r"fieldkit (?!lab )(?P<words>[^|<>;&$'\"\n]*)(?P<rest>[|>][^\n]*)?")
-"""A command that this process can run; `fieldkit lab up` would leave a fork of it in the background."""
+PLAIN = re.compile(r"fieldkit (?!lab (?:up|shell))(?P<words>[^|<>;&$'\"\n]*)(?P<rest>[|>][^\n]*)?")
+"""A command that this process can run; `fieldkit lab up` would leave a fork of it in the background, and `lab shell`
+would replace it."""
 
 TOPIC = re.compile(r"fieldkit docs ([a-z][a-z0-9_-]*)")
 MARKDOWN_FILE = re.compile(r"[\w/-]+\.md\b")

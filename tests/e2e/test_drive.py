@@ -461,7 +461,7 @@ def test_stop_of_a_suspended_agent_prevents_further_velocities(field_robots: Fie
     assert motions(trial) == ["origin", "begun", "held"]
     again = run_here(field_robots.folder, "resume", str(trial), *RESUME)
     assert again.code == 5, again.err
-    assert "no robot moves before a person confirms: rover-1" in again.err
+    assert "no robot moves until a person confirms: rover-1" in again.err
     assert standstill_s(field_robots, stationary_since_ns) == 0.0
 
 
@@ -474,7 +474,11 @@ def command_line(pid: int) -> list[bytes]:
 
 
 FAR_M = 3.0
-AFTER = DRIVE.replace("repeats: 1\nattempts: 1", "repeats: 2\nattempts: 2").replace("away: 20m", f"away: {FAR_M:g}m")
+AFTER = (
+    DRIVE.replace("repeats: 1\nattempts: 1", "repeats: 2\nattempts: 2")
+    .replace("away: 20m", f"away: {FAR_M:g}m")
+    .replace("count: 150", "count: 50")  # twice the time for the path
+)
 RESUME = ("--yes", "--allow-motion")
 
 

@@ -52,7 +52,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     try:
         yield lab_folder
     finally:
-        assert fieldkit(lab_folder, "lab", "down").code == 0
+        assert run_here(lab_folder, "lab", "down").code == 0
 
 
 def run_plain(lab_folder: Path, *argv: str) -> str:
@@ -313,7 +313,7 @@ def test_a_lab_that_is_killed_leaves_nothing_and_can_come_up_again(
     listing = run_here(tmp_path, "lab", "ps")
     assert (listing.code, "remedy: fieldkit lab up" in listing.err) == (2, True)
     assert fieldkit(tmp_path, "lab", "up").code == 0
-    assert fieldkit(tmp_path, "lab", "down").code == 0
+    assert run_here(tmp_path, "lab", "down").code == 0
 
 
 def test_a_lab_in_the_foreground_ends_with_ctrl_c(tmp_path: Path) -> None:
@@ -338,7 +338,7 @@ def test_a_lab_rejects_control_over_the_radio(tmp_path: Path, robots: tuple[str,
         assert run_here(tmp_path, "lab", "move", name, "--to", "0m", "0m").code == 0
         assert fieldkit(tmp_path, "lab", "shell", name, "hostname").out == f"{name}\n"
     finally:
-        assert fieldkit(tmp_path, "lab", "down").code == 0
+        assert run_here(tmp_path, "lab", "down").code == 0
 
 
 def test_a_lab_that_cannot_start_reports_the_reason_in_the_terminal(tmp_path: Path) -> None:

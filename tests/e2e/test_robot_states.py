@@ -11,7 +11,7 @@ from fieldkit.core.model import Role
 from fieldkit.trial.stored import plans
 from tests.helpers import texts
 from tests.helpers.labs import write_procedure
-from tests.helpers.runs import fieldkit, only_trial, rows
+from tests.helpers.runs import only_trial, rows, run_here
 
 pytestmark = pytest.mark.emulated
 
@@ -55,7 +55,7 @@ def lab(folder: Path, **scripts: str) -> Path:
     site = f"{texts.site()}emulated:\n  ros: builtin\n  late_bound: 2s\n{robots}"
     (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     write_procedure(folder, PROCEDURE)
-    done = fieldkit(folder, "trial", "pings", "5m", "--yes")
+    done = run_here(folder, "trial", "pings", "5m", "--yes")
     assert done.code == 0, done.err
     return folder
 
@@ -84,16 +84,16 @@ def test_conditions_of_robots_are_named_and_not_compared(tmp_path: Path) -> None
         "turtlebot-2: others use 60 % of the airtime on channel 6",
     ):
         assert reason in row["marks_reason"]
-    table = fieldkit(bad, "aggregate", "trials", "--format", "csv").out
+    table = run_here(bad, "aggregate", "trials", "--format", "csv").out
     assert f"marks={names}" in table
-    assert fieldkit(bad, "report", "trials", "-o", "report.html").code == 0
+    assert run_here(bad, "report", "trials", "-o", "report.html").code == 0
     page = (bad / "report.html").read_text(encoding="utf-8")
     assert "1 valid repeat marked" in page
     assert "turtlebot-2: others use" in page
-    compared = fieldkit(tmp_path, "compare", "plain/trials", "bad/trials")
+    compared = run_here(tmp_path, "compare", "plain/trials", "bad/trials")
     assert compared.code == 2
     for name in names.split(" and "):
         assert f"marks, {name}: A has it in 0 of 1 repeats, B has it in 1 of 1" in compared.err
-    checked = fieldkit(bad, "clocks")
+    checked = run_here(bad, "clocks")
     assert checked.code == 1
     assert "the clocks of turtlebot-1 and turtlebot-2 differ by" in checked.out, "their true offset is 0"

@@ -169,15 +169,15 @@ def test_real_ros_drives_a_robot_in_gazebo(tmp_path: Path, monkeypatch: pytest.M
         started = fieldkit(tmp_path, "lab", "up")
         assert started.code == 0, started.err
         try:
-            assert fieldkit(tmp_path, "lab", "move", "robot-1", "--to", "10m", "18m").code == 0
+            assert run_here(tmp_path, "lab", "move", "robot-1", "--to", "10m", "18m").code == 0
             assert fieldkit(tmp_path, "lab", "shell", "robot-1", f"{DRIVE} >/dev/null 2>&1 &").code == 0
 
             def place_m() -> list[float]:
-                listed = json.loads(fieldkit(tmp_path, "lab", "ps", "--json").out)
+                listed = json.loads(run_here(tmp_path, "lab", "ps", "--json").out)
                 place: list[float] = listed["robots"][0]["place_m"]
                 return place
 
             wait_until(lambda: place_m()[0] > 10.3, Deadline.after(90))
             assert place_m()[1] == pytest.approx(18.0, abs=0.05)
         finally:
-            assert fieldkit(tmp_path, "lab", "down").code == 0
+            assert run_here(tmp_path, "lab", "down").code == 0

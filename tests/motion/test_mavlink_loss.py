@@ -9,6 +9,7 @@ import pytest
 
 from fieldkit.motion.logs import tlog
 from tests.helpers import drones
+from tests.helpers.nightly import mark_nightly
 from tests.helpers.paths import ROOT
 
 pytestmark = pytest.mark.emulated
@@ -20,7 +21,7 @@ EDGE = 2 * len(REQUESTED)
 
 
 @pytest.mark.quiet
-@pytest.mark.parametrize("percent", [0, 20])
+@pytest.mark.parametrize("percent", mark_nightly([20, 0]))
 def test_loss_behind_a_router_is_that_of_the_kernel(percent: int, tmp_path: Path) -> None:
     log = tmp_path / "mavlink.tlog"
     words = ("unshare", "--net", "--", sys.executable, "-m", "tests.helpers.mavlink_loss")

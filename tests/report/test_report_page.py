@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.cli import main
 from tests.helpers import lawns, tables
-from tests.helpers.runs import fieldkit
+from tests.helpers.runs import run_here
 
 HOSTILE = "<script>alert(1)</script>\"' onload=x $\\frac$ \u202e\x1b[31m]]>--><svg/onload=alert(1)>"
 
@@ -48,7 +48,7 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path) -> None:
     runs = []
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
-        run = fieldkit(tmp_path / name, "report", str(path), "--figures", "figures")
+        run = run_here(tmp_path / name, "report", str(path), "--figures", "figures")
         assert run.code == 0, run.err
         files = sorted(file for file in (tmp_path / name).rglob("*") if file.is_file())
         runs.append({str(file.relative_to(tmp_path / name)): file.read_bytes() for file in files})

@@ -32,7 +32,7 @@ class Outside(Step):
 class Partial(Step):
     """A kind that defines only a part of a capability."""
 
-    def recorded(self, cast: Cast) -> Iterator[RecordedFile]:
+    def recordings(self, cast: Cast) -> Iterator[RecordedFile]:
         return iter(())
 
 

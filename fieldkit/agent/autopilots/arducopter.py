@@ -94,9 +94,9 @@ class ArduCopter:
         """Return the commands for climb speed and take-off; versions before 4.1 use WPNAV_SPEED_UP as climb speed."""
         return (CHANGE_SPEED, _CLIMB_SPEED, climb_m_s), (TAKE_OFF, 0, 0, 0, 0, 0, 0, height_m)
 
-    def bring_down_command(self, how: str) -> Command:
+    def bring_down_command(self, action: str) -> Command:
         """Return the command that selects RTL or LAND."""
-        return (SET_MODE, CUSTOM_MODE, _RTL if how == "return" else _LAND)
+        return (SET_MODE, CUSTOM_MODE, _RTL if action == "return" else _LAND)
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
         """Return its limits; RTL_ALT is in cm, and RTL_ALT_M replaced it in 4.7."""

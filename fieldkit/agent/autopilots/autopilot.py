@@ -304,4 +304,4 @@ class AutopilotState:
 
 def status_text(drone: AutopilotState) -> str:
     """Return a text with the mode of an autopilot and its last text message."""
-    return f"mode {drone.mode_name}" + (f", its last text: {drone.texts.last}" if drone.texts.last else "")
+    return f"mode {drone.mode_name}" + (f", its last text: {drone.texts.last_text}" if drone.texts.last_text else "")

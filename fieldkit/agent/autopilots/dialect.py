@@ -76,7 +76,7 @@ class FlightDialect(Protocol):
     def take_off_commands(self, height_m: float, climb_m_s: float) -> Sequence[Command]:
         """Return the commands for the take-off of an armed drone; empty if it takes off by set-points."""
 
-    def bring_down_command(self, how: str) -> Command:
+    def bring_down_command(self, action: str) -> Command:
         """Return the command to `land` at the current position, or to `return`."""
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:

@@ -95,8 +95,8 @@ def is_intact(frame: bytes) -> bool:
     if message.kind not in CRC_EXTRA:
         return False
     end = (6 if frame[0] == _MAGIC_1 else 10) + frame[1]
-    expected = checksum(frame[1:end] + bytes((CRC_EXTRA[message.kind],)))
-    return int.from_bytes(frame[end : end + 2], "little") == expected
+    expected_checksum = checksum(frame[1:end] + bytes((CRC_EXTRA[message.kind],)))
+    return int.from_bytes(frame[end : end + 2], "little") == expected_checksum
 
 
 class FrameWriter:

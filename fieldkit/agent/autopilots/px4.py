@@ -82,9 +82,9 @@ class Px4:
         """Return no commands: it takes off by set-points."""
         return ()
 
-    def bring_down_command(self, how: str) -> Command:
+    def bring_down_command(self, action: str) -> Command:
         """Return the command to return or to land."""
-        return (RETURN,) if how == "return" else (LAND,)
+        return (RETURN,) if action == "return" else (LAND,)
 
     def limits(self, values: Mapping[str, float]) -> AutopilotLimits:
         """Return its limits; a value of 0 means no fence (parameter reference, Geofence)."""

@@ -100,7 +100,7 @@ def drive(middleware: Middleware, arguments: Mapping[str, Any], log: Path, stop_
         finally:
             _stop_robot(publisher, poses, arguments.get("stationary", ""), cdr=cdr)
         stop_reason = driver.stop_reason or ("" if driver.phase == "home" else "ordered to stop")
-        _report(driver, ZERO_VELOCITY, lines, status, ended=stop_reason or "home")
+        _report(driver, ZERO_VELOCITY, lines, status, end_reason=stop_reason or "home")
     return stop_reason
 
 
@@ -170,7 +170,9 @@ def _stop_robot(
         time.sleep(1 / RATE_HZ)
 
 
-def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, status: Path, ended: str = "") -> None:
+def _report(
+    driver: Driver, velocity: DriveVelocity, lines: NumberedLines, status: Path, end_reason: str = ""
+) -> None:
     """Write the state of the drive to the status file for the laptop, and to the log while the robot is on its path.
 
     The status also contains `pose` in the frame of the odometry; `frame_id`; `ready`, whether the robot is
@@ -190,9 +192,9 @@ def _report(driver: Driver, velocity: DriveVelocity, lines: NumberedLines, statu
         "turn_rad_s": round(velocity.turn_rad_s, 4),
         "driven_m": round(driver.driven_m, 3),
         "left_m": round(driver.remaining_m, 4),
-        "ended": ended,
+        "ended": end_reason,
     }
-    if ended:
+    if end_reason:
         lines.end(line)
     elif driver.phase not in ("waits", "returns"):
         lines.write(line)

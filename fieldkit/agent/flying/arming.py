@@ -115,8 +115,8 @@ class ArmingCheck:
         """Return the names of the requested parameters that the autopilot has not reported."""
         dialect = self._drone.dialect
         alternatives = [names.split("|") for names in dialect.limit_parameters] if dialect else []
-        reported = self._drone.parameters.keys()
-        return [name for names in alternatives if reported.isdisjoint(names) for name in names]
+        reported_names = self._drone.parameters.keys()
+        return [name for names in alternatives if reported_names.isdisjoint(names) for name in names]
 
     @property
     def is_starting(self) -> bool:
@@ -152,7 +152,7 @@ class ArmingCheck:
             )
             return
         if drone.armed:
-            yield ArmingFault("its motors turn", "land it first")
+            yield ArmingFault("its motors are running", "land it first")
         yield from self._position()
         yield from self._battery()
         yield from self._prearm_checks()

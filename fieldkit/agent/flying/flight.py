@@ -219,16 +219,16 @@ class OffboardPilot:
             slow_height_m = height_m / 2 if drone.speed_m_s < _SLOW_M_S else math.inf
             return risen_m() > min(_RISEN_FRACTION * height_m, slow_height_m)
 
-        *preceding, last = commands
+        *preceding_commands, last_command = commands
         for command in commands:
             drone.command_results.pop(int(command[0]), None)
-        for command in preceding:
+        for command in preceding_commands:
             self._loop.command_until(
                 partial(drone.commands.send, *command), partial(self._has_result, command[0]), "a climb speed"
             )
         # The acknowledgement may be lost, and a second command to take off is refused in the air.
-        is_accepted = lambda: drone.command_results.get(int(last[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
-        self._loop.command_until(partial(drone.commands.send, *last), is_accepted, "to take off")
+        is_accepted = lambda: drone.command_results.get(int(last_command[0])) == ACCEPTED or risen_m() > _LIFTED_M  # noqa: E731
+        self._loop.command_until(partial(drone.commands.send, *last_command), is_accepted, "to take off")
         self._loop.run_until(lambda: has_risen() or self._loop.orders.order == HOME)
 
     def _has_result(self, command: float) -> bool:

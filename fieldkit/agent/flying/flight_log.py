@@ -13,7 +13,7 @@ from fieldkit.agent.numbered_lines import NumberedLines
 
 
 class FlightLog:
-    """Writes one JSON object per line. Write errors stop the log, not the flight: a full disk must not land a drone.
+    """Writes one JSON object per line. After a write error the log ends, but the flight continues.
 
     Args:
         path: The file; empty to write none.

@@ -49,7 +49,7 @@ class FlightError(Exception):
 
 def bring_down(
     session: AutopilotSession,
-    how: str,
+    action: str,
     may_command: Callable[[], bool],
     each_iteration: Callable[[], None] = lambda: None,
 ) -> None:
@@ -63,30 +63,30 @@ def bring_down(
 
     Args:
         session: The session with its autopilot.
-        how: `land` or `return`.
+        action: `land` or `return`.
         may_command: Returns True if the drone is in a mode in which fieldkit controls it.
         each_iteration: Called in each iteration.
 
     Raises:
         FlightError: Another party flies the drone (`TAKEN_OVER`), no heartbeat was received for `NO_HEARTBEAT_S`, or
-            its motors still turn after `_LANDING_TIMEOUT_S`.
+            its motors are still running after `_LANDING_TIMEOUT_S`.
     """
     drone, retry_s, start_s, has_warned = session.drone, 0.0, time.monotonic(), False
-    command = (drone.dialect or Px4()).bring_down_command(how)  # other families accept the commands of PX4
+    command = (drone.dialect or Px4()).bring_down_command(action)  # other families accept the commands of PX4
     command_id = int(command[0])
     drone.command_results.pop(command_id, None)
     _wait_for_mode(session, each_iteration)
     while drone.armed:
         now_s = time.monotonic()
         if now_s > start_s + _LANDING_TIMEOUT_S:
-            raise FlightError(REFUSED, f"its motors still turn, although it was commanded to {how}")
+            raise FlightError(REFUSED, f"its motors are still running, although it was commanded to {action}")
         if min(drone.heartbeat_age_s, now_s - start_s) > NO_HEARTBEAT_S:
             raise FlightError(REFUSED, f"no heartbeat of the autopilot for {NO_HEARTBEAT_S:g} s")
         if not drone.alive and not has_warned:
             log_line(alarm(drone))
         has_warned = not drone.alive
         if may_command():
-            if how == "return" and drone.alive and now_s > start_s + COMMAND_TIMEOUT_S:
+            if action == "return" and drone.alive and now_s > start_s + COMMAND_TIMEOUT_S:
                 log_line(f"land: it does not return ({status_text(drone)})")
                 bring_down(session, "land", may_command, each_iteration)
                 return

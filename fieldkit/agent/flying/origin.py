@@ -96,29 +96,29 @@ def is_same_frame(identifier: str, other_identifier: str) -> bool:
         return False
 
 
-def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> FlightOrigin:
+def resolve_origin(recorded_origin: FlightOrigin | None, start: FlightOrigin) -> FlightOrigin:
     """Return the origin of a flight in the frame of its start.
 
     The heading is that of the recorded origin. If latitude and longitude of both positions are known, they give its
     position in the frame of the start; otherwise the frame must be the same as at the first start.
 
     Args:
-        recorded: The origin of the trial; None for its first start, which becomes the origin.
+        recorded_origin: The origin of the trial; None for its first start, which becomes the origin.
         start: Current position and heading of the drone.
 
     Raises:
         OriginError: The drone is more than `START_M` from the origin, or the distance is unknown.
     """
-    if recorded is None:
+    if recorded_origin is None:
         return start
-    north_m, east_m = start.x_m - recorded.x_m, start.y_m - recorded.y_m
-    coordinates = recorded.latitude_deg, recorded.longitude_deg, start.latitude_deg, start.longitude_deg
+    north_m, east_m = start.x_m - recorded_origin.x_m, start.y_m - recorded_origin.y_m
+    coordinates = recorded_origin.latitude_deg, recorded_origin.longitude_deg, start.latitude_deg, start.longitude_deg
     if None not in coordinates:
         latitude, longitude, start_latitude, start_longitude = (float(value or 0.0) for value in coordinates)
         north_m = (start_latitude - latitude) * _METRES_PER_DEGREE
         longitude_difference = math.remainder(start_longitude - longitude, 360.0)
         east_m = longitude_difference * _METRES_PER_DEGREE * math.cos(math.radians(latitude))
-    elif not is_same_frame(recorded.frame_id, start.frame_id):
+    elif not is_same_frame(recorded_origin.frame_id, start.frame_id):
         raise OriginError(
             "its autopilot has rebooted since the first flight of this trial, and latitude and longitude of its "
             "origin are not known: wait for GPS, or put the drone at its start position and start a new trial"
@@ -134,9 +134,9 @@ def resolve_origin(recorded: FlightOrigin | None, start: FlightOrigin) -> Flight
         start.frame_id,
         start.x_m - north_m,
         start.y_m - east_m,
-        recorded.heading_rad,
-        recorded.latitude_deg,
-        recorded.longitude_deg,
+        recorded_origin.heading_rad,
+        recorded_origin.latitude_deg,
+        recorded_origin.longitude_deg,
     )
 
 

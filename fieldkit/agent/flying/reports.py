@@ -44,7 +44,7 @@ class AutopilotTexts:
         return [text for severity, text in self._texts if severity <= WARNING]
 
     @property
-    def last(self) -> str:
+    def last_text(self) -> str:
         """The last text; empty if there is none."""
         return self._texts[-1][1] if self._texts else ""
 

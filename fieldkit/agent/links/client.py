@@ -76,7 +76,7 @@ class SharedLink:
         self._requests: dict[tuple[bytes, bytes], bytes] = {}
         self._stop_event = threading.Event()
         self._last_answer_s = 0.0
-        self._refused = self._dropped_by_client = self._dropped_by_server = self._dropped_by_earlier_servers = 0
+        self._dropped_by_client = self._dropped_by_server = self._dropped_by_earlier_servers = 0
         self.lost_since_s: float | None = time.monotonic()
         self.error = (0, "")
         self.failure: OSError | None = None

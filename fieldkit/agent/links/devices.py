@@ -58,12 +58,12 @@ def check(connection: str) -> None:
     Raises:
         ValueError: The name is invalid.
     """
-    kind, _, rest = connection.partition(":")
+    kind, _, suffix = connection.partition(":")
     if kind.startswith("/"):
-        if not rest.isdigit() or not hasattr(termios, f"B{int(rest)}"):
-            raise ValueError(f"{kind} does not support {rest} baud")
+        if not suffix.isdigit() or not hasattr(termios, f"B{int(suffix)}"):
+            raise ValueError(f"{kind} does not support {suffix} baud")
         return
-    host, _, port = rest.rpartition(":")
+    host, _, port = suffix.rpartition(":")
     if kind not in ("tcp", "udpout", "udpin"):
         raise ValueError(f"{connection} is not a connection: udpout:, udpin:, tcp: or /dev/")
     if not host or not port.isdigit() or not 0 < int(port) < 65_536:
@@ -78,10 +78,10 @@ def open_device(connection: str) -> FlightDevice:
         ValueError: The name of the connection is invalid.
     """
     check(connection)
-    kind, _, rest = connection.partition(":")
+    kind, _, suffix = connection.partition(":")
     if kind.startswith("/"):
-        return StreamDevice(_open_serial(kind, int(rest)))
-    host, _, port = rest.rpartition(":")
+        return StreamDevice(_open_serial(kind, int(suffix)))
+    host, _, port = suffix.rpartition(":")
     if kind == "tcp":
         stream = socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S)
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

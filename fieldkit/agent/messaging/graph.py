@@ -62,23 +62,23 @@ def entities_info(
         writers: GUID of each of its writers.
         gid_bytes: Length of a GID, which is a GUID padded with zeros.
     """
-    packed = bytearray()
+    message = bytearray()
 
     def add_number(number: int) -> None:
-        packed.extend(bytes(-len(packed) % 4))
-        packed.extend(struct.pack("<I", number))
+        message.extend(bytes(-len(message) % 4))
+        message.extend(struct.pack("<I", number))
 
     def add_gid(guid: bytes) -> None:
-        packed.extend(guid + bytes(gid_bytes - _GUID_BYTES))
+        message.extend(guid + bytes(gid_bytes - _GUID_BYTES))
 
     add_gid(participant)
     add_number(1)
     for text in ("/", node):
         data = text.encode() + b"\0"
         add_number(len(data))
-        packed.extend(data)
+        message.extend(data)
     for guids in (readers, writers):
         add_number(len(guids))
         for guid in guids:
             add_gid(guid)
-    return b"\0\1\0\0" + bytes(packed)
+    return b"\0\1\0\0" + bytes(message)

@@ -87,7 +87,7 @@ def count_messages(
         intervals_us: Requested intervals by message name. Other messages are counted if their rate is an integer
             number of hertz up to 10.
     """
-    indices = _unwrapped([number for _, number in numbers])
+    indices = _unwrap([number for _, number in numbers])
     received_count = lost_count = 0
     tail_us = max(ended_us - numbers[-1][0], 0) if numbers else 0
     for name, messages in streams.items():
@@ -124,15 +124,15 @@ def _best_assignment(messages: Sequence[StreamMessage], indices: Sequence[int], 
 
 def _next_hypotheses(before: _Hypothesis, boot_ms: int, missing_count: int, period_ms: float) -> list[_Hypothesis]:
     """Return the hypotheses after the next message; at most `missing_count` messages before it were lost."""
-    elapsed = (boot_ms - before.phase_ms) / period_ms
-    nearest = max(round(elapsed), 1)
+    elapsed_periods = (boot_ms - before.phase_ms) / period_ms
+    nearest = max(round(elapsed_periods), 1)
     hypotheses = list[_Hypothesis]()
     for periods in range(max(nearest - 1, 1), nearest + 2):
         lost_before = min(periods - 1, missing_count)
         if skipped_periods := periods - 1 - lost_before:  # the schedule starts again at this message
             cost, phase_ms = before.cost + _SKIP_COST * skipped_periods, float(boot_ms)
         else:
-            deviation = elapsed - periods
+            deviation = elapsed_periods - periods
             cost = before.cost + deviation**2
             phase_ms = before.phase_ms + (periods + _PHASE_GAIN * deviation) * period_ms
         hypotheses.append(_Hypothesis(cost, phase_ms, before.lost_count + lost_before))
@@ -165,7 +165,7 @@ def _period_ms(messages: Sequence[StreamMessage], indices: Sequence[int], interv
     return 1e3 / rate_hz if is_near else None
 
 
-def _unwrapped(numbers: Sequence[int]) -> list[int]:
+def _unwrap(numbers: Sequence[int]) -> list[int]:
     """Return sequence numbers that continue after 255; a late one stays before the newest."""
     indices, newest = list[int](), 0
     for number in numbers:

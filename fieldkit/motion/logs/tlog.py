@@ -227,15 +227,15 @@ def read(path: Path, system: int, ended_us: int, intervals_us: tuple[tuple[str, 
     """
     contents = _query(path, system, ended_us=ended_us, intervals_us=dict(intervals_us))
     counts = contents["numbers"]
-    sent = counts["messages"] + counts["lost"]
-    periodic, lost = contents["periodic"]
+    sent_count = counts["messages"] + counts["lost"]
+    periodic, lost_count = contents["periodic"]
     values = {
         "messages": counts["messages"],
-        "sent": sent,
-        "loss_most": 1 - counts["messages"] / sent if sent else None,
+        "sent": sent_count,
+        "loss_most": 1 - counts["messages"] / sent_count if sent_count else None,
         "periodic": periodic or None,
-        "periodic_sent": periodic + lost or None,
-        "loss": lost / (periodic + lost) if periodic else None,
+        "periodic_sent": periodic + lost_count or None,
+        "loss": lost_count / (periodic + lost_count) if periodic else None,
         "damaged": contents["damaged"],
         "rate_hz": counts["rate_hz"],
         "silence_s": counts["silence_s"],

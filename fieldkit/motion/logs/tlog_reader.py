@@ -104,11 +104,11 @@ class TlogDecoder:
     def message(self, frame: LoggedFrame) -> Any | None:  # noqa: ANN401 (of a class that the dialect generates)
         """Return the message in a frame; None if the frame is damaged, or of another dialect."""
         try:
-            decoded = self._link.decode(bytearray(frame.data))
+            message = self._link.decode(bytearray(frame.data))
         except dialect.MAVError:
             self.damaged_frames += 1
             return None
-        return None if decoded.get_type().startswith("UNKNOWN") else decoded
+        return None if message.get_type().startswith("UNKNOWN") else message
 
 
 def answer(request: Json) -> Json:
@@ -150,18 +150,17 @@ def _autopilot(data: bytes, system_id: int) -> Source:
 
 def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mapping[str, int]) -> Json:
     decoder, series = TlogDecoder(), defaultdict[str, list[float]](list)
-    kinds, numbers, frame_count, back_us = Counter[str](), list[tuple[int, int]](), 0, 0
+    kinds, numbers, frame_count, backward_us = Counter[str](), list[tuple[int, int]](), 0, 0
     first_us, last_us, previous_us = _MAX_TIME_US, 0, 0
     streams = defaultdict[str, list[StreamMessage]](list)
     for frame in frames(data):
         frame_count += 1
         first_us, last_us = min(first_us, frame.at_us), max(last_us, frame.at_us)
-        back_us, previous_us = max(back_us, previous_us - frame.at_us), frame.at_us
+        backward_us, previous_us = max(backward_us, previous_us - frame.at_us), frame.at_us
         is_autopilot, damaged_frames = frame.source == autopilot, decoder.damaged_frames
         message = decoder.message(frame)
-        if (
-            is_autopilot and decoder.damaged_frames == damaged_frames
-        ):  # messages of other dialects have a sequence number too
+        # Messages of other dialects have a sequence number, too.
+        if is_autopilot and decoder.damaged_frames == damaged_frames:
             numbers.append((frame.at_us, frame.number))
         if message is not None and (is_autopilot or message.get_type() == _RADIO):
             kinds[message.get_type()] += 1
@@ -173,7 +172,7 @@ def _summary(data: bytes, autopilot: Source, ended_us: int, intervals_us: Mappin
                     series[name].append(value)
     return {
         "frames": frame_count,
-        "times": [first_us, last_us, back_us],
+        "times": [first_us, last_us, backward_us],
         "damaged": decoder.damaged_frames,
         "system": autopilot[0],
         "kinds": dict(kinds),
@@ -258,9 +257,8 @@ def _positions(data: bytes, autopilot: Source, kind: str) -> Iterator[tuple[int,
             position = message.y, message.x, -message.z
             rows.append((frame.at_us, message.time_boot_ms, *position, heading_rad))
     bounds = (90.0, 180.0, _MAX_DISTANCE_M) if kind == tlog.GLOBAL else (_MAX_DISTANCE_M,) * 3
-    if not all(
-        abs(value) <= bound for row in rows for value, bound in zip(row[2:5], bounds, strict=True)
-    ):  # NaN fails, too
+    # The comparison is false for NaN, too.
+    if not all(abs(value) <= bound for row in rows for value, bound in zip(row[2:5], bounds, strict=True)):
         raise ValueError(f"a {kind} contains no valid position")
     first_rad = next((row[5] for row in rows if math.isfinite(row[5])), 0.0)
     for row in rows:

@@ -161,16 +161,16 @@ class MotionJournal:
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
 
-    def confirm(self, how: str, *, at_place: bool) -> None:
+    def confirm(self, confirmation: str, *, at_place: bool) -> None:
         """Allow the held robots to move again.
 
         Args:
-            how: The way in which it was confirmed.
+            confirmation: Description of the confirmation.
             at_place: Whether a person confirmed that they are at their places; their origins are then recorded again.
         """
         event = MotionEvent.CONFIRMED if at_place else MotionEvent.ALLOWED
         for hold in self.holds:
-            self.add(event, hold.robot, reason=how)
+            self.add(event, hold.robot, reason=confirmation)
 
 
 def read(path: Path) -> list[MotionEntry]:

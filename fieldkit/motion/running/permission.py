@@ -42,8 +42,10 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
 
 
 def _self_moving(plan: Plan) -> tuple[Role, ...]:
-    moved = plan.procedure.moved_roles()
-    return tuple(role for role, robot in plan.cast.items() if role in moved and (can_drive(robot) or can_fly(robot)))
+    moving_roles = plan.procedure.moved_roles()
+    return tuple(
+        role for role, robot in plan.cast.items() if role in moving_roles and (can_drive(robot) or can_fly(robot))
+    )
 
 
 class MotionPermission:
@@ -65,14 +67,14 @@ class MotionPermission:
         self.origins: Origins
         self._moving = {role: plan.cast[role].name for role in _self_moving(plan)}
         self._testbed = testbed
-        self._journaled: JournaledOrigins | None = None
+        self._journaled_origins: JournaledOrigins | None = None
         if isinstance(testbed, Transient):
             self.origins = MemoryOrigins()
             return
         self._journal = MotionJournal(motion_journal.journal_of(folder))
         may_return = isinstance(testbed, Attended) and permissions.MOVE_AFTER_FAULT in testbed.permissions
         robots = {role: robot.name for role, robot in plan.cast.items()}
-        self.origins = self._journaled = JournaledOrigins(
+        self.origins = self._journaled_origins = JournaledOrigins(
             self._journal, folder, robots, plan.placement, may_return=may_return
         )
 
@@ -84,11 +86,11 @@ class MotionPermission:
             MotionHeldError: No person has confirmed.
             OSError: The disk is full or was removed.
         """
-        if self._journaled is None or not self._moving:
+        if self._journaled_origins is None or not self._moving:
             return
-        self._require_placed(self._journaled)
+        self._require_placed(self._journaled_origins)
         if self._journal.holds:
-            self._require_confirmed(self._journaled)
+            self._require_confirmed(self._journaled_origins)
 
     @contextmanager
     def reporting_holds(self, sink: Sink) -> Iterator[None]:
@@ -96,9 +98,9 @@ class MotionPermission:
         try:
             yield
         except KeyboardInterrupt:
-            for hold in self._journal.holds if self._journaled is not None else ():
-                place = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
-                sink(Note(f"{hold.reason}: {place}"))
+            for hold in self._journal.holds if self._journaled_origins is not None else ():
+                instruction = f"before {hold.robot} moves again, a person must put it at its place and type {CONFIRM}"
+                sink(Note(f"{hold.reason}: {instruction}"))
             raise
 
     def _require_placed(self, origins: JournaledOrigins) -> None:

@@ -70,7 +70,7 @@ class FlyLeg(PathLeg):
     down: _Distance = None
 
     @schema.model_validator(mode="after")
-    def _one_direction(self) -> "FlyLeg":
+    def _has_one_direction(self) -> "FlyLeg":
         for key, opposite in (("away", "towards"), ("left", "right"), ("up", "down")):
             if getattr(self, key) is not None and getattr(self, opposite) is not None:
                 raise schema.validation_error(
@@ -261,9 +261,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     def needs(self, scene: Scene) -> Iterator[Need]:
         """Yield the checks that the autopilot can be reached, and that it can be armed for this flight."""
         robot = scene.robot(self.robot)
-        if (
-            mavlink_of(robot.profile) is not None and robot.profile.limits.max_height_m is not None
-        ):  # otherwise `refusals` reports it
+        # Missing keys of the profile are reported by `refusals`.
+        if mavlink_of(robot.profile) is not None and robot.profile.limits.max_height_m is not None:
             plan = self._plan(scene)
             yield link_need(robot, self.robot, plan.connection, ("pilot", "guard"))
             yield arming_need(robot, self.robot, plan)

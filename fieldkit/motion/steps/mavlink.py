@@ -235,7 +235,7 @@ class MavlinkStep(Nest, ChecksPlacement, HasNeeds, UsesSpace, SendsTraffic, Writ
         mavlink = mavlink_of(scene.robot(self.robot).profile)
         if self.recorder != self.robot and mavlink is not None:
             frames = self._messages(scene)
-            yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, served=True)
+            yield Flow(self.robot, self.recorder, mavlink.port, frames, Protocol.UDP, has_other_listener=True)
 
     @override
     def stored_bytes(self, scene: Scene, role: Role) -> float:

@@ -106,10 +106,13 @@ class MoveStep(
     @override
     def adjustments(self, cast: Cast) -> Iterator[str]:
         if self.within_limits:
-            requested = self.model_copy(update={"within_limits": False}).resolved(cast).motion
-            permitted = self.resolved(cast).motion
-            if permitted != requested:
-                permitted_text, requested_text = geometry.describe_move(permitted), geometry.describe_move(requested)
+            requested_move = self.model_copy(update={"within_limits": False}).resolved(cast).motion
+            permitted_move = self.resolved(cast).motion
+            if permitted_move != requested_move:
+                permitted_text, requested_text = (
+                    geometry.describe_move(permitted_move),
+                    geometry.describe_move(requested_move),
+                )
                 yield f"{cast[self.robot].name} moves {permitted_text}; {requested_text} is beyond its limits"
 
     @property
@@ -161,7 +164,7 @@ class MoveStep(
         if (drive := drive_of(robot.profile)) is not None and can_drive(robot):
             driving_note = (
                 f", and back, automatically: velocities on {drive.topic}, odometry of {drive.odometry}; it stops if "
-                f"no order arrives for {drive.lease:g} s, or {robot.profile.limits.fence_m:g} m from its origin"
+                f"no order arrives for {drive.lease:g} s, and at {robot.profile.limits.fence_m:g} m from its origin"
             )
         duration = f"for up to {round(self.path_s(robot), 1):g} s"
         yield f"{robot.name} moves {geometry.describe_move(self.motion)}, {duration}{driving_note}"

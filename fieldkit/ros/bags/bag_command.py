@@ -74,8 +74,8 @@ def _show(path: Path, bag_contents: BagContents) -> None:
         count = format_count(bag_contents.messages, "message")
         print_text(f"{path}: {bag_contents.format}, {format_bytes(bag_contents.size_bytes)}, {count}")
     if bag_contents.messages:
-        started = datetime.fromtimestamp(bag_contents.started_utc_ns / 1e9, UTC)
-        print_text(f"{started:%Y-%m-%d %H:%M:%S} UTC, {format_duration(bag_contents.duration_s)}")
+        start_time = datetime.fromtimestamp(bag_contents.started_utc_ns / 1e9, UTC)
+        print_text(f"{start_time:%Y-%m-%d %H:%M:%S} UTC, {format_duration(bag_contents.duration_s)}")
     rows = [
         (topic.name, topic.type, str(topic.messages), _rate(topic.messages, bag_contents.duration_s))
         for topic in bag_contents.topics

@@ -112,9 +112,9 @@ def repair(path: Path, to: Path) -> WriteResult:
     """
     bag = find(path)
     if (bag.format is BagFormat.ROS1) != (to.suffix == ".bag"):
-        required = "NAME.bag" if bag.format is BagFormat.ROS1 else "a folder, whose name does not end in .bag"
+        required_name = "NAME.bag" if bag.format is BagFormat.ROS1 else "a folder, whose name does not end in .bag"
         raise ConfigurationError(
-            f"a repaired bag keeps its format, {bag.format}: the new one must be {required}", where=str(to)
+            f"a repaired bag keeps its format, {bag.format}: the new one must be {required_name}", where=str(to)
         )
 
     def write(temporary_path: Path) -> WriteResult:

@@ -84,19 +84,19 @@ def _reader(bag: BagFiles) -> rosbag1.Reader | rosbag2.Reader:
 
 
 def _contents(reader: rosbag1.Reader | rosbag2.Reader) -> Json:
-    by_topic: Counter[tuple[str, str]] = Counter()
+    message_counts: Counter[tuple[str, str]] = Counter()
     if isinstance(reader, rosbag1.Reader):
         for connection in reader.connections:
-            by_topic[connection.topic, connection.msgtype] += sum(
+            message_counts[connection.topic, connection.msgtype] += sum(
                 info.connection_counts.get(connection.id, 0) for info in reader.chunk_infos
             )
         compression = "none"
     else:
         for connection in reader.connections:
-            by_topic[connection.topic, connection.msgtype] += connection.msgcount
+            message_counts[connection.topic, connection.msgtype] += connection.msgcount
         compression = reader.compression_format or "none"
     return {
-        "topics": [[topic, kind, count] for (topic, kind), count in sorted(by_topic.items())],
+        "topics": [[topic, kind, count] for (topic, kind), count in sorted(message_counts.items())],
         "started_utc_ns": reader.start_time if reader.message_count else 0,
         # The duration of rosbags ends one nanosecond after the last message.
         "duration_s": max(reader.duration - 1, 0) / 1e9,

@@ -96,15 +96,21 @@ Kind = TypeVar("Kind", bound=Policy)
 
 def to_zenoh(profile: QosProfile) -> str:
     """Return a profile as the last part of a liveliness token, for example `2::,5:,:,:,,` for sensor data."""
-    adapted = _with_zenoh_defaults(profile)
-    kinds = (adapted.reliability, adapted.durability, adapted.history, adapted.liveliness)
+    resolved_profile = _with_zenoh_defaults(profile)
+    kinds = (
+        resolved_profile.reliability,
+        resolved_profile.durability,
+        resolved_profile.history,
+        resolved_profile.liveliness,
+    )
     defaults = (_ZENOH.reliability, _ZENOH.durability, _ZENOH.history, _ZENOH.liveliness)
     reliability, durability, history, liveliness = (
         "" if kind is default else str(kind.value) for kind, default in zip(kinds, defaults, strict=True)
     )
-    depth = "" if adapted.depth == _ZENOH.depth else str(adapted.depth)
+    depth = "" if resolved_profile.depth == _ZENOH.depth else str(resolved_profile.depth)
     deadline, lifespan, lease = (
-        _duration(time_ns) for time_ns in (adapted.deadline_ns, adapted.lifespan_ns, adapted.lease_ns)
+        _duration(time_ns)
+        for time_ns in (resolved_profile.deadline_ns, resolved_profile.lifespan_ns, resolved_profile.lease_ns)
     )
     return f"{reliability}:{durability}:{history},{depth}:{deadline}:{lifespan}:{liveliness},{lease}"
 

@@ -123,9 +123,9 @@ def judge_names(
         if robot.address in addresses:
             report.ok(check, f"its nodes are reached as {name}, which is {robot.address}")
         else:
-            resolved = printable(", ".join(addresses).encode()) or "unknown here"
+            resolved_text = printable(", ".join(addresses).encode()) or "unknown here"
             report.fail(
                 check,
-                f"its nodes are reached as {name}, which is {resolved}, not {robot.address}",
+                f"its nodes are reached as {name}, which is {resolved_text}, not {robot.address}",
                 f"on {robot.name}: export ROS_IP={robot.address}   # before its nodes start",
             )

@@ -82,10 +82,10 @@ def judge_agreement(
     roles = [role for role in states if is_ros2(cast[role])]
     if len(roles) < 2:
         return
-    first, *others = roles
-    for role in others:
+    first_role, *other_roles = roles
+    for role in other_roles:
         for compare in (_compare_domains, _compare_rmws, _compare_distributions, _compare_servers):
-            compare(cast[first], states[first].variables, states[role].variables, reports[role])
+            compare(cast[first_role], states[first_role].variables, states[role].variables, reports[role])
 
 
 def _judge_domain(robot: Robot, state: RosState, report: Report) -> None:
@@ -246,48 +246,49 @@ def _judge_firewall(state: RosState, report: Report) -> None:
         report.ok("firewall", "no rule drops received packets")
 
 
-def _compare_domains(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+def _compare_domains(first_robot: Robot, expected: Variables, actual: Variables, report: Report) -> None:
     if domain(actual) != domain(expected):
         report.fail(
             "same ROS domain",
-            f"domain {domain(actual)}, but {first.name} is in domain {domain(expected)}: no discovery",
+            f"domain {domain(actual)}, but {first_robot.name} is in domain {domain(expected)}: no discovery",
             "use one ROS_DOMAIN_ID on all robots",
         )
 
 
-def _compare_rmws(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+def _compare_rmws(first_robot: Robot, expected: Variables, actual: Variables, report: Report) -> None:
     if uses_zenoh(actual) != uses_zenoh(expected):
         report.fail(
             "same RMW",
-            f"{rmw(actual)}, but {first.name} has {rmw(expected)}: Zenoh and DDS do not communicate",
+            f"{rmw(actual)}, but {first_robot.name} has {rmw(expected)}: Zenoh and DDS do not communicate",
             "use one RMW_IMPLEMENTATION on all robots",
         )
     elif rmw(actual) != rmw(expected):
         report.warn(
             "same RMW",
-            f"{rmw(actual)}, but {first.name} has {rmw(expected)}: ROS does not support different RMWs",
+            f"{rmw(actual)}, but {first_robot.name} has {rmw(expected)}: ROS does not support different RMWs",
             "use one RMW_IMPLEMENTATION on all robots",
         )
     else:
-        report.ok("same RMW", f"{rmw(actual)}, as on {first.name}")
+        report.ok("same RMW", f"{rmw(actual)}, as on {first_robot.name}")
 
 
-def _compare_distributions(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+def _compare_distributions(first_robot: Robot, expected: Variables, actual: Variables, report: Report) -> None:
     own_distro, first_distro = actual.get("ROS_DISTRO", ""), expected.get("ROS_DISTRO", "")
     if own_distro and first_distro and own_distro != first_distro:
         report.warn(
             "same ROS distribution",
-            f"{own_distro}, but {first.name} has {first_distro}: ROS does not support different distributions",
+            f"{own_distro}, but {first_robot.name} has {first_distro}: ROS does not support different distributions",
             "install one distribution on all robots, or compare the types: ros2 topic info -v TOPIC",
         )
 
 
-def _compare_servers(first: Robot, expected: Variables, actual: Variables, report: Report) -> None:
+def _compare_servers(first_robot: Robot, expected: Variables, actual: Variables, report: Report) -> None:
     own_server, first_server = actual.get("ROS_DISCOVERY_SERVER", ""), expected.get("ROS_DISCOVERY_SERVER", "")
     if own_server != first_server:
         report.fail(
             "same discovery server",
-            f"{own_server or 'no discovery server'}, but {first.name} has {first_server or 'none'}: no discovery",
+            f"{own_server or 'no discovery server'}, but {first_robot.name} has {first_server or 'none'}: "
+            "no discovery",
             "use one ROS_DISCOVERY_SERVER on all robots, or on none",
         )
 
@@ -318,5 +319,6 @@ def judge_servers(
 
 def ports_remedy(domain_number: int) -> str:
     """Return a command that opens a firewall for a domain."""
-    first = multicast_port(domain_number)
-    return f"sudo ufw allow proto udp to any port {first}:{first + 249}   # the ports of ROS domain {domain_number}"
+    first_port = multicast_port(domain_number)
+    port_range = f"{first_port}:{first_port + 249}"
+    return f"sudo ufw allow proto udp to any port {port_range}   # the ports of ROS domain {domain_number}"

@@ -175,9 +175,9 @@ def _reason(judgement: Judgement) -> str:
     unknown, expectation_text = judgement.why or "undecided", judgement.expectation.text
     if judgement.estimate is None or judgement.met is None:
         return f"{expectation_text}: {unknown}"
-    why = f"; {judgement.why}" if judgement.why else ""
+    note = f"; {judgement.why}" if judgement.why else ""
     figures = f"in {judgement.met} of {judgement.estimate.n} repeats, up to {judgement.estimate.maximum:.3g}"
-    return f"{expectation_text} {figures}{why}"
+    return f"{expectation_text} {figures}{note}"
 
 
 def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
@@ -186,13 +186,13 @@ def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
     yield f"Measured: {assessment.candidate}."
     yield f"Criterion: {criterion}."
     for cell in assessment.cells:
-        valid = f"{cell.cell.n_valid} of {cell.attempts} repeats are valid"
-        yield f"{cell.place}, samples of {cell.size_bytes:g} B: {valid}."
+        valid_text = f"{cell.cell.n_valid} of {cell.attempts} repeats are valid"
+        yield f"{cell.place}, samples of {cell.size_bytes:g} B: {valid_text}."
         for judgement in judgements.judge(criterion.expectations, [cell.cell]):
             if judgement.estimate is not None and judgement.met is not None:
                 met, n = judgement.met, judgement.estimate.n
-                least = f"at least {100 * share_low(met, n):.0f} % of all repeats, with 95 % confidence"
-                yield f"  {judgement.expectation.text} in {met} of {n} repeats: in {least}"
+                share_text = f"at least {100 * share_low(met, n):.0f} % of all repeats, with 95 % confidence"
+                yield f"  {judgement.expectation.text} in {met} of {n} repeats: in {share_text}"
         yield f"  loss in %: {figure(cell.loss, 100.0)}"
         yield f"  delay of 95 % of the samples in ms: {figure(cell.delay, 1e3)}"
         yield f"  trials: {', '.join(cell.sources)}"

@@ -151,11 +151,11 @@ def link_cell(place: str, size_bytes: float, tables: Sequence[Repeats]) -> LinkC
     """
     numbers = {name: np.concatenate([table.numbers[name] for table in tables]) for name in tables[0].numbers}
     texts = {name: np.concatenate([table.texts[name] for table in tables]) for name in tables[0].texts}
-    intended = numbers["topic_sent"] + numbers["topic_refused"] + numbers["topic_skipped"]
+    intended_samples = numbers["topic_sent"] + numbers["topic_refused"] + numbers["topic_skipped"]
     # The loss of a repeat in which no sample was due is undefined, so it has no value.
-    numbers[_INTENDED] = np.where(intended > 0, intended, np.nan)
+    numbers[_INTENDED] = np.where(intended_samples > 0, intended_samples, np.nan)
     numbers[_LOSS.name] = (numbers[_INTENDED] - numbers["topic_received"]) / numbers[_INTENDED]
-    texts[_CELL] = np.full(len(intended), place, dtype=np.object_)
+    texts[_CELL] = np.full(len(intended_samples), place, dtype=np.object_)
     (cell,) = aggregate(Repeats(numbers, texts, ()), (_CELL,), quantities=(_LOSS, _DELAY), words=())
     return LinkCell(place, size_bytes, tuple(dict.fromkeys(map(str, texts[SOURCE]))), cell)
 

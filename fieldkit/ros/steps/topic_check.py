@@ -143,10 +143,10 @@ def _record(
     try:
         return path, bag.read(path)
     except EvidenceError as error:
-        raise EvidenceError(f"{error.what}; the recorder: {_end(log) or 'printed nothing'}") from error
+        raise EvidenceError(f"{error.what}; the recorder: {_end_of_log(log) or 'printed nothing'}") from error
 
 
-def _end(log: Path) -> str:
+def _end_of_log(log: Path) -> str:
     """Return the end of a log."""
     if not log.is_file():
         return ""

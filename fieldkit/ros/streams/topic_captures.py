@@ -49,7 +49,7 @@ PROGRAM_DELAY_FIGURES: Final = {
     "topic_jitter_s": "95th percentile",
     "topic_deadline_misses": "largest",
 }
-"""Time columns, and the statistic of the delay in the subscriber's program with which each is compared."""
+"""Columns of times. Each is compared with this statistic of the delay in the subscriber's program."""
 
 _GRACE_NS: Final = 300_000_000
 """The subscriber's log may lack a captured sample that is within this time of the match or of the end of the log."""
@@ -184,17 +184,17 @@ def _content_contradictions(
     """Yield differences in the time of sending between capture and log, and captured samples without a record."""
     if numbers is not None and (unlogged_count := int((~np.isin(heads.sequence, numbers)).sum())):
         yield f"{format_count(unlogged_count, 'sample')} in the {name}'s capture are not in its log"
-    first = heads.first()
-    _, log_index, capture_index = np.intersect1d(samples.sequence, first.sequence, return_indices=True)
-    if different_count := int((samples.sent_ns[log_index] != first.sent_ns[capture_index]).sum()):
+    first_heads = heads.first()
+    _, log_index, capture_index = np.intersect1d(samples.sequence, first_heads.sequence, return_indices=True)
+    if different_count := int((samples.sent_ns[log_index] != first_heads.sent_ns[capture_index]).sum()):
         samples_text = format_count(different_count, "sample")
         yield f"{samples_text} have different times of sending in the {name}'s log and in its capture"
 
 
 def _sending_contradictions(publisher: SampleHeads) -> Iterator[str]:
     """Yield contradictions between the times of sending and the publisher's capture."""
-    first = publisher.first()
-    after_ns = first.at_ns - first.sent_ns
+    first_heads = publisher.first()
+    after_ns = first_heads.at_ns - first_heads.sent_ns
     if len(after_ns) and int(after_ns.min()) < -STAMP_NS:
         early_s = -int(after_ns.min()) / 1e9
         yield f"a sample was sent {early_s:.6f} s before it was created, according to the publisher's capture and log"
@@ -224,14 +224,14 @@ def _uncaptured_samples(plan: TopicPlan, arrivals: TopicSamples, subscriber: Sam
         return
     packets = subscriber.packets
     size_bytes = plan.size_bytes + plan.envelope_bytes
-    without_head = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
+    headless_count = int((~np.isin(arrivals.sequence, subscriber.heads.sequence)).sum())
     payload_bytes = packets.tcp_payload_bytes + np.maximum(packets.udp_bytes - UDP_HEADER_BYTES, 0)
     if subscriber.is_tcp or size_bytes > _DATAGRAM_BYTES:
         capacity = int(payload_bytes.sum()) // size_bytes - len(subscriber.heads.first())
     else:
         capacity = int((payload_bytes // size_bytes).sum()) - len(subscriber.heads)
-    if without_head > max(capacity, 0):
-        missing_text = f"{format_count(without_head - max(capacity, 0), 'sample')} in the subscriber's log"
+    if headless_count > max(capacity, 0):
+        missing_text = f"{format_count(headless_count - max(capacity, 0), 'sample')} in the subscriber's log"
         yield f"{missing_text} are not in its capture"
     if not len(subscriber.heads):
         yield from _early_samples(arrivals, packets.time_ns, payload_bytes, size_bytes)
@@ -243,10 +243,10 @@ _DATAGRAM_BYTES: Final = 1_200
 
 def _early_samples(samples: TopicSamples, times_ns: Ints, payload_bytes: Ints, size_bytes: int) -> Iterator[str]:
     """Yield a contradiction if samples were logged before enough bytes had arrived; for captures without heads."""
-    order, arrival = np.argsort(times_ns, kind="stable"), np.sort(samples.at_ns)
+    order, arrivals_ns = np.argsort(times_ns, kind="stable"), np.sort(samples.at_ns)
     bytes_until = np.concatenate(([0], np.cumsum(payload_bytes[order])))
-    captured_bytes = bytes_until[np.searchsorted(times_ns[order], arrival + STAMP_NS, side="right")]
-    needed_bytes = size_bytes * np.arange(1, len(arrival) + 1)
+    captured_bytes = bytes_until[np.searchsorted(times_ns[order], arrivals_ns + STAMP_NS, side="right")]
+    needed_bytes = size_bytes * np.arange(1, len(arrivals_ns) + 1)
     if early_count := int((captured_bytes < needed_bytes).sum()):
         early_text = f"{format_count(early_count, 'sample')} in the subscriber's log"
         yield f"{early_text} arrived earlier than their bytes in its capture"
@@ -295,8 +295,8 @@ def _is_acknowledged(heads: SampleHeads, subscriber: SampleFlow) -> Mask:
     if connection is None or not len(connection[1]):
         return np.zeros(len(heads), dtype=np.bool_)
     base = int(heads.end[0])
-    acknowledged: Mask = seq_difference(heads.end, base) <= seq_difference(connection[1].tcp_ack, base).max()
-    return acknowledged
+    is_acknowledged: Mask = seq_difference(heads.end, base) <= seq_difference(connection[1].tcp_ack, base).max()
+    return is_acknowledged
 
 
 def _may_have_overflowed(
@@ -308,15 +308,17 @@ def _may_have_overflowed(
     arrived_ns, read_ns = np.sort(heads.at_ns), np.append(np.sort(samples.at_ns), end_ns)
     lost_ns = heads.at_ns[is_missing]
     next_ns = read_ns[np.minimum(np.searchsorted(read_ns, lost_ns), len(read_ns) - 1)]
-    queued = np.searchsorted(arrived_ns, next_ns, side="right") - np.searchsorted(arrived_ns, lost_ns, side="right")
+    queue_length = np.searchsorted(arrived_ns, next_ns, side="right") - np.searchsorted(
+        arrived_ns, lost_ns, side="right"
+    )
     # A missing sample that arrives releases all waiting samples together; the capture may lack heads of some of them.
     read_together = np.searchsorted(read_ns[:-1], next_ns + _READ_BURST_NS, side="right") - np.searchsorted(
         read_ns[:-1], next_ns
     )
-    queued = np.maximum(queued, read_together)
+    queue_length = np.maximum(queue_length, read_together)
     newest_ns = arrived_ns[max(len(arrived_ns) - plan.depth, 0)]
-    overflowed: Mask = (queued >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
-    return overflowed
+    may_have_overflowed: Mask = (queue_length >= plan.depth) & ((lost_ns < newest_ns) | (read_together >= plan.depth))
+    return may_have_overflowed
 
 
 def _missing_bytes(plan: TopicPlan, log: TopicLog, subscriber: SampleFlow) -> int:

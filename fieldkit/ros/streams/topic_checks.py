@@ -66,8 +66,8 @@ def check_logs(plan: TopicPlan, publisher_log: TopicLog, subscriber_log: TopicLo
     yield from _end_contradictions(plan, subscriber_log, topic_samples.SUBSCRIBER)
     yield from _publisher_problems(plan, publisher_log)
     yield from _wrong_sizes(plan, subscriber_log, PADDING_BYTES, "subscriber")
-    if plan.in_order and (reversed_s := _reversed_s(subscriber_log)):
-        yield f"a sample in the subscriber's log is {reversed_s:.3f} s earlier than the previous one"
+    if plan.in_order and (backward_s := _backward_s(subscriber_log)):
+        yield f"a sample in the subscriber's log is {backward_s:.3f} s earlier than the previous one"
     samples, arrivals = publisher_log.samples, subscriber_log.samples
     if unsent_count := int((~np.isin(arrivals.sequence, publisher_log.numbers)).sum()):
         yield f"{format_count(unsent_count, 'sample')} arrived with numbers that the publisher's log does not have"
@@ -127,9 +127,9 @@ def _publisher_problems(plan: TopicPlan, publisher_log: TopicLog) -> Iterator[st
     samples, numbers = publisher_log.samples, publisher_log.numbers
     if (numbers != np.arange(len(numbers))).any():
         yield "the sample numbers in the publisher's log do not start at 0, or have a gap"
-    offered = len(numbers) + publisher_log.skipped
-    if publisher_log.matched_ns is not None and offered != plan.samples:
-        yield f"the publisher's log accounts for {offered} instead of {format_count(plan.samples, 'sample')}"
+    offered_count = len(numbers) + publisher_log.skipped
+    if publisher_log.matched_ns is not None and offered_count != plan.samples:
+        yield f"the publisher's log accounts for {offered_count} instead of {format_count(plan.samples, 'sample')}"
     yield from _wrong_sizes(plan, publisher_log, 0, "publisher")
     if len(samples) and (samples.at_ns < samples.sent_ns - MAX_SLEW_NS).any():
         yield "the publisher's log has a sample that the middleware accepted before it was created"
@@ -149,10 +149,10 @@ def _wrong_sizes(plan: TopicPlan, log: TopicLog, padding_bytes: int, name: str) 
         yield f"the {name}'s log has {samples}"
 
 
-def _reversed_s(log: TopicLog) -> float:
+def _backward_s(log: TopicLog) -> float:
     """Return the largest time by which a sample is earlier than the previous one; 0 if the order is correct."""
-    reversed_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
-    return reversed_ns / 1e9 if reversed_ns > MAX_SLEW_NS else 0.0
+    backward_ns = -int(np.diff(log.samples.at_ns).min(initial=0))
+    return backward_ns / 1e9 if backward_ns > MAX_SLEW_NS else 0.0
 
 
 _SAME_FILE: Final = "the same file: checksum and count of samples"

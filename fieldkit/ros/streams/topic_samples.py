@@ -140,23 +140,23 @@ def read_log(path: Path) -> TopicLog:
         raise EvidenceError(
             "does not have the number of samples in its end record", where=str(path), remedy="repeat the measurement"
         )
-    started, matched, origin = by_kind[DISCOVERY_STARTED], by_kind[MATCHED], by_kind[_ORIGIN]
-    if len(ends) and not _is_intact(content, ends[0], required=len(origin) > 0):
+    start_records, match_records, origin_records = by_kind[DISCOVERY_STARTED], by_kind[MATCHED], by_kind[_ORIGIN]
+    if len(ends) and not _is_intact(content, ends[0], required=len(origin_records) > 0):
         raise EvidenceError("was changed: its checksum is wrong", where=str(path), remedy="repeat the measurement")
-    offered = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]
+    offered_records = records[(records["kind"] == _SAMPLE) | (records["kind"] == REFUSED)]
     return TopicLog(
         samples=TopicSamples(*(samples[name].astype(np.int64) for name in ("sequence", "size", "sent_ns", "at_ns"))),
-        discovery_start_ns=int(started["at_ns"][0]) if len(started) else None,
-        matched_ns=int(matched["at_ns"][0]) if len(matched) else None,
+        discovery_start_ns=int(start_records["at_ns"][0]) if len(start_records) else None,
+        matched_ns=int(match_records["at_ns"][0]) if len(match_records) else None,
         refused=len(by_kind[REFUSED]),
         skipped=int(by_kind[SKIPPED]["sequence"].sum()),
         foreign=len(by_kind[FOREIGN]),
         is_complete=bool(len(ends)),
         kinds={kind: len(records_of_kind) for kind, records_of_kind in by_kind.items()},
         times_ns=records["at_ns"].astype(np.int64),
-        numbers=offered["sequence"].astype(np.int64),
-        role=int(origin["sequence"][0]) if len(origin) else None,
-        topic_sum=int(origin["size"][0]) if len(origin) else None,
+        numbers=offered_records["sequence"].astype(np.int64),
+        role=int(origin_records["sequence"][0]) if len(origin_records) else None,
+        topic_sum=int(origin_records["size"][0]) if len(origin_records) else None,
         reads=SampleReads(*(by_kind[READ][name].astype(np.int64) for name in ("sequence", "sent_ns", "at_ns"))),
         unreadable=len(by_kind[UNREADABLE]),
     )

@@ -126,10 +126,10 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     @override
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         for role in self.robots:
-            yield self._planned(scene, role)
+            yield self._planned_job(scene, role)
         yield from self.inside(scene)
 
-    def _planned(self, scene: Scene, role: Role) -> Planned:
+    def _planned_job(self, scene: Scene, role: Role) -> Planned:
         profile = scene.robot(role).profile
         immediate = ("--immediate-mode",) if scene.tools(role).immediate_mode else ()
         options = ("-n", "-U", *immediate, "-s", str(self._snap_bytes), "-B", str(self._buffer_kib))
@@ -219,7 +219,7 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-        captures = [self._planned(scene, role) for role in self.robots]
+        captures = [self._planned_job(scene, role) for role in self.robots]
         first, *others = (entry.step for entry in self.during)
         first_actions: list[Callable[[Announce], None]] = []
 

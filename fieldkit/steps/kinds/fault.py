@@ -225,10 +225,10 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
         """Run the steps inside before the fault. An error in this time is not caused by the fault and is raised."""
         from concurrent.futures import wait  # noqa: PLC0415 (as above)
 
-        until = Deadline.after(self.after)
+        deadline = Deadline.after(self.after)
         if wait([steps], timeout=self.after).done:
             steps.result()
-            time.sleep(until.remaining_s)
+            time.sleep(deadline.remaining_s)
 
     def _wait_for_steps(self, steps: "Future[None]", scene: Scene, testbed: Testbed) -> None:
         """Wait for the steps inside; if they failed because of the fault, stop their jobs."""
@@ -275,13 +275,15 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
 
     @override
     def measure(self, view: View) -> Measured:
-        observed = view.evidence.read_or_none(outage.read, "", self.kind, self.prefix)
-        return outage.measure(self.kind, observed) | across.measure(self, view)
+        outage_result = view.evidence.read_or_none(outage.read, "", self.kind, self.prefix)
+        return outage.measure(self.kind, outage_result) | across.measure(self, view)
 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
-        outage_s, recovered = (values.get(fault_column_name(self.kind, what)) for what in ("outage_s", "recovered"))
-        if recovered is not None:
+        outage_s, has_recovered = (
+            values.get(fault_column_name(self.kind, name)) for name in ("outage_s", "recovered")
+        )
+        if has_recovered is not None:
             result = f"no answer for {outage_s:.1f} s" if isinstance(outage_s, float) else "did not recover"
             yield f"{self.kind}: {result}"
 

@@ -109,21 +109,21 @@ class Iperf3Step(LoadOptions, AlongStep, Prepares, UsesSpace, Listens, SendsTraf
     def jobs(self, scene: Scene) -> Iterator[Planned]:
         end_options = ("-t", f"{self._duration_s:.0f}") if self.size is None else ("-n", f"{self.size:.0f}")
         client = self.client(scene, *end_options, *(("-R",) if self.reverse else ()), "-i", "1", "--json")
-        yield self._planned(scene, self.receiver, "server", self.server("-i", "1", "--json"))
-        yield self._planned(scene, self.sender, "client", client)
+        yield self._planned_job(scene, self.receiver, "server", self.server("-i", "1", "--json"))
+        yield self._planned_job(scene, self.sender, "client", client)
 
-    def _planned(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:
-        serves = role == self.receiver
+    def _planned_job(self, scene: Scene, role: Role, name: str, argv: tuple[str, ...]) -> Planned:
+        is_server = role == self.receiver
         job = Job(
             folder=scene.folder,
             name=self.prefixed_name(f"iperf3-{name}"),
             argv=argv,
-            limit_s=self.limit + _SERVER_EXIT_S * serves,
+            limit_s=self.limit + _SERVER_EXIT_S * is_server,
             log=self._log(role),
             stdout=self._json(role),
-            ready=jobs.ready_when_bound(Protocol.TCP, self.port) if serves else None,
+            ready=jobs.ready_when_bound(Protocol.TCP, self.port) if is_server else None,
         )
-        least_s = 0.0 if serves or self.size is not None else self._duration_s
+        least_s = 0.0 if is_server or self.size is not None else self._duration_s
         return Planned(role, job, program=PROGRAM, least_s=least_s)
 
     @override

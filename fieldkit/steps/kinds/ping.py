@@ -300,8 +300,8 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
     @override
     def summary(self, values: Mapping[str, Value]) -> Iterator[str]:
         if isinstance(loss := values.get("rtt_loss"), float | int):
-            unanswered = f" ({format_count(int(values['rtt_sent']), 'request')}, no reply)" if loss >= 1 else ""
-            yield f"ping loss {100 * loss:.1f} %{unanswered}"
+            no_reply_text = f" ({format_count(int(values['rtt_sent']), 'request')}, no reply)" if loss >= 1 else ""
+            yield f"ping loss {100 * loss:.1f} %{no_reply_text}"
         if isinstance(gap_s := values.get("rtt_gap_s"), float):
             yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
         if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):

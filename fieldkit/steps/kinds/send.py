@@ -118,10 +118,10 @@ class SendStep(TransferStep):
         if not size_bytes:
             return Verdict.FAIL, "it is empty", "name a file with content"
         if not self.size / _SIZE_FACTOR <= size_bytes <= self.size * _SIZE_FACTOR:
-            what = f"{format_bytes(size_bytes)}, but the procedure has {format_bytes(self.size)}"
+            detail = f"{format_bytes(size_bytes)}, but the procedure has {format_bytes(self.size)}"
             return (
                 Verdict.WARN,
-                what,
+                detail,
                 f"write size: {size_bytes}B in the procedure, so that enough disk space is reserved",
             )
         return Verdict.OK, format_bytes(size_bytes), ""

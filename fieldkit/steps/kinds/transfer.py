@@ -128,14 +128,14 @@ class TransferStep(
     @override
     def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
         recorders = [step for step in earlier if isinstance(step, Records) and self.sender in step.records_on()]
-        what = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
+        transfer_text = f"the transfer from {self.sender} {f'sends {self.file}' if self.file else 'names no file'}"
         if not recorders:
-            return f"{what}, but no step before it records on {self.sender}"
+            return f"{transfer_text}, but no step before it records on {self.sender}"
         if self.file is None and len(recorders) > 1:
-            return f"{what}, but {len(recorders)} files are recorded there before it: write file:"
+            return f"{transfer_text}, but {len(recorders)} files are recorded there before it: write file:"
         files = {name for step in recorders for name in step.files()}
         if self.file and PurePosixPath(self.file).parts[0] not in files:
-            return f"{what}, but no recording of that name is made on {self.sender} before it"
+            return f"{transfer_text}, but no recording of that name is made on {self.sender} before it"
         return None
 
     def _file_to_send(self, scene: Scene) -> RecordedFile:
@@ -201,9 +201,9 @@ class TransferStep(
         version = scene.tools(self.receiver).versions.get(Tool.NETCAT, "")
         if netcat.truncates_datagrams(ends[self.sender], ends[self.receiver], version):
             size = netcat.DATAGRAM_BYTES[ends[self.sender]]
-            what = f"its netcat truncates the datagrams of {size} bytes from the sender's netcat"
+            reason = f"its netcat truncates the datagrams of {size} bytes from the sender's netcat"
             yield Refusal(
-                self.receiver, what, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
+                self.receiver, reason, "sudo apt-get install netcat-openbsd, and netcat: nc.openbsd in its profile"
             )
 
     def _file_refusals(self, scene: Scene) -> Iterator[Refusal]:
@@ -213,9 +213,9 @@ class TransferStep(
             self._file_to_send(scene).name,
             self._file_to_send(scene).alias,
         }:
-            what = f"it cannot send {self.file}: its recorder writes {', '.join(recordings)}"
+            reason = f"it cannot send {self.file}: its recorder writes {', '.join(recordings)}"
             leave_out = "leave out file: in the transfer, or " if len(recordings) == 1 else ""
-            yield Refusal(self.sender, what, f"{leave_out}write file: {recordings[0]}")
+            yield Refusal(self.sender, reason, f"{leave_out}write file: {recordings[0]}")
 
     @override
     def prepare(self, scene: Scene, testbed: Testbed) -> Callable[[Announce], None]:

@@ -35,7 +35,7 @@ def judge(plan: Plan, role: Role, sections: Sections, report: Report) -> None:
     _judge_disk(plan, role, sections, report)
     scene = plan.scenes()[0]
     steps = (placed.step for placed in plan.procedure.walk() if isinstance(placed.step, SendsTraffic))
-    flows = (flow for step in steps for flow in step.flows(scene) if not flow.served)
+    flows = (flow for step in steps for flow in step.flows(scene) if not flow.has_other_listener)
     for port in dict.fromkeys(flow.port for flow in flows if flow.destination is role and flow.port is not None):
         _judge_port(port, sections, report)
     for battery in _BATTERY.finditer(sections.get("batteries", MISSING_SECTION).text):

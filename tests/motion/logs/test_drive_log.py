@@ -118,7 +118,7 @@ def test_an_invalid_line_is_refused(tmp_path: Path, wrong: dict[str, Any]) -> No
 def test_a_missing_or_empty_log_is_refused(tmp_path: Path) -> None:
     with pytest.raises(EvidenceError, match="contains no position of a"):
         drive_log.read(write_log(tmp_path, []))
-    with pytest.raises(EvidenceError, match="not in the order of time"):
+    with pytest.raises(EvidenceError, match="not in chronological order"):
         drive_log.read(write_log(tmp_path, [{**LINE, "at_s": 1.0}, LINE]))
     with pytest.raises(EvidenceError, match="cannot be read"):
         drive_log.read(tmp_path / "none")

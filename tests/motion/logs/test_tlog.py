@@ -228,7 +228,7 @@ def test_a_log_that_contradicts_its_recorder_or_the_attempt_is_detected(tmp_path
             replace(recorder_summary, ended_us=log.last_us - 10**6),
             tlog.crc32_of(path),
             window,
-            "1.000 s after its recorder ended",
+            "1.000 s after its recorder stopped",
         ),
         (
             recorder_summary,

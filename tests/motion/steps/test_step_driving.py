@@ -84,7 +84,7 @@ def test_without_permission_there_is_no_driver() -> None:
     (line, *_) = STEP.dry_run_notes(scene)
     assert "automatically" not in line
     (line, *_) = STEP.dry_run_notes(SCENE)
-    assert "it stops if no order arrives for 2 s, or 30 m from its origin" in line
+    assert "it stops if no order arrives for 2 s, and at 30 m from its origin" in line
 
 
 def test_path_beyond_fence_or_speed_is_refused() -> None:
@@ -352,5 +352,5 @@ def test_an_error_inside_is_reported_even_if_the_robot_does_not_return(
     field = DrivingTestbed(RecordingShell(status=['{"ended": "", "ready": true}']))
     with pytest.raises(LinkError) as caught:
         driven(field, fail)
-    assert caught.value.what.startswith("it does not answer; before, the steps failed: RobotError: ")
+    assert caught.value.what.startswith("it does not answer; before that, the steps failed: RobotError: ")
     assert "ping exited with 2" in caught.value.what

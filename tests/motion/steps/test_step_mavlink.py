@@ -78,7 +78,7 @@ def test_recorder_on_the_drone_and_on_another_robot() -> None:
     step = mavlink("at: sender, system: 7, rates: {ATTITUDE: 20Hz}")
     assert role_and_argument(step) == (Role.SENDER, remote)
     (flow,) = step.flows(SCENE)
-    assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP, served=True)
+    assert flow == Flow(Role.RECEIVER, Role.SENDER, 14550, flow.frames, Protocol.UDP, has_other_listener=True)
     assert not list(mavlink().flows(SCENE))
     assert step.stored_bytes(SCENE, Role.SENDER) > 1000
     assert step.stored_bytes(SCENE, Role.RECEIVER) == 0

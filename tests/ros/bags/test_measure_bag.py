@@ -148,7 +148,7 @@ def test_a_file_that_contradicts_its_metadata_is_refused(suffix: str, tmp_path: 
     path = write_ros2_bag(tmp_path / "scan", suffix, {"/scan": 5})
     other = write_ros2_bag(tmp_path / "other" / "scan", suffix, {"/scan": 4})
     shutil.copy(other, path)
-    with pytest.raises(EvidenceError, match=r"contains 4 messages, metadata.yaml states 5"):
+    with pytest.raises(EvidenceError, match=r"contains 4 messages, but metadata.yaml states 5"):
         bag.read(path)
 
 

@@ -81,7 +81,7 @@ OTHER_DOMAIN = RosProgram("talker", {"ROS_DISTRO": "humble", "ROS_DOMAIN_ID": "5
         (robot_state(rmw_interfaces=("eth0", "wlan0")), "RMW settings", Verdict.OK, "limited to eth0, wlan0"),
         (robot_state(unreadable_settings="head: x"), "RMW settings", Verdict.FAIL, "head: x"),
         (robot_state(ZENOH), "Zenoh router", Verdict.FAIL, "TCP port 7447"),
-        (robot_state(ZENOH, tcp_ports=frozenset({7447})), "Zenoh router", Verdict.WARN, "connects to no other"),
+        (robot_state(ZENOH, tcp_ports=frozenset({7447})), "Zenoh router", Verdict.WARN, "does not connect to other"),
         (
             robot_state(ZENOH | {"ZENOH_ROUTER_CONFIG_URI": "r.json5"}, tcp_ports=frozenset({7447})),
             "Zenoh router",

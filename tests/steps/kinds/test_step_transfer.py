@@ -133,5 +133,5 @@ def test_sender_that_starts_after_end_of_listener_is_an_error(
 ) -> None:
     sender, receiver = LateShell(tmp_path / "sender"), LocalShell(tmp_path / "receiver")
     sender.until = receiver.home / FOLDER / ".jobs" / "listen" / "exit"
-    with pytest.raises(RobotError, match=rf"after listening, but {reason}"):
+    with pytest.raises(RobotError, match=rf"after the listener, but {reason}"):
         transfer(protocol, sender, receiver, idle="1s", limit="2s")

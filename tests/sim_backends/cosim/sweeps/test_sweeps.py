@@ -8,9 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import duckdb
-import pandas as pd
-import polars as pl
 import pytest
 
 import fieldkit
@@ -175,6 +172,10 @@ def test_another_sweep_is_refused(lab: Path) -> None:
 
 
 def test_pandas_polars_and_duckdb_read_the_dataset(lab: Path) -> None:
+    import duckdb  # noqa: PLC0415 (these take 0.3 s, which each worker would need at its start)
+    import pandas as pd  # noqa: PLC0415
+    import polars as pl  # noqa: PLC0415
+
     results = lab / "sweep" / "results"
     expected = {("scheduled", "7ms"): 2, ("scheduled", "13ms"): 2, ("sliding_window", "7ms"): 2}
     expected |= {("sliding_window", "13ms"): 2}
