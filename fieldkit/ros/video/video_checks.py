@@ -6,6 +6,8 @@
 from collections.abc import Iterator
 from typing import Final
 
+import numpy as np
+
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 from fieldkit.core.units import format_count
 from fieldkit.ros.streams.sample_arrivals import STAMP_NS
@@ -31,7 +33,7 @@ def check_captures(sent: TopicLog, received: TopicLog, sender: RtpPackets, recei
     if early := int((frames.sent_ns < sent.samples.sent_ns - STAMP_NS).sum()):
         yield f"{format_count(early, 'frame')} in the sender's capture were sent before they were taken, by its log"
     arrived = first_arrivals(received)
-    known = arrived.where(arrived.sequence < len(frames))
+    known = arrived.where(np.isin(arrived.sequence, np.arange(len(frames))))
     first_ns, last_ns = frames.first_ns[known.sequence], frames.last_ns[known.sequence]
     if lacking := int((first_ns == NO_PACKET).sum()):
         yield f"{format_count(lacking, 'frame')} in the receiver's log have no packet in its capture"
