@@ -91,7 +91,7 @@ def _telemetry_sources(plan: Plan, role: Role) -> Sequence[Sequence[str]]:
         return ()
     from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-    return telemetry_queries.of_robots(cast).get(role, ())
+    return telemetry_queries.queries_by_role(cast).get(role, ())
 
 
 def _copy_command(put: PutProgram, robot: Robot, folder: str) -> str:
