@@ -113,7 +113,11 @@ def declare_columns(prefix: str, sent: str) -> tuple[Column, ...]:
             f"Longest time in which reads returned no newer {item} although {item}s were expected.",
             Figure(f"longest time without a new {item}", Kind.MEDIAN, rank=92),
         ),
-        (f"{prefix}_gaps", "count", f"Number of times without a newer {item} that were longer than the limit of the step."),
+        (
+            f"{prefix}_gaps",
+            "count",
+            f"Number of times without a newer {item} that were longer than the limit of the step.",
+        ),
     )
 
 
