@@ -247,7 +247,11 @@ def _add_conform(commands: Commands) -> None:
     )
     _add_changes(parser)
     parser.add_argument(
-        "--windows", type=natural, default=2000, metavar="N", help="windows of the check for drift (default 2000)"
+        "--windows",
+        type=natural,
+        default=2000,
+        metavar="N",
+        help="number of windows in the check for drift (default 2000)",
     )
     parser.add_argument("--deadline", metavar="TIME", help="longest wait for an answer, in wall time (default 30s)")
     parser.add_choice("--format", ("table", "json"), default="table", help="output format (default table)")
