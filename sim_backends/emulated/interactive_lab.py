@@ -24,7 +24,7 @@ from sim_backends.emulated.mobility import WATCH_S, MotionThread, self_steered_m
 from sim_backends.emulated.motion_sections import mavlink_of
 from sim_backends.emulated.nodes import RunningRobots, running_robots
 from sim_backends.emulated.robot.spec import USER
-from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.emulated.ros.robot_motion import AssignedPath
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.world_channel import WorldChannel
 from sim_backends.world.motion import State
@@ -59,7 +59,7 @@ class EmulatedLab:
         for name in members:
             self._assign_place(name, self._places_m[name])
         running.media.place(self._places_m)
-        running.places.write(self._places_m)
+        running.positions_writer.write(self._places_m)
         self._first_stats = running.medium.stats() if options.is_cosimulated else None
         self.members = members
         self.login = Login(USER, running.private_key, running.host_keys)
@@ -92,7 +92,7 @@ class EmulatedLab:
             except RobotError:
                 self._assign_place(name, self._places_m[name])
                 raise
-            self._running.places.write(places_m)
+            self._running.positions_writer.write(places_m)
             self._places_m = places_m
             return place_m
 
@@ -122,7 +122,7 @@ class EmulatedLab:
                 self._places_m = self._places_m | {name: state.position_m for name, state in states.items()}
                 velocities_m_s = {name: state.velocity_m_s for name, state in states.items()}
                 self._running.media.place(self._places_m, velocities_m_s=velocities_m_s)
-                self._running.places.write(self._places_m)
+                self._running.positions_writer.write(self._places_m)
         return WATCH_S
 
     def lateness(self) -> LabLateness | None:

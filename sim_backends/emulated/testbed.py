@@ -118,7 +118,7 @@ class EmulatedTestbed:
         self._shells = shells
         self._boot_s = options.boot
         self._mobility = Mobility(
-            cast, running.media, world, laptop, running.robots, write_positions=running.places.write
+            cast, running.media, world, laptop, running.robots, write_positions=running.positions_writer.write
         )
         names = {role: robot.name for role, robot in running.robots.items()}
         self._oracle = EmulatedOracle(names, running.media, self._mobility, options)

@@ -96,7 +96,7 @@ class MinstrelHt(RateControl):
         draws: Random draws that order the sampled modes.
 
     Attributes:
-        is_probing: True if the frame of the last first attempt is a sample; drivers do not aggregate it.
+        is_probing: True if the most recent new frame is a sample of another mode; drivers do not aggregate it.
     """
 
     def __init__(self, groups: Sequence[Sequence[WifiMode]], draws: PacketDraws) -> None:

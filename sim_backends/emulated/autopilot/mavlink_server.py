@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from fieldkit.core.model import Vector
 from sim_backends.emulated.ros.flight_records import FlightCommandRecord, FlightRecord
-from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.emulated.ros.robot_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.autopilot.autopilot import Autopilot
@@ -74,8 +74,8 @@ def serve(drone: Drone, *, assigned_paths: Path, motion_record: Path, ready: Pat
 
     Args:
         drone: Settings of the drone.
-        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
-        motion_record: The file in which the robot records its motion (`own_motion.MotionReporter`).
+        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        motion_record: The file in which the robot records its motion (`robot_motion.MotionReporter`).
         ready: File that is created when the port is open.
 
     Raises:
@@ -170,7 +170,7 @@ class DroneMotionReporter:
         """Restart the drone at its new place if the lab has moved it."""
         placement = self._reporter.poll_placement(now_ns)
         if placement is not None:
-            east_m, north_m, up_m = placement.place_m
+            east_m, north_m, up_m = placement.position_m
             self._vehicle.place((east_m, north_m, up_m - self._antenna_m), placement.heading_rad, now_ns)
             self._was_flying = False
 

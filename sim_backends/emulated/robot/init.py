@@ -25,9 +25,9 @@ from sim_backends.emulated.robot import mounts, network, rootfs, services, wirel
 from sim_backends.emulated.robot.services import Service
 from sim_backends.emulated.robot.spec import HOME, LOOPBACK_INTERFACE, STATE, RobotSpec, WifiSpec
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND
-from sim_backends.emulated.ros import own_motion
+from sim_backends.emulated.ros import robot_motion
 from sim_backends.emulated.ros.laser import Neighbourhood
-from sim_backends.emulated.ros.own_motion import AssignedPath
+from sim_backends.emulated.ros.robot_motion import AssignedPath
 
 RESTART_S: Final = 0.1
 """Delay before a service that exited is restarted; the default of systemd's RestartSec."""
@@ -203,7 +203,7 @@ class Init:
             case "open wifi" | "switch off" | "switch on" | "switch link on":
                 self._change_radio(request)
             case "move":
-                own_motion.append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
+                robot_motion.append_path(services.ASSIGNED_PATHS, AssignedPath(**request["path"]))
             case "kill":
                 kill_processes(request["process"])
             case "halt":

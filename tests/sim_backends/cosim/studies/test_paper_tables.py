@@ -156,15 +156,15 @@ def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}
     assert row.delay.seeds == 2
-    assert row.delay.ours.value == pytest.approx(0.2), "of the seeds with arrivals"
+    assert row.delay.measured.value == pytest.approx(0.2), "of the seeds with arrivals"
     # Student's t with one degree of freedom is 12.706, and the standard error is 0.1 s; a delay is at least 0.
-    assert row.delay.ours.low == 0
-    assert row.delay.ours.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
+    assert row.delay.measured.low == 0
+    assert row.delay.measured.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
     assert row.delay.agreement is Agreement.AGREES
     assert not row.delay.agrees_by_mean
     assert row.delay.difference == pytest.approx(0.1)
-    assert row.loss.ours.value == pytest.approx((0.02 + 0.02 + 1) / 3)
-    assert row.loss.ours.high == 1, "Student's interval would end at 1.75"
+    assert row.loss.measured.value == pytest.approx((0.02 + 0.02 + 1) / 3)
+    assert row.loss.measured.high == 1, "Student's interval would end at 1.75"
     assert row.reason == "not matched yet"
     assert flow == study.sources[1].flow
 

@@ -21,7 +21,7 @@ from sim_backends.emulated.cosimulated.simulators import RobotBody
 from sim_backends.emulated.robot.base_controller import TIMEOUT_NS
 from sim_backends.emulated.robot.spec import ANTENNA_M
 from sim_backends.emulated.ros.flight_records import FlightMotion, FlightRecord
-from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.emulated.ros.robot_motion import MotionReporter
 from sim_backends.physics.ground import Ground
 from sim_backends.physics.robot_limits import DUCKIEDRONE
 from sim_backends.world.motion import GRAVITY_M_S2
