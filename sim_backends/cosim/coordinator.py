@@ -61,9 +61,9 @@ class Coordinator:
         is_interrupted: True if `KeyboardInterrupt` must be raised as soon as `is_committing` is False.
 
     Raises:
-        ConfigurationError: The physics does not move an agent that may send or receive, or the physics lacks a member
+        ConfigurationError: The physics federate does not move an agent that may send or receive, or it lacks a member
             of a physics federate.
-        FederateError: The physics failed, or does not move an agent that runs a program.
+        FederateError: The physics federate failed, or does not move an agent that runs a program.
     """
 
     def __init__(
@@ -120,8 +120,8 @@ class Coordinator:
         unmoved_agents = self._active - self.situation.states.keys() - agents.absent.keys()
         if unmoved_agents:
             raise ConfigurationError(
-                f"{', '.join(sorted(unmoved_agents))} may send, receive or interfere, but the physics does not move "
-                "this agent"
+                f"{', '.join(sorted(unmoved_agents))} may send, receive or interfere, but the "
+                "physics federate does not move this agent"
             )
         self._select_present()
         if observer is not None:

@@ -112,7 +112,7 @@ class SyncOptions(Strict):
         window: Length of a window, or the w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
         bound: Largest error of the network's relative position of two robots, for `error_bounded`.
-        step: Time step of the physics.
+        step: Time step of the physics simulator.
     """
 
     name: str = "event_driven"
@@ -134,7 +134,7 @@ class SyncOptions(Strict):
 
     @property
     def step_ns(self) -> int:
-        """Time step of the physics in nanoseconds."""
+        """Time step of the physics simulator in nanoseconds."""
         return round(self.step * 1e9)
 
 

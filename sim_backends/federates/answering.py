@@ -48,7 +48,7 @@ class FederateService:
     """A federate and its properties.
 
     Attributes:
-        make: Returns a physics or a network for a run.
+        make: Returns a physics or network federate for a run.
         name: Its name in messages.
         software: Name and version of its software.
         is_deterministic: True if equal requests give equal answers.
@@ -69,7 +69,7 @@ class FederateService:
     commands: Sequence[int] = COMMAND_TYPES
     transports: Sequence[str] = ()
 
-    def welcome(self, federate: Any, hello: Hello) -> Welcome:  # noqa: ANN401 (a physics or a network)
+    def welcome(self, federate: Any, hello: Hello) -> Welcome:  # noqa: ANN401 (a physics or network federate)
         """Return the answer to a hello.
 
         Raises:
@@ -102,7 +102,7 @@ class FederateService:
         )
 
 
-def _next_event_ns(federate: Any) -> int:  # noqa: ANN401 (a physics or a network)
+def _next_event_ns(federate: Any) -> int:  # noqa: ANN401 (a physics or network federate)
     if not hasattr(federate, "next_event_ns"):
         return NO_EVENT
     at_ns = federate.next_event_ns()

@@ -17,7 +17,7 @@ _HELLO_S: Final = 10.0
 
 
 def serve(make: Make, *, address: str | None = None, runs: int | None = None, **properties: Any) -> None:  # noqa: ANN401 (of `FederateService`)
-    """Serve a physics or a network class.
+    """Serve a physics or network class.
 
     Args:
         make: Called with the `Hello` of each run; returns the federate, for example its class.

@@ -133,7 +133,8 @@ def _exceeded_bound(scenario: CosimScenario, row: Row) -> str | None:
         return None
     return (
         f"{row.policy} had a position error of {largest_m * 1e3:.3g} mm, more than its bound of "
-        f"{chosen_policy.bound * 1e3:.3g} mm: agents changed their velocity by more than limits_m_s2 of the physics"
+        f"{chosen_policy.bound * 1e3:.3g} mm: agents changed their velocity "
+        "by more than limits_m_s2 of the physics federate"
     )
 
 

@@ -6,7 +6,7 @@ network: arrivals count from the end of the window, so nothing that physics and 
 the network. At the time that physics and programs have reached, a pair of agents has an error x: the distance between
 its true relative position and its relative position in the network. This error grows at a speed v, which changes by
 at most the acceleration limit a: after a time t, the error is at most x + v t + a t^2 / 2. Before the error can reach
-the bound, the policy evaluates the errors again; if less than one step of the physics remains, the window ends. The
+the bound, the policy evaluates the errors again; if less than one physics step remains, the window ends. The
 bound is therefore kept for any motion, and the windows are not shortened for motions that were possible but did not
 occur ("send on delta": Miskowicz, Sensors 6, 49, 2006).
 
@@ -15,12 +15,12 @@ of each agent and a fixed point on the ground, so that the bound also applies to
 bound in dB adds the pairs of each agent and a fixed source of interference.
 
 The network extrapolates in steps, but the trajectory is continuous: with an assumed relative speed u and a step q,
-the error grows by u q between two steps. The step is the step of the physics if u q is at most an eighth of the
+the error grows by u q between two steps. The step is the physics step if u q is at most an eighth of the
 bound; otherwise it is shorter.
 
 While no program sends and the network has no events, positions are not used, and the window extends to the last step
 before the next event. If a network cannot extrapolate, it assumes that agents do not move, and x is the distance that
-they have moved; if one step of the physics moves them farther than the bound, the bound cannot be kept, and the
+they have moved; if one physics step moves them farther than the bound, the bound cannot be kept, and the
 policy raises an error.
 
 The bound may be given in dB of path loss. By the log-distance law, 10 n log10(d), if a pair has the assumed distance
@@ -146,11 +146,11 @@ class ErrorBounded:
             return
         worst_pair = int(np.argmax(errors_m - pairs.bounds_m))
         raise PolicyError(
-            f"this network does not extrapolate, and in one step of the physics, {step_s:g} s, the position error of "
+            f"this network does not extrapolate, and in one physics step, {step_s:g} s, the position error of "
             f"{pairs.name(worst_pair)} may reach {errors_m[worst_pair]:.3g} m; the bound is "
             f"{pairs.bounds_m[worst_pair]:.3g} m",
             where=f"{self.name} at {situation.now_ns / 1e9:g} s",
-            remedy="use a larger bound, a shorter step of the physics, or a network that extrapolates",
+            remedy="use a larger bound, a shorter physics step, or a network that extrapolates",
         )
 
     def _pairs(self, situation: Situation) -> "_Pairs":
@@ -162,7 +162,7 @@ class ErrorBounded:
             assumed_states = [situation.assumed_states[name] for name in names]
         places_m, velocities_m_s = _arrays(states, fixed_m)
         assumed_m, assumed_m_s = _arrays(assumed_states, fixed_m)
-        # The physics may have no limit for an agent that appeared during the run.
+        # The physics federate may have no limit for an agent that appeared during the run.
         limits_m_s2 = np.array(
             [*(situation.limits_m_s2.get(name, math.inf) for name in names), *(0.0 for _ in fixed_m)]
         )

@@ -23,7 +23,7 @@ class Situation:
         pairs: Sender and receiver of each possible transmission.
         next_wake_ns: Returns the next time at which a program's timer wakes it, or None.
         next_event_ns: Returns the time of the next event in the network, or None.
-        physics_step_ns: The step of the physics.
+        physics_step_ns: The physics step.
         limits_m_s2: Largest change of each agent's velocity per second.
         next_send_ns: Time before which no program sends, or None; only set for policies that look ahead.
         assumed_states: States of the agents that the network assumes now, and from which it extrapolates; only set

@@ -109,7 +109,7 @@ def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
 
 
 class SimulatorName(NamedTuple):
-    """A physics or a network that has a name.
+    """A physics or network federate that has a name.
 
     Attributes:
         name: Its name.
@@ -213,7 +213,7 @@ def carried_radio(network: NetworkFederate, names: Sequence[str]) -> RadioModel[
     return IpRadio(network, names)
 
 
-def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+def _make_federate(federate: PythonFederate, name: str, hello: Hello) -> Any:  # noqa: ANN401 (either role)
     """Return a federate in this process.
 
     Raises:

@@ -52,7 +52,7 @@ _VALIDATED_DEFAULT: Final = Field(validate_default=True)
 PhysicsFederateOptions = Annotated[
     Options, PlainValidator(_options_of(PHYSICS)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]
-"""Options of the physics that `federate` names in the same mapping."""
+"""Options of the physics federate that `federate` names in the same mapping."""
 NetworkFederateOptions = Annotated[
     Options, PlainValidator(_options_of(NETWORK)), _SERIALIZER, _JSON_SCHEMA, _VALIDATED_DEFAULT
 ]

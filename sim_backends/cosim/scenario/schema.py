@@ -212,7 +212,7 @@ class CosimScenario(Named):
         line: The line of the world along which agents start.
         duration: Its duration, in simulated time.
         seeds: Seeds of the random draws, one for each run.
-        physics: The physics.
+        physics: The physics federate.
         network: The network.
         radio: The radio.
         tcp: The TCP of all agents, also for ROS 1 topics.
@@ -377,7 +377,7 @@ class CosimScenario(Named):
     def _window_is_at_least_a_step(self) -> "CosimScenario":
         if self.policy.window < self.physics.step:
             raise schema.validation_error(
-                f"a window of {self.policy.window:.12g} s is shorter than the step of the physics, "
+                f"a window of {self.policy.window:.12g} s is shorter than the physics step, "
                 f"{self.physics.step:.12g} s, so that no state changes in it",
                 "policy",
                 "window",

@@ -18,7 +18,7 @@ from sim_backends.physics.bodies import Bodies
 from sim_backends.world.world import World
 
 
-def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or a network)
+def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or network federate)
     """Return the built-in federate of a run.
 
     Args:

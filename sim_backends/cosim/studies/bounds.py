@@ -65,7 +65,7 @@ def bound_cost(
     Args:
         run: Runs the same scenario and seed with a policy.
         bound_m: Largest allowed error of the network's relative position of two agents.
-        step_s: The step of the physics, which is the shortest window.
+        step_s: The physics step, which is the shortest window.
         longest_s: The longest window.
     """
     bounded_run = run(ErrorBounded(bound_m, longest_s))

@@ -61,8 +61,8 @@ class SampledPhysics:
     """Physics whose states are sampled at equal intervals; sampling does not change the motion.
 
     Args:
-        physics: The physics.
-        interval_ns: Sampling interval; it is rounded up to whole steps of the physics.
+        physics: The physics federate.
+        interval_ns: Sampling interval; it is rounded up to whole physics steps.
     """
 
     def __init__(self, physics: PhysicsFederate, interval_ns: int) -> None:
@@ -75,7 +75,7 @@ class SampledPhysics:
         self.agents_disappear = getattr(physics, "agents_disappear", False)
 
     def advance(self, to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
-        """Advance the physics, and store the samples that are due."""
+        """Advance the physics federate, and store the samples that are due."""
         while self._next_ns <= to_ns:
             self._samples.append(self._physics.advance(self._next_ns, commands))
             self._next_ns += self._interval_ns

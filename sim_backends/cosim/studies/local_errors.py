@@ -97,7 +97,7 @@ def local_errors(
         policies: Functions that return a policy for a parameter: the length of a window in seconds, or its
             equivalent.
         parameters: The parameters.
-        starts_ns: Start times of windows, ascending; whole steps of the physics.
+        starts_ns: Start times of windows, ascending; whole physics steps.
         tail_ns: Time for which forks continue after the window; packets whose fate is undecided then are ignored.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The process of a co-simulated medium: a network carries packets between devices, and a physics moves the robots.
+"""The process of a co-simulated medium, which runs a network for packets and a physics simulator for robots.
 
 `client` runs it as `python -m sim_backends.emulated.cosimulated.cosim_process FD SEED FRAMING`. It answers the same
 requests as the process of a radio model, and two more: `simulate`, with simulators and policy, and `body`, with the

@@ -86,7 +86,7 @@ class MediumClient:
             fd: Descriptor of its device, or of a packet socket: each read returns one framed packet, and each write
                 accepts one. The medium gets a copy; the caller closes this descriptor. None for a radio of the
                 kernel, which has no device.
-            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics; other media ignore them.
+            physics_fds: `EmulatedRobot.physics_fds`, for a medium with a physics simulator; other media ignore them.
 
         Raises:
             LinkError: The medium ended or did not answer.

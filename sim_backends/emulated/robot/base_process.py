@@ -60,7 +60,7 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
 
 
 def _record_velocities(channel: socket.socket) -> NoReturn:
-    """Record each velocity for the physics, which limits it and stops the robot after the last one."""
+    """Record each velocity for the physics simulator, which limits it and stops the robot after the last one."""
     record = VelocityCommandRecord.open(VELOCITY_COMMAND)
     while True:
         velocity = unpack(channel.recv(BYTES + 1))

@@ -30,7 +30,7 @@ MOTION_RECORD: Final = Path(STATE, "steered")
 """The file in which a robot that steers itself records its motion."""
 
 FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
-"""The file in which an autopilot records its command for a physics that flies the drone."""
+"""The file in which an autopilot records its command for a physics simulator that flies the drone."""
 
 FLIGHT: Final = Path(STATE, "flown")
 """The file in which that physics records the flight."""

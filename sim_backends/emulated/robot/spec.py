@@ -50,7 +50,8 @@ class Base:
         speed_m_s: Maximum speed.
         acceleration_m_s2: Maximum acceleration.
         turn_rad_s: Maximum turn rate.
-        is_simulated: True if the physics of a co-simulation moves the robot: the base only records the velocities.
+        is_simulated: True if the physics simulator of a co-simulation moves the robot: the base only records the
+            velocities.
     """
 
     topic: str
@@ -127,7 +128,8 @@ class RobotSpec:
         registered_topics: Published topics that it registers at that master.
         definitions: Definitions of the message types of its sensors.
         mavlink_port: UDP port of its autopilot; None without an autopilot.
-        simulated_flight: True if the physics of a co-simulation flies it: the autopilot records its commands only.
+        simulated_flight: True if the physics simulator of a co-simulation flies it: the autopilot only records its
+            commands.
         autopilot: Firmware that the autopilot emulates, `px4` or `ardupilot`.
         system: MAVLink system id of that autopilot.
         boot_s: Boot time of that autopilot.

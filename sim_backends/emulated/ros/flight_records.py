@@ -1,4 +1,4 @@
-"""Records between the autopilot of a drone and the physics that flies it: commands, and the resulting flight."""
+"""Records that the autopilot and the physics simulator of a drone exchange: commands, and the resulting flight."""
 
 import math
 from typing import Final, NamedTuple
@@ -77,7 +77,7 @@ class FlightCommandRecord(Record):
 
 
 class FlightMotion(NamedTuple):
-    """Motion of a drone that a physics flies, for its autopilot.
+    """Motion of a drone that a physics simulator flies, for its autopilot.
 
     Attributes:
         time_ns: Its time, by the monotonic clock.

@@ -1,4 +1,4 @@
-"""Checks of a physics: signs, axes and units of its motion.
+"""Checks of a physics federate: signs, axes and units of its motion.
 
 Agents accelerate within limits, and wheels slip: the tolerances accept half of the commanded motion.
 """

@@ -1,4 +1,4 @@
-"""Checks of a physics: times, commands, motion, determinism, forks."""
+"""Checks of a physics federate: times, commands, motion, determinism, forks."""
 
 import json
 import math

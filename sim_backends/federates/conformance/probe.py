@@ -46,7 +46,7 @@ class Opener(Protocol):
 
 @dataclass(frozen=True)
 class PhysicsAnswer:
-    """The answer of a physics.
+    """The answer of a physics federate.
 
     Attributes:
         at_ns: Time of the states.
@@ -118,7 +118,7 @@ class FederateProbe:
     def physics(
         self, to_ns: int, commands: Mapping[str, Any] | None = None, *, from_ns: int | None = None, copy: int = 0
     ) -> PhysicsAnswer:
-        """Advance a physics; the commands apply from the time of the last call, or from `from_ns`."""
+        """Advance a physics federate; the commands apply from the time of the last call, or from `from_ns`."""
         begin_ns = self.last_ns if from_ns is None else from_ns
         body = encode_advance_physics(to_ns, begin_ns, commands or {}, self.agents)
         names_before = set(self.agents.names)
@@ -223,7 +223,7 @@ class Target:
 
     @property
     def is_physics(self) -> bool:
-        """True if a physics is tested."""
+        """True if a physics federate is tested."""
         return self.hello.role == PHYSICS
 
     def open(self, hello: Hello | None = None) -> FederateProbe:
