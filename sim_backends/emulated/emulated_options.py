@@ -161,15 +161,15 @@ class EmulatedOptions(Strict):
             fixed links have none.
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
-        physics: The robots move [on the co-simulation](lab-cosim.md), moved by this physics: `kinematic`, `mujoco` or
-            `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
+        physics: The physics simulator that moves the robots [on the co-simulation](lab-cosim.md): `kinematic`,
+            `mujoco` or `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
         sync: The sync policy between physics and network: its name, or name and parameters. The default is
             `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
             exchange at every event of ns-3 takes too long for real time.
-        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [the Wi-Fi of Linux](linux-wifi.md), over the same
-            radio, in a virtual machine if this kernel has no mac80211_hwsim.
-        linux_wifi: Settings of the Wi-Fi of Linux.
+        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [Linux Wi-Fi](linux-wifi.md), over the same radio,
+            in a virtual machine if this kernel has no mac80211_hwsim.
+        linux_wifi: Settings of Linux Wi-Fi.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -190,7 +190,7 @@ class EmulatedOptions(Strict):
 
     @property
     def has_linux_wifi(self) -> bool:
-        """True if the robots have the Wi-Fi of Linux."""
+        """True if the robots have Linux Wi-Fi."""
         return self.wifi == "linux"
 
     @property

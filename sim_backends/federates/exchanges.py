@@ -32,8 +32,8 @@ next index in the first message that mentions it, for this copy and its copies.
 - **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
   `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
   Otherwise agents stay at their positions until the next request.
-- **Absent agents** have no state. A physics federate with the capability 32 omits agents that it has removed; they
-may return.
+- **Absent agents** have no state. A physics federate with the capability 32 omits agents that it has
+  removed; they may return.
   With the scenario's keys `appears` and `disappears` the coordinator ignores states of absent agents, sends them no
   commands, and drops their packets as `agent absent`; the network still reports the fates of those that it already
   carries. A network without the capability 32 receives the last states of absent agents, or their start states.

@@ -45,7 +45,9 @@ _COLUMNS: Final = (
         1e3,
     ),
     SheetColumn("late_s", "late (ms)", "mean time by which the receiver was already past an arrival", 1e3),
-    SheetColumn("position_m", "place (mm)", "mean error of the relative position of two agents in the network", 1e3),
+    SheetColumn(
+        "position_m", "position (mm)", "mean error of the relative position of two agents in the network", 1e3
+    ),
     SheetColumn("fates", "fate (%)", "packets with another fate", 100),
     SheetColumn("path_m", "path (mm)", "mean position error of agents at the end of a window", 1e3),
 )

@@ -54,7 +54,8 @@ def scenario(arguments: argparse.Namespace) -> CosimScenario:
     """Return the scenario that the arguments name, with the changes of other arguments.
 
     Raises:
-        ConfigurationError: It does not exist, or a change is invalid; the message states the key and its place.
+        ConfigurationError: It does not exist, or a change is invalid; the message states the key and its line in the
+            file.
     """
     return load_scenario(arguments.scenario, changes(arguments))
 

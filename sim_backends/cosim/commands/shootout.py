@@ -38,7 +38,7 @@ COLUMNS: Final = (
     SheetColumn("delay_added_s", "added", "mean delay that the policy added, in ms", 1e3),
     SheetColumn("fate_disagreement", "fate (%)", "packets lost here or in the reference, but not in both", 100),
     SheetColumn("causality_violations", "late", "arrivals at a time that the receiver was already past, per run"),
-    SheetColumn("position_error_mean_m", "place (mm)", "mean error of relative positions in the network", 1e3),
+    SheetColumn("position_error_mean_m", "position (mm)", "mean error of relative positions in the network", 1e3),
     SheetColumn("position_error_p95_m", "p95", "its 95th percentile", 1e3),
     SheetColumn("position_error_max_m", "max", "its maximum", 1e3),
     SheetColumn(

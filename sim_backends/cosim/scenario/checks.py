@@ -160,10 +160,10 @@ def check(scenario: CosimScenario, world: World, where: Callable[[Location], str
     Args:
         scenario: The scenario.
         world: Its world.
-        where: Returns the place of keys in the scenario's file, for the message.
+        where: Returns the line of keys in the scenario's file, for the message.
 
     Raises:
-        ConfigurationError: It cannot be run; the message has the first reason and its place.
+        ConfigurationError: It cannot be run; the message has the first reason and its line in the file.
     """
     for problem in problems(scenario, world):
         raise ConfigurationError(problem.message, where=where(problem.location), remedy=problem.remedy)

@@ -1,4 +1,4 @@
-"""Builds the physics and the network of a session."""
+"""Builds the physics simulator and the network of a session of the co-simulation."""
 
 import dataclasses
 import json

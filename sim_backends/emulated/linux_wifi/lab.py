@@ -1,4 +1,4 @@
-"""Wi-Fi of Linux in an emulated lab: the Wi-Fi settings of each robot, its radio, and the medium of all radios."""
+"""Linux Wi-Fi in an emulated lab: the Wi-Fi settings of each robot, its radio, and the medium of all radios."""
 
 import secrets
 from collections.abc import Iterable, Mapping

@@ -33,7 +33,7 @@ FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
 """The file in which an autopilot records its command for a physics simulator that flies the drone."""
 
 FLIGHT: Final = Path(STATE, "flown")
-"""The file in which that physics records the flight."""
+"""The file in which this physics simulator records the flight."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
 

@@ -89,7 +89,7 @@ class Ros2Spec:
 
 @dataclass(frozen=True)
 class WifiSpec:
-    """The Wi-Fi of Linux on a robot.
+    """Settings of Linux Wi-Fi on a robot.
 
     Attributes:
         mode: `ad hoc`, `mesh point`, `access point` or `station`.
@@ -150,7 +150,7 @@ class RobotSpec:
         mesh_hello_s: Hello interval of its routing daemon; None for a robot that does not forward.
         ros2: Its ROS 2 over the radio; None if it has none.
         routes_zenoh: True if it runs the Zenoh router.
-        wifi: Its Wi-Fi of Linux; None for a robot whose radio is a TUN or TAP device.
+        wifi: Settings of its Linux Wi-Fi; None for a robot whose radio is a TUN or TAP device.
         links: Interface and address with the prefix length of each further link, by its name.
         bridge: Command that bridges its topics from ROS 1 to another middleware; empty if none runs automatically.
     """

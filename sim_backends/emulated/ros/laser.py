@@ -168,7 +168,7 @@ class Neighbourhood:
         self._positions_m = [_ABSENT] * robots
 
     def targets(self, neighbours: Sequence[Neighbour]) -> list[LaserTarget]:
-        """Return the other robots as laser targets at their current positions; robots without a position are omitted."""
+        """Return the other robots with a position, as laser targets at these positions."""
         self._read()
         targets = []
         for body in neighbours:

@@ -189,7 +189,7 @@ class TestPlacement:
 
     def test_a_world_without_a_line_for_the_scenario_is_refused(self) -> None:
         without_lines = self.LAWN.model_copy(update={"lines": {}})
-        with pytest.raises(ConfigurationError, match="no line for the places of robots in the scenario los"):
+        with pytest.raises(ConfigurationError, match="no line for the positions of robots in the scenario los"):
             placement.positions_m(cast_for(Topology.MASTER), placed(Scenario.LOS, Topology.MASTER), without_lines)
 
 
