@@ -53,8 +53,8 @@ class RadioNetwork:
         relay: Station whose access point relays between the others; None for direct links.
 
     Attributes:
-        now_ns: See `Wire`.
-        extrapolates: See `NetworkFederate.advance`.
+        now_ns: Current simulated time.
+        extrapolates: True, because dead-reckoned states are evaluated at the time of each event.
         transmitters: Stations that send independently of the traffic: the relay, and agents that carry a jammer.
         fixed_emitters_m: Positions of the jammers that no agent carries.
 
@@ -274,7 +274,7 @@ class RadioNetwork:
         } | self._absent_stations
 
     def _disturb(self, resume_ns: int) -> None:
-        """Apply the present disturbances; called when one starts or ends, and when the absent stations change.
+        """Apply the current disturbances; called when one starts or ends, and when the absent stations change.
 
         Args:
             resume_ns: Time from which the suspended timers of hosts that are on again fire.

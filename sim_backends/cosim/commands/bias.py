@@ -23,14 +23,14 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigurationError: There is only one seed.
     """
-    scenario = settings.scenario(arguments)
-    policies = settings.policies(arguments)
-    seeds = settings.seeds(arguments, scenario)
+    scenario = settings.read_scenario(arguments)
+    policies = settings.read_policies(arguments)
+    seeds = settings.read_seeds(arguments, scenario)
     if len(seeds) < 2:
         raise ConfigurationError("--bias: one seed has no distribution", remedy="add --seeds 20")
     if arguments.windows:
-        scenario = settings.with_window(scenario, settings.windows_s(arguments, scenario)[0])
-    draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
+        scenario = settings.with_window(scenario, settings.read_windows_s(arguments, scenario)[0])
+    draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))
     with showing_progress() as sink:
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
             partial(_build, scenario),
             policies,
             seeds,
-            workers=settings.workers(arguments, scenario.packets * runs),
+            workers=settings.read_workers(arguments, scenario.packets * runs),
             progress=partial(progress_reporter(sink), "bias", runs),
         )
     by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}

@@ -33,8 +33,8 @@ def run(arguments: argparse.Namespace) -> int:
         FieldkitError: The federate cannot be started or connected.
     """
     endpoint = arguments.federate[0] if len(arguments.federate) == 1 else shlex.join(arguments.federate)
-    deadline_s = settings.deadline_s(arguments.deadline)
-    changes = settings.changes(arguments)
+    deadline_s = settings.parse_deadline_s(arguments.deadline)
+    changes = settings.read_changes(arguments)
     if _is_federate_with_role(endpoint, NETWORK):
         changes |= {"traffic": _udp_traffic(load_scenario(arguments.scenario, changes))}
     scenario = load_scenario(arguments.scenario, changes | _federate_change(endpoint))

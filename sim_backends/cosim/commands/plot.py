@@ -161,7 +161,7 @@ _REMEDY: Final = "write one with fieldkit cosim shootout SCENARIO --format csv >
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw a recording, or the table of a shootout."""
-    draw = settings.figure(arguments.out, "--out")
+    draw = settings.open_figure(arguments.out, "--out")
     if arguments.recording.suffix == ".csv":
         draw(error_against_cost(_points(arguments.recording)))
         return 0

@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         ConfigurationError: The threshold is above 100 %.
     """
-    scenario = settings.scenario(arguments)
+    scenario = settings.read_scenario(arguments)
     threshold = parse_quantity(arguments.threshold, {"%": 0.01}, "threshold")
     if threshold > 1:
         raise ConfigurationError(

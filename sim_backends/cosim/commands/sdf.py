@@ -9,5 +9,5 @@ from sim_backends.cosim.scenario.sdf_world import scenario_sdf
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the world with its robots as SDF."""
-    print_text(scenario_sdf(settings.scenario(arguments), arguments.gazebo).rstrip("\n"))
+    print_text(scenario_sdf(settings.read_scenario(arguments), arguments.gazebo).rstrip("\n"))
     return 0

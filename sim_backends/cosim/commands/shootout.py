@@ -30,7 +30,7 @@ COLUMNS: Final = (
     SheetColumn(
         "delivery_error_mean_s",
         "time (ms)",
-        "mean magnitude of the difference between the delivery time and the reference's",
+        "mean absolute difference from the delivery time in the reference",
         1e3,
     ),
     SheetColumn("delivery_error_p95_s", "p95", "its 95th percentile", 1e3),
@@ -71,15 +71,15 @@ def run(arguments: argparse.Namespace) -> int:
         return bias.run(arguments)
     if arguments.bound:
         return bound.run(arguments)
-    scenario = settings.scenario(arguments)
-    policies = settings.policies(arguments)
-    seeds = settings.seeds(arguments, scenario)
-    windows_s = settings.windows_s(arguments, scenario)
-    draw = None if arguments.figure is None else settings.figure(arguments.figure, "--figure")
+    scenario = settings.read_scenario(arguments)
+    policies = settings.read_policies(arguments)
+    seeds = settings.read_seeds(arguments, scenario)
+    windows_s = settings.read_windows_s(arguments, scenario)
+    draw = None if arguments.figure is None else settings.open_figure(arguments.figure, "--figure")
     build(without_federates(scenario))  # raises before any run if the scenario is invalid
     settings.note_commensurate_events(scenario, policies, windows_s, len(seeds))
     with showing_progress() as sink:
-        workers = settings.workers(arguments, scenario.packets * (len(policies) + 1) * len(seeds))
+        workers = settings.read_workers(arguments, scenario.packets * (len(policies) + 1) * len(seeds))
         all_rows = _all_rows(scenario, policies, seeds, windows_s, workers=workers, sink=sink)
     _sheet(scenario, all_rows, seeds).show(arguments.format)
     for window_s, row in all_rows:

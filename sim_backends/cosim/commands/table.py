@@ -34,14 +34,14 @@ _REASON: Final = SheetColumn("loss_reason", "main reason", "most frequent reason
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the simulations of a table or of the claims of the paper; print the numbers of both."""
-    which, changes = arguments.which, settings.changes(arguments)
+    which, changes = arguments.which, settings.read_changes(arguments)
     seeds = range(1, arguments.seeds + 1) if arguments.seed is None else (arguments.seed,)
     table = None if which == "claims" else paper_table(which, changes)
     setups = claim_setups(changes) if table is None else table.setups
     with showing_progress() as sink:
         progress = partial(progress_reporter(sink), f"table {which}", len(setups) * len(seeds))
         progress(0)
-        samples = flow_samples(setups, seeds, workers=settings.workers(arguments), progress=progress)
+        samples = flow_samples(setups, seeds, workers=settings.read_workers(arguments), progress=progress)
     title = f"{_TITLES[which]}, {format_count(len(seeds), 'seed')}"
     if table is None:
         claim_sheet(title, claims(setups, samples)).show(arguments.format)

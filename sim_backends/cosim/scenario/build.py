@@ -1,4 +1,4 @@
-"""Builds a scenario: agents, network and coordinator.
+"""Builds the simulation of a scenario: agents, network and coordinator.
 
 The network consists of antennas, a radio model and transports, with the faults of radios.
 """
@@ -64,7 +64,8 @@ def radio_network(
         world: Its world.
         seed: Seed of all random draws.
         observer: Receives all IP packets if it has `log_ip`.
-        path_losses_db: As for `WifiInWorld`; fixed links ignore them.
+        path_losses_db: Returns the mean losses that replace losses in the world, by transmitter and receiver; None if
+            there are none. Fixed links ignore them.
         carrier: Network that carries its IP packets instead of the built-in radio, or None.
     """
     stations = antennas(scenario)
@@ -217,7 +218,7 @@ class Simulation:
 
         Args:
             until_ns: End time in nanoseconds of simulated time, or None.
-            progress: As for `Coordinator.advance`.
+            progress: Called at most every 0.2 s of wall time, or None.
 
         Raises:
             PolicyError: The policy has no window. After any error, `Coordinator.run` has the record so far.
@@ -249,7 +250,7 @@ def build(
         deadline_s: Longest wait for an answer of a federate, in seconds of wall time; None for no deadline.
         physics: Replaces the scenario's physics, and receives the commands to bodies.
         network: Replaces the scenario's network; it must then also apply the faults of the radio.
-        measures_all: As for `Coordinator`.
+        measures_all: True to include all agents in the position error of every packet, as comparisons need.
         captures: Folder of captures for a network that writes them itself; the recorder then receives no IP packets.
 
     Raises:

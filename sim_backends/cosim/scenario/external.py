@@ -1,4 +1,4 @@
-"""External federates of a scenario; only this module of the co-simulation starts, connects to or creates them."""
+"""Starts, connects to or creates the external federates of a scenario; no other module of the co-simulation does."""
 
 import dataclasses
 import json
@@ -136,7 +136,14 @@ def simulators() -> list[SimulatorName]:
 def open_physics(
     scenario: CosimScenario, world: World, bodies: Mapping[str, Body[Any]], seed: int, deadline_s: float | None
 ) -> PhysicsFederate | None:
-    """Start, connect to or create the scenario's external physics, if it has one; arguments as for `make_hello`.
+    """Start, connect to or create the scenario's external physics federate; return None if it has none.
+
+    Args:
+        scenario: The scenario.
+        world: Its world.
+        bodies: The body of each agent.
+        seed: Seed of all random draws.
+        deadline_s: Longest wait for an answer, in seconds of wall time; None for no deadline.
 
     Raises:
         ConfigurationError: The name, the command or the address cannot be used.
@@ -162,15 +169,20 @@ def open_network(
     *,
     captures: Mapping[str, Any] | None = None,
 ) -> NetworkFederate | None:
-    """Start, connect to or create the scenario's external network, if it has one; errors as for `open_physics`.
+    """Start, connect to or create the scenario's external network federate; return None if it has none.
 
     Args:
         scenario: The scenario.
-        world: The world.
-        bodies: The bodies.
-        seed: The seed.
-        deadline_s: The deadline.
+        world: Its world.
+        bodies: The body of each agent.
+        seed: Seed of all random draws.
+        deadline_s: Longest wait for an answer, in seconds of wall time; None for no deadline.
         captures: Settings of the captures for a network with `writes_captures`; None if it writes no captures.
+
+    Raises:
+        ConfigurationError: The name, the command or the address cannot be used, or the network lacks a transport or a
+            capability that the scenario needs.
+        FederateError: The federate failed, or has not connected or answered in time.
     """
     endpoint = scenario.network.federate
     if endpoint is None:
@@ -209,7 +221,7 @@ def open_network(
 
 
 def carried_radio(network: NetworkFederate, names: Sequence[str]) -> RadioModel[Fragment]:
-    """Return the radio for built-in transports that uses an external network to carry IP packets."""
+    """Return the radio for built-in transports whose IP packets an external network carries."""
     return IpRadio(network, names)
 
 

@@ -1,4 +1,4 @@
-"""The world of a scenario as SDF, for Gazebo."""
+"""Converts the world and the robots of a scenario to SDF, for Gazebo."""
 
 from sim_backends.cosim.scenario.agent_setup import bodies, limits
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -12,7 +12,7 @@ def scenario_sdf(scenario: CosimScenario, version: Version = "fortress") -> str:
 
     Args:
         scenario: The scenario.
-        version: As for `world_sdf`.
+        version: Version of Gazebo, which determines the names of the plugins.
 
     Raises:
         ConfigurationError: The world does not exist, or a robot starts within an obstacle.

@@ -1,6 +1,7 @@
-"""The built-in physics and network as external federates: `python -m sim_backends.cosim.scenario.served physics`.
+"""Serves the built-in physics or network as an external federate.
 
-A second argument is an address as for `serve`; without it, standard input and output are used.
+The command is `python -m sim_backends.cosim.scenario.served physics [ADDRESS]`, or `network` instead of `physics`.
+ADDRESS is the address of a transport; without it, standard input and output are used.
 """
 
 import json

@@ -76,7 +76,12 @@ def bound_cost(
 
 
 def fixed_cost(run: Callable[[SyncPolicy], Run], window_s: float) -> FixedCost:
-    """Return the cost of a fixed window in a scenario with one seed; `run` is as for `bound_cost`."""
+    """Return the cost of a fixed window in a scenario with one seed.
+
+    Args:
+        run: Runs the same scenario and seed with a policy.
+        window_s: The window.
+    """
     result = run(Scheduled(window_s))
     return FixedCost(largest_m(result), len(result.windows_ns))
 
@@ -86,8 +91,8 @@ def longest_sufficient_window(
 ) -> tuple[float, Sequence[FixedCost]]:
     """Return the longest fixed window that keeps a bound in all runs, and its cost in each run.
 
-    The tolerance is 2 %. It is the window that a user would choose for further runs. If there is none, the result is
-    nan and an empty sequence.
+    This is the window that a user would choose for further runs; it is determined within 2 %. If there is no such
+    window, the result is nan and an empty sequence.
 
     Args:
         longest_s: The longest window that keeps the bound in each run.

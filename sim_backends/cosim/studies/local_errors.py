@@ -26,7 +26,7 @@ from sim_backends.radio.random_streams import PacketIdentity
 from sim_backends.world.motion import State
 
 MEASURES: Final = ("delivery_s", "late_s", "position_m", "fates", "path_m")
-"""Error of the delivery time; time by which the receiver was already past an arrival; error of the relative position
+"""Error of the delivery time; time by which an arrival was in the receiver's past; error of the relative position
 of sender and receiver in the network; share of packets with another fate; position error of agents at the end of the
 window."""
 

@@ -71,7 +71,7 @@ def claim_setups(changes: Changes) -> dict[str, Setup]:
     """Return the setups to run for the claims, by name.
 
     Args:
-        changes: Changes of the scenario's file, as for `load_scenario`.
+        changes: Values by dotted key of the scenario file, which replace those of the file.
 
     Raises:
         ConfigurationError: The changes are invalid.

@@ -76,8 +76,8 @@ def flow_samples(
     Args:
         setups: The setups by name.
         seeds: Seeds of the random draws.
-        workers: As for `run_many`.
-        progress: As for `run_many`.
+        workers: The workers that run the simulations.
+        progress: Called with the number of finished runs.
 
     Raises:
         FieldkitError: A run failed.
@@ -122,7 +122,7 @@ def _flow_sample(sent_packets: int, delays_s: Sequence[float], fates: Sequence[F
 
 
 Changes = Mapping[str, Any]
-"""Changes of a scenario's file, as for `load_scenario`."""
+"""Values by dotted key of a scenario file, which replace those of the file."""
 
 RADIOS: Final[Mapping[str, Changes]] = MappingProxyType(
     {"wifi": MappingProxyType({}), "1 Mbit/s": MappingProxyType({"radio": {"rate": "1Mbit/s"}})}

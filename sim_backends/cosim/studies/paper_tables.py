@@ -275,7 +275,7 @@ def paper_table(table: str, changes: Mapping[str, Any]) -> PaperTable:
 
     Args:
         table: One of `TABLES`.
-        changes: Changes of the scenario's file, as for `load_scenario`.
+        changes: Values by dotted key of the scenario file, which replace those of the file.
 
     Raises:
         ConfigurationError: The changes are invalid.

@@ -90,8 +90,8 @@ def outcomes(
         make: Builds the scenario; it must be picklable.
         policies: Names of policies.
         seeds: The seeds.
-        workers: As for `run_many`.
-        progress: As for `run_many`.
+        workers: The workers that run the simulations.
+        progress: Called with the number of finished runs.
 
     Raises:
         FieldkitError: A run failed with an error other than `PolicyError`.

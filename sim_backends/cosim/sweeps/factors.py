@@ -53,7 +53,7 @@ _QUANTITIES: Final = (
     ("_dbm", "dBm", {"dBm": 1.0}),
     ("_value", "1", FRACTION_PER_UNIT),
 )
-"""For each kind of quantity: suffix and unit of its column of numbers, and the factors of all its units."""
+"""Suffix and unit of the column of numbers of each kind of quantity, and the factors of all its units."""
 
 
 def _parse_in_unit(text: str, unit: str, factors: dict[str, float]) -> float:

@@ -1,4 +1,7 @@
-"""The runs of a sweep. The name of a run is the hash of scenario, settings, seed and version of fieldkit."""
+"""The plan of a sweep: all its settings and runs.
+
+The name of a run is the hash of scenario, settings, seed and version of fieldkit.
+"""
 
 import hashlib
 import json
@@ -27,7 +30,7 @@ class SweepSetting:
     """A scenario with a combination of values.
 
     Attributes:
-        values: The values by the name of their factor, as in the command.
+        values: The values by the name of their factor, as given on the command line.
         scenario: The scenario with these values.
         digest: Hash of the scenario, of the files that it names, and of the version of fieldkit.
     """
@@ -68,7 +71,7 @@ class SweepPlan:
     Attributes:
         scenario: The scenario without its factors.
         factors: The factors.
-        settings: All combinations of their values, in the order of the command.
+        settings: All combinations of their values, in the order of the command line.
         seeds: Seeds of each combination.
     """
 
@@ -91,7 +94,7 @@ def plan_sweep(
     Args:
         name_or_path: Name or path of the scenario.
         factors: The factors.
-        seeds: The seeds.
+        seeds: Seeds of each combination of values.
         changes: Values by dotted key of the scenario file, which replace those of the file in all settings.
 
     Raises:

@@ -44,7 +44,7 @@ class Autopilot:
         obstacles: Obstacles in the world, including the floor.
         now_ns: Time of power-on.
         boot_s: Time from power-on until its position estimate has an origin.
-        make_airframe: See `VehicleBase`.
+        make_airframe: Creates the airframe; None for an airframe that the autopilot itself moves.
     """
 
     def __init__(

@@ -59,9 +59,9 @@ def _states_under_commands(
     step_ns = probe.welcome.step_ns
     window_ns = max(round(window_s * 1e9 / step_ns), 1) * step_ns
     begin_ns = probe.last_ns
-    yield probe.physics(begin_ns).states
+    yield probe.advance_physics(begin_ns).states
     for window in range(1, math.ceil(seconds * 1e9 / window_ns) + 1):
-        yield probe.physics(begin_ns + window * window_ns, commands if window == 1 else None).states
+        yield probe.advance_physics(begin_ns + window * window_ns, commands if window == 1 else None).states
 
 
 def _displacement_m(before: State, after: State) -> tuple[float, float, float]:

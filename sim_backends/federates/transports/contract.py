@@ -118,7 +118,7 @@ class HostAndPort:
         scheme: Its scheme, without `-listen`.
         host: Host name or IP address.
         port: Port.
-        listens: See `TransportAddress`.
+        listens: True if this side listens; False if it connects.
     """
 
     scheme: str

@@ -126,8 +126,8 @@ class DatagramChannel:
 
     Args:
         endpoint: The socket; the channel closes it.
-        connection: See `DatagramHeader`.
-        cookie: See `DatagramHeader`.
+        connection: Number that the connecting side has drawn.
+        cookie: Number that the listening side has drawn for this connection and the address of the connecting side.
     """
 
     def __init__(self, endpoint: socket.socket, connection: int, cookie: int) -> None:

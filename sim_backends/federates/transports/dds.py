@@ -151,7 +151,7 @@ class DdsAddress:
         name: Its name.
         domain: DDS domain.
         interface: IPv4 address of the network interface to use.
-        listens: See `TransportAddress`.
+        listens: None: the federate listens and the coordinator connects, with the same address on both sides.
     """
 
     name: str

@@ -106,7 +106,7 @@ class Ros1Address:
         name: Its name.
         master: URI of the master.
         host: Address of this machine for other nodes; empty for the local address of connections to the master.
-        listens: See `TransportAddress`.
+        listens: None: the federate listens and the coordinator connects, with the same address on both sides.
     """
 
     name: str
