@@ -1,4 +1,4 @@
-"""The agents of a co-simulation: the bodies that the physics federate moves, and the programs that run on them."""
+"""The agents of a co-simulation: bodies that the physics federate moves, and the programs that run on them."""
 
 import heapq
 from collections.abc import Iterable, Iterator, KeysView, Mapping, Sequence
@@ -131,7 +131,7 @@ class Agents:
         self._schedule_change()
 
     def states(self, now_ns: int) -> Mapping[str, State]:
-        """Return the states of the present agents at the last physics step that is not after `now_ns`.
+        """Return the states of the agents that are present at the last physics step that is not after `now_ns`.
 
         Raises:
             FederateError: The physics federate failed, did not answer in time, or returned no state for an agent that
@@ -189,7 +189,7 @@ class Agents:
         )
 
     def _update_names(self, states: Mapping[str, State], now_ns: int) -> None:
-        """Update the names of the present agents.
+        """Update the names of the agents that are present.
 
         Raises:
             FederateError: An agent has disappeared within its lifetime, but this physics may not remove agents.

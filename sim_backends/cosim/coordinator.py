@@ -148,7 +148,7 @@ class Coordinator:
         return self.run
 
     def fork(self) -> "Coordinator":
-        """Return an independent copy of this co-simulation in its present state, without an observer."""
+        """Return an independent copy of this co-simulation in its current state, without an observer."""
         return copy.deepcopy(self, {id(self._observer): None})
 
     def _next_wake_ns(self) -> int | None:
@@ -338,7 +338,7 @@ class Coordinator:
         self._select_present()
 
     def _select_present(self) -> None:
-        """Limit the pairs and the other agents of the situation to present agents."""
+        """Limit the pairs and the other agents of the situation to agents that are present."""
         if not self._agents.has_changed:
             return
         situation = self.situation

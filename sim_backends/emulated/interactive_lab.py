@@ -1,4 +1,4 @@
-"""Interactive lab: all robots of a site file run, without roles, and communicate directly."""
+"""The interactive lab, in which all robots of a site file run, without roles, and communicate directly."""
 
 import socket
 import threading

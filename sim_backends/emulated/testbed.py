@@ -1,4 +1,4 @@
-"""Testbed of the emulated robots of one cast."""
+"""The testbed of the emulated robots of one cast."""
 
 import socket
 import time

@@ -1,4 +1,4 @@
-"""Answers of a federate to the requests of a coordinator."""
+"""Answers the requests of a coordinator on behalf of a federate."""
 
 import copy
 import sys
@@ -52,7 +52,7 @@ class FederateService:
         name: Its name in messages.
         software: Name and version of its software.
         is_deterministic: True if equal requests give equal answers.
-        forks: True if `copy.deepcopy` copies it in its present state.
+        forks: True if `copy.deepcopy` copies it in its current state.
         agents_appear: True if agents may appear during a run.
         agents_disappear: True if agents may disappear.
         commands: Types of commands that it supports.

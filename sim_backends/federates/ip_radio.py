@@ -1,4 +1,4 @@
-"""The IP packets of the built-in transports, carried by a network federate."""
+"""The radio for built-in transports whose IP packets a network federate carries."""
 
 from collections.abc import Callable, Mapping, Sequence, Set
 

@@ -1,4 +1,4 @@
-"""Rate control: the mode of a station's next frame, fixed or adapted to acknowledgements like Linux's minstrel."""
+"""Rate control: selects the mode of the next frame, fixed or adapted to acknowledgements like Linux's minstrel."""
 
 from collections.abc import Sequence
 from typing import Final, Protocol

@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bias`: the bias of each sync policy, over seeds."""
+"""The command `fieldkit cosim shootout --bias`, which computes the bias of each sync policy over seeds."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.shootout import Bias, biases, outcomes
+from sim_backends.cosim.studies.shootout import Bias, compute_biases, run_outcomes
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -35,14 +35,14 @@ def run(arguments: argparse.Namespace) -> int:
     settings.note_commensurate_events(scenario, policies, [scenario.policy.window], len(seeds))
     with showing_progress() as sink:
         runs = len({*policies, EventDriven.name}) * len(seeds)
-        all_outcomes = outcomes(
+        all_outcomes = run_outcomes(
             partial(_build, scenario),
             policies,
             seeds,
             workers=settings.read_workers(arguments, scenario.packets * runs),
             progress=partial(progress_reporter(sink), "bias", runs),
         )
-    by_policy = {name: measures for name, measures in biases(all_outcomes).items() if name in policies}
+    by_policy = {name: measures for name, measures in compute_biases(all_outcomes).items() if name in policies}
     title = f"{scenario.name}, {scenario.topology}, {len(seeds)} seeds"
     _sheet(title, by_policy, arguments.format).show(arguments.format)
     for name, failure in all_outcomes.failures.items():

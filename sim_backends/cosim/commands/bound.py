@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --bound`: the exchanges that `error_bounded` and fixed windows need."""
+"""The command `fieldkit cosim shootout --bound`, which compares exchanges of fixed windows and `error_bounded`."""
 
 import argparse
 import math

@@ -1,4 +1,4 @@
-"""`fieldkit cosim conform COMMAND...`: checks that an external federate follows the protocol."""
+"""The command `fieldkit cosim conform`, which checks that an external federate follows the protocol."""
 
 import argparse
 import shlex

@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO --orders`: local errors against the window, and the order of each sync policy."""
+"""The command `fieldkit cosim shootout --orders`, which computes local errors and the order of each sync policy."""
 
 import argparse
 from collections.abc import Mapping, Sequence

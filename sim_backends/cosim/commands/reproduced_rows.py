@@ -12,7 +12,7 @@ from fieldkit.trial.simulated import PlannedExchange, SimulatedRepeat, Simulated
 from sim_backends.cosim.commands.flow_rows import BACKEND, motion_columns
 from sim_backends.cosim.commands.results import FlowResult, FlowRoundTrips, SeedResult
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import addresses, first_tcp_packet_ns, packets_between
+from sim_backends.cosim.recording.captures import assign_addresses, first_tcp_packet_ns, packets_between
 from sim_backends.cosim.recording.recorder import CAPTURES
 from sim_backends.cosim.scenario.agent_setup import bodies
 from sim_backends.cosim.scenario.external import writes_captures
@@ -47,7 +47,7 @@ class ReproducedRows:
         self._agents = {Role.SENDER: first_repeat.transfer.source, Role.RECEIVER: first_repeat.transfer.to[0]}
         if scenario.topology is Topology.MASTER and scenario.relay is not None:
             self._agents[Role.RELAY] = scenario.relay
-        self._addresses = {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()}
+        self._addresses = {name: str(address) for name, address in assign_addresses(sorted(scenario.agents)).items()}
         self._trial = SimulatedTrial(
             trial.procedure,
             robots={

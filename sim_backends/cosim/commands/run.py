@@ -1,4 +1,4 @@
-"""`fieldkit cosim run SCENARIO`: runs it with one sync policy, and one seed or several."""
+"""The command `fieldkit cosim run`, which runs a scenario with one sync policy and one or several seeds."""
 
 import argparse
 import hashlib

@@ -1,4 +1,4 @@
-"""`fieldkit cosim sdf SCENARIO`: the world of a scenario for Gazebo."""
+"""The command `fieldkit cosim sdf`, which prints the world of a scenario for Gazebo."""
 
 import argparse
 

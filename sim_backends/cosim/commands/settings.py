@@ -1,4 +1,4 @@
-"""Applies the options of a command to a scenario, and reports the progress of its runs."""
+"""Reads the options of a command, applies them to a scenario, and reports the progress of runs."""
 
 import argparse
 import inspect

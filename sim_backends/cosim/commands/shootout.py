@@ -1,4 +1,4 @@
-"""`fieldkit cosim shootout SCENARIO`: the error and the cost of each sync policy."""
+"""The command `fieldkit cosim shootout`, which prints the error and the cost of each sync policy."""
 
 import argparse
 import math
@@ -20,8 +20,8 @@ from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.formation import formation, has_followers
-from sim_backends.cosim.studies.shootout import Row, outcomes, rows
+from sim_backends.cosim.studies.formation import has_followers
+from sim_backends.cosim.studies.shootout import Row, rows, run_outcomes
 
 COLUMNS: Final = (
     SheetColumn("policy", "policy", ""),
@@ -117,8 +117,8 @@ def _all_rows(
         runs = len({*policies_to_run, EventDriven.name}) * len(seeds)
         progress = partial(report, f"window {window_s * 1e3:g} ms", runs)
         progress(0)
-        window_outcomes = outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
-        window_rows = rows(window_outcomes, partial(formation, scenario))
+        window_outcomes = run_outcomes(make, policies_to_run, seeds, workers=workers, progress=progress)
+        window_rows = rows(window_outcomes, partial(compute_formation, scenario))
         all_rows += [(window_s, row) for row in window_rows if row.policy in policies_to_run]
     return sorted(all_rows, key=lambda window_and_row: policies.index(window_and_row[1].policy))
 

@@ -1,4 +1,4 @@
-"""`fieldkit cosim sweep SCENARIO`: all combinations of settings and seeds, in parallel."""
+"""The command `fieldkit cosim sweep`, which runs all combinations of settings and seeds in parallel."""
 
 import argparse
 from collections.abc import Sequence

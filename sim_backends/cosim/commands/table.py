@@ -11,7 +11,7 @@ from fieldkit.core.units import format_count
 from sim_backends.cosim.commands import settings
 from sim_backends.cosim.commands.settings import progress_reporter
 from sim_backends.cosim.commands.sheets import Sheet, SheetColumn, SheetPart, Value, wrapped
-from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims
+from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, compute_claims
 from sim_backends.cosim.studies.paper_setups import flow_samples
 from sim_backends.cosim.studies.paper_tables import Agreement, PaperCell, PaperRow, paper_table
 
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
         samples = flow_samples(setups, seeds, workers=settings.read_workers(arguments), progress=progress)
     title = f"{_TITLES[which]}, {format_count(len(seeds), 'seed')}"
     if table is None:
-        claim_sheet(title, claims(setups, samples)).show(arguments.format)
+        claim_sheet(title, compute_claims(setups, samples)).show(arguments.format)
         return 0
     rows = table.rows(samples)
     paper_sheet(title, rows, is_ping=which == "emane").show(arguments.format)

@@ -1,4 +1,4 @@
-"""The sync policies other than `error_bounded`, and ends of windows without accumulated rounding errors."""
+"""The sync policies other than `error_bounded`, and the computation of ends of windows without accumulated errors."""
 
 import math
 from collections.abc import Sequence
@@ -89,7 +89,7 @@ class Scheduled(FixedWindow):
 
 
 class SlidingWindow(FixedWindow):
-    """The network is one window behind the physics federate."""
+    """The network is simulated one window later than the physics."""
 
     name = "sliding_window"
     defers_sends = False

@@ -288,7 +288,7 @@ class SpeedOscillation(NeverSends):
         return self._timer.next_ns
 
     def wake(self, now_ns: int, own_state: State, received_datagrams: Sequence[ReceivedDatagram]) -> Action:  # noqa: ARG002 (Program)
-        """Send the present speed if a command is due."""
+        """Send the current speed if a command is due."""
         if not self._timer.fire_if_due(now_ns):
             return Action()
         return Action(command=Twist(self._mean_m_s + self._amplitude_m_s * math.sin(self._rate_rad_s * now_ns / 1e9)))

@@ -1,4 +1,4 @@
-"""The agents of a scenario: their bodies and radios, and the programs that steer them and send their traffic."""
+"""Creates the agents of a scenario: bodies, radios, and the programs that steer them and send their traffic."""
 
 import math
 from collections.abc import Iterator, Mapping

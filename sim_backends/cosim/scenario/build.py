@@ -17,7 +17,7 @@ from sim_backends.cosim.federates import NetworkFederate, PhysicsFederate
 from sim_backends.cosim.policies.registry import make_policy
 from sim_backends.cosim.policies.sync_policy import SyncPolicy
 from sim_backends.cosim.programs.senders import REPLY
-from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver, addresses
+from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver, assign_addresses
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
 from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
@@ -110,7 +110,7 @@ def _captures(scenario: CosimScenario, folder: Path) -> dict[str, Any] | None:
     pings = list(dict.fromkeys(flow.ping for flow in flows.values() if flow.ping))
     return {
         "folder": str(folder.absolute()),
-        "addresses": {name: str(address) for name, address in addresses(sorted(scenario.agents)).items()},
+        "addresses": {name: str(address) for name, address in assign_addresses(sorted(scenario.agents)).items()},
         "flows": {
             name: {
                 "port": flow.port or 0,

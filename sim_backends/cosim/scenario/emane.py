@@ -144,11 +144,11 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
 def _losses(scenario: CosimScenario, seed: int) -> Losses:
     channel = WorldChannel(seed, antennas(scenario), scenario.radio, load_world(scenario.world))
 
-    def losses_db(places_m: Sequence[Vector]) -> dict[tuple[int, int], float]:
-        pairs = list(combinations(range(len(places_m)), 2))
+    def losses_db(positions_m: Sequence[Vector]) -> dict[tuple[int, int], float]:
+        pairs = list(combinations(range(len(positions_m)), 2))
         if not pairs:
             return {}
-        ends_m = np.array([[places_m[first], places_m[second]] for first, second in pairs])
+        ends_m = np.array([[positions_m[first], positions_m[second]] for first, second in pairs])
         return dict(zip(pairs, channel.loss_db(ends_m[:, 0], ends_m[:, 1]).tolist(), strict=True))
 
     return losses_db

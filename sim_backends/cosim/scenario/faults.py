@@ -1,4 +1,4 @@
-"""The faults in a scenario file."""
+"""The schema of the faults in a scenario file."""
 
 from typing import Annotated, Literal
 

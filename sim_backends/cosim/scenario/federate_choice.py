@@ -1,4 +1,4 @@
-"""The federate of a scenario's physics or network, and its options, which the named simulator defines."""
+"""The section of a scenario file that selects the federate for the physics or the network, and its options."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Final

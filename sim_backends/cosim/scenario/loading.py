@@ -1,4 +1,4 @@
-"""Scenarios by name or by the path of a file, and the JSON schema of scenario files for editors."""
+"""Loads scenarios by name or by the path of a file, and creates the JSON schema of scenario files for editors."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

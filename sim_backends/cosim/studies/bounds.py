@@ -1,4 +1,4 @@
-"""The number of exchanges needed to keep a bound, with `error_bounded` and the longest sufficient fixed window."""
+"""Counts the exchanges needed to keep a bound, with `error_bounded` and with the longest sufficient fixed window."""
 
 import math
 from collections.abc import Callable, Sequence

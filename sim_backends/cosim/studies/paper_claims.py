@@ -24,7 +24,6 @@ from sim_backends.cosim.studies.paper_tables import (
     PRINTED,
     Agreement,
     Printed,
-    agreement,
 )
 
 ADAPTIVE: Final = "adaptive"
@@ -64,7 +63,7 @@ class Claim(NamedTuple):
     @property
     def agreement(self) -> Agreement | None:
         """The relation of the measured change to the stated one; None if the paper states none."""
-        return None if self.claimed_change is None else agreement(self.claimed_change, self.measured_change)
+        return None if self.claimed_change is None else compare(self.claimed_change, self.measured_change)
 
 
 def claim_setups(changes: Changes) -> dict[str, Setup]:
@@ -84,7 +83,9 @@ def claim_setups(changes: Changes) -> dict[str, Setup]:
     return setups
 
 
-def claims(setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[str, FlowSample]]]) -> list[Claim]:
+def compute_claims(
+    setups: Mapping[str, Setup], samples: Mapping[str, Sequence[Mapping[str, FlowSample]]]
+) -> list[Claim]:
     """Return all claims.
 
     Args:

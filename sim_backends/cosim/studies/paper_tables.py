@@ -62,7 +62,7 @@ class Printed:
         return float(low / self.per_si), float(high / self.per_si)
 
 
-def agreement(printed: Printed, measured: IntervalEstimate) -> Agreement:
+def compare(printed: Printed, measured: IntervalEstimate) -> Agreement:
     """Return the relation of an estimate to a printed number, both in SI units.
 
     They agree if the printed number, at its precision, is within the interval of the estimate, or if the value of the
@@ -187,13 +187,13 @@ class PaperCell:
     @property
     def agreement(self) -> Agreement:
         """The relation of the measured number to the printed one."""
-        return agreement(self.printed, self.measured)
+        return compare(self.printed, self.measured)
 
     @property
     def agrees_by_mean(self) -> bool:
         """True if the mean rounds to the printed number; False if only another value in its interval does."""
         mean_only = IntervalEstimate(self.measured.value, np.nan, np.nan)
-        return agreement(self.printed, mean_only) is Agreement.AGREES
+        return compare(self.printed, mean_only) is Agreement.AGREES
 
     @property
     def difference(self) -> float:

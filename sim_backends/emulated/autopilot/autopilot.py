@@ -1,4 +1,4 @@
-"""The autopilot: its answers to messages, and its periodic messages. It uses neither socket nor clock."""
+"""The emulated autopilot, which answers messages and sends periodic ones. It uses neither socket nor clock."""
 
 import math
 from collections.abc import Iterator, Sequence

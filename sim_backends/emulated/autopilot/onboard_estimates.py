@@ -147,7 +147,7 @@ class LandDetector:
         self.grounded_ns = self.armed_ns = now_ns
 
     def advance(self, now_ns: int, *, on_ground: bool) -> None:
-        """Update the state with the present contact with the ground."""
+        """Update the state with the current contact with the ground."""
         if not on_ground:
             self.has_flown, self.has_landed, self.grounded_ns = True, False, now_ns
         elif now_ns - self.grounded_ns >= self._landed_s * 1e9:

@@ -1,4 +1,4 @@
-"""The lab's client of a co-simulated medium."""
+"""The lab's client of a co-simulated medium, which starts the process of the medium."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any

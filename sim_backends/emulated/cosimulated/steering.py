@@ -46,7 +46,7 @@ class Steering(ABC):
     Args:
         motion_record: Descriptor of the record of the robot's motion.
         paths: Descriptor of the file of its assigned paths.
-        now_ns: The present time.
+        now_ns: The current time.
 
     Attributes:
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
@@ -167,7 +167,7 @@ class GroundSteering(Steering):
     Args:
         descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
             paths, and the record of its velocity commands.
-        now_ns: The present time.
+        now_ns: The current time.
     """
 
     idle = Twist()
@@ -189,7 +189,7 @@ class FlightSteering(Steering):
     Args:
         descriptors: Descriptors (`EmulatedRobot.physics_fds`) of the record of its motion, the file of its assigned
             paths, the record of the autopilot's commands, and the record of its flight.
-        now_ns: The present time.
+        now_ns: The current time.
     """
 
     idle = ROTORS_OFF

@@ -1,4 +1,4 @@
-"""Checks of a network: times, fates of packets, window borders, reasons, determinism, forks."""
+"""Conformance checks of a network federate: times, fates of packets, window borders, reasons, determinism, forks."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Checks of a physics federate: times, commands, motion, determinism, forks."""
+"""Conformance checks of a physics federate: times, commands, motion, determinism, forks."""
 
 import json
 import math

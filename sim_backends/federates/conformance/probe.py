@@ -1,4 +1,4 @@
-"""Helpers of the checks: connections to newly started federates, and the last request and answer of each."""
+"""Helpers of the conformance checks: connections to new federates, and the last request and answer of each."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Interface of a transport: an address that can connect or listen, and a listener that accepts with a deadline."""
+"""The interface of a transport between coordinator and federate: an address that can connect or listen."""
 
 import hmac
 import ipaddress

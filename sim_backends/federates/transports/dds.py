@@ -1,4 +1,4 @@
-"""DDS with CycloneDDS: two reliable topics that keep all samples. There is no master.
+"""The transport over DDS, with CycloneDDS: two reliable topics that keep all samples. There is no master.
 
 The two sides discover each other at different times. A writer may thus send the first sample before the reader has
 discovered it; a volatile reader never receives this sample. The topics are therefore transient local: a reader

@@ -1,4 +1,4 @@
-"""Access points, neighbouring networks and microwave ovens around robots, in one object."""
+"""The infrastructure around robots: access points, neighbouring networks and microwave ovens."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace

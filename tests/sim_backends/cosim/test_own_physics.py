@@ -7,7 +7,7 @@ import pytest
 
 from fieldkit.core.errors import FieldkitError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.comparison import errors
+from sim_backends.cosim.comparison import compare_runs
 from sim_backends.cosim.policies.registry import BUILTIN
 from sim_backends.cosim.policies.window_policies import Scheduled
 from sim_backends.cosim.scenario.agent_setup import bodies
@@ -40,7 +40,7 @@ def test_the_class_of_the_page_runs_with_every_policy(policy: str, carts: Any) -
     assert run.fates
     exact = build(SCENARIO, physics=physics(carts)).run(400 * MS)
     if policy in {"event_driven", "variable_stepped"}:
-        assert errors(exact, run).delivery_error_s.largest == 0
+        assert compare_runs(exact, run).delivery_error_s.largest == 0
 
 
 def test_the_class_receives_commands_and_forks_do_not_change_it(carts: Any) -> None:  # noqa: ANN401 (as above)

@@ -8,7 +8,7 @@ import pytest
 
 from fieldkit.core.model import Scenario as Sight
 from sim_backends.cosim.studies.intervals import t_quantile
-from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, claims, delay_change
+from sim_backends.cosim.studies.paper_claims import Claim, claim_setups, compute_claims, delay_change
 from sim_backends.cosim.studies.paper_setups import FlowSample, Setup, only_flow
 from sim_backends.cosim.studies.paper_tables import Agreement
 
@@ -30,7 +30,10 @@ def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -
             {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
             for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
         ]
-    return {(claim.compared_system, claim.sight_group, claim.quantity): claim for claim in claims(setups(), samples)}
+    return {
+        (claim.compared_system, claim.sight_group, claim.quantity): claim
+        for claim in compute_claims(setups(), samples)
+    }
 
 
 def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:

@@ -23,7 +23,7 @@ from sim_backends.cosim.studies.paper_setups import (
     mesh,
     only_flow,
 )
-from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, agreement, paper_table
+from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, compare, paper_table
 
 NAN = math.nan
 
@@ -52,7 +52,7 @@ NAN = math.nan
     ],
 )
 def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agreement) -> None:
-    assert agreement(printed, ours) is expected
+    assert compare(printed, ours) is expected
 
 
 @given(
@@ -63,7 +63,7 @@ def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agree
 def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, per_si: int) -> None:
     text = str(value.quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP))
     ours = float(value / per_si)
-    assert agreement(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
+    assert compare(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
 
 
 @given(
@@ -78,9 +78,9 @@ def test_a_number_more_than_half_a_step_away_disagrees(
     printed = Printed(str(number), step=step)
     ours = printed.value + deviation * float(step) * (1 if above else -1)
     expected = Agreement.ABOVE if above else Agreement.BELOW
-    assert agreement(printed, IntervalEstimate(ours, NAN, NAN)) is expected
+    assert compare(printed, IntervalEstimate(ours, NAN, NAN)) is expected
     ends = printed.value, ours
-    assert agreement(printed, IntervalEstimate(ours, min(ends), max(ends))) is Agreement.AGREES
+    assert compare(printed, IntervalEstimate(ours, min(ends), max(ends))) is Agreement.AGREES
 
 
 SHORT = {"duration": "1200ms"}
