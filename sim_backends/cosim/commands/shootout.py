@@ -20,7 +20,7 @@ from sim_backends.cosim.policies.window_policies import EventDriven
 from sim_backends.cosim.scenario.build import Simulation, build
 from sim_backends.cosim.scenario.external import without_federates
 from sim_backends.cosim.scenario.schema import CosimScenario
-from sim_backends.cosim.studies.formation import has_followers
+from sim_backends.cosim.studies.formation import compute_formation, has_followers
 from sim_backends.cosim.studies.shootout import Row, rows, run_outcomes
 
 COLUMNS: Final = (

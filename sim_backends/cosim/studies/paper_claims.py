@@ -24,6 +24,7 @@ from sim_backends.cosim.studies.paper_tables import (
     PRINTED,
     Agreement,
     Printed,
+    compare,
 )
 
 ADAPTIVE: Final = "adaptive"
