@@ -121,7 +121,7 @@ class EmulatedBackend:
             return False
         from sim_backends.emulated.linux_wifi import radios  # noqa: PLC0415 (other labs need none of it)
 
-        return not radios.runs_here()
+        return not radios.can_use_radios()
 
     def run_elsewhere(self, argv: Sequence[str], results: Path) -> int:
         """Implement `Relocating.run_elsewhere`: the command runs in a virtual machine."""

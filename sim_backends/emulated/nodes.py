@@ -314,7 +314,7 @@ def running_robots(
 ) -> Iterator[RunningRobots[RobotKey]]:
     """Yield robots whose programs are ready; leaving the context stops all their processes.
 
-    Arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
+    The arguments are those of `testbed.bring_up`. Robots that share a ROS master or a Zenoh router start 1 m apart,
     and connect to it over the radio.
 
     Raises:

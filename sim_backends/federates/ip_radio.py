@@ -54,12 +54,12 @@ class IpRadio:
     def place(
         self,
         now_ns: int,  # noqa: ARG002 (see RadioModel)
-        places_m: Mapping[str, Vector],
+        positions_m: Mapping[str, Vector],
         relay: str | None,  # noqa: ARG002
         velocities_m_s: Mapping[str, Vector] | None = None,  # noqa: ARG002
     ) -> None:
         """Implement `RadioModel.place`."""
-        self._states = {name: State(place_m) for name, place_m in places_m.items()}
+        self._states = {name: State(position_m) for name, position_m in positions_m.items()}
 
     def send(
         self,

@@ -191,7 +191,7 @@ class MujocoPhysics:
         mujoco.mj_step1(self.model, self.data)
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put an agent at a place, at rest and without a command. Whether it overlaps something is not checked.
+        """Put an agent at a position, at rest and without a command. Whether it overlaps something is not checked.
 
         Args:
             name: The agent.

@@ -125,7 +125,7 @@ class Bodies:
         return self._states
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put a body at a place, at rest and without a command; it may overlap something.
+        """Put a body at a position, at rest and without a command; it may overlap something.
 
         Args:
             name: The body.

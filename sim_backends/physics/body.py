@@ -107,7 +107,7 @@ class Body(Protocol[PoseT]):
         ...
 
     def pose_at(self, place_m: Vector, heading_rad: float) -> PoseT:
-        """Return its pose at rest at a place; see `place_m`."""
+        """Return its pose at rest at a position, which is defined as for `place_m`."""
         ...
 
     def on_surface(self, pose: PoseT, surface: Surface) -> PoseT:

@@ -77,11 +77,11 @@ def _body(plan: AgentPlan, scenario: CosimScenario, world: World) -> Body[Any]:
 
 def _start_m(plan: AgentPlan, scenario: CosimScenario, world: World) -> Vector:
     """Return the start position of an agent: metres east, north, up."""
-    place_m = plan.at_m
-    if place_m is None:
+    point_m = plan.at_m
+    if point_m is None:
         assert plan.along is not None
-        place_m = world.lines[scenario.line].at(plan.along, plan.aside_m)
-    return *place_m, world.ground_m(place_m) + plan.height
+        point_m = world.lines[scenario.line].at(plan.along, plan.aside_m)
+    return *point_m, world.ground_m(point_m) + plan.height
 
 
 def antennas(scenario: CosimScenario) -> dict[str, Antenna]:

@@ -173,8 +173,8 @@ def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance
             case LinkCutFault():
                 yield LinkCut(*fault.between, fault.begin_ns, fault.end_ns)
             case JammerFault():
-                place_m = None if fault.at_m is None else (*fault.at_m, world.ground_m(fault.at_m) + fault.height)
-                yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, place_m, fault.agent or "")
+                position_m = None if fault.at_m is None else (*fault.at_m, world.ground_m(fault.at_m) + fault.height)
+                yield Jammer(float(fault.power_dbm), fault.begin_ns, fault.end_ns, position_m, fault.agent or "")
 
 
 def _nothing_to_close() -> None:

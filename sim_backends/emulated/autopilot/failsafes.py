@@ -331,7 +331,7 @@ class Fence:
         return stop_distance_m > max(radius_m, math.hypot(*here_m[:2])) or stop_m[2] > max(height_m, here_m[2])
 
     def reset(self) -> None:
-        """Treat the vehicle as inside the fence, after it was armed or carried to another place."""
+        """Treat the vehicle as inside the fence, after it was armed or carried to another position."""
         self._is_breached = False
 
     def advance(self, state: VehicleState, place_m: Vector) -> Reaction | None:

@@ -14,7 +14,7 @@ from sim_backends.world.world import World
 
 
 class CosimulatedClient(MediumClient):
-    """Starts the process of a co-simulated medium. Other arguments and errors are those of `MediumClient`.
+    """Starts the process of a co-simulated medium. The other arguments and the errors are those of `MediumClient`.
 
     Args:
         bodies: Body of each robot; other nodes have none.

@@ -47,7 +47,7 @@ class CosimSession:
         settings: Simulators and their settings.
         steerings: Steering of each robot that programs can drive.
         policy: Name and parameters of the sync policy.
-        clock: Simulated time as real time.
+        clock: Converts between simulated time and the monotonic clock.
 
     Raises:
         ConfigurationError: A simulator cannot be used with these settings.

@@ -72,7 +72,7 @@ class LabPhysics:
         bodies: Names of the robots, which have a body.
         stations: Names of all stations.
         step_ns: Time step of the physics simulator.
-        clock: Simulated time as real time.
+        clock: Converts between simulated time and the monotonic clock.
 
     Attributes:
         step_ns: Time step of the physics simulator.

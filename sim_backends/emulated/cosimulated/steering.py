@@ -18,7 +18,7 @@ from sim_backends.physics.quadrotor import ROTORS_OFF, FlightStatus, FlightTarge
 from sim_backends.world.motion import STILL, State
 
 _REPORT_NS: Final = 10_000_000
-"""Interval of the records while a robot moves; the robot's own base controller uses 20 ms."""
+"""Interval of the records while a robot moves; the base controller in a robot uses 20 ms."""
 
 _PENDING_COMMANDS: Final = 1000
 """Maximum number of commands that are kept while the simulation lags (at most 1 s); older ones are dropped."""
@@ -30,7 +30,7 @@ class TimedCommand(NamedTuple):
     """A command.
 
     Attributes:
-        time_ns: Its time, by the monotonic clock.
+        time_ns: Its time, from the monotonic clock.
         command: The command.
         is_idle: True if it need not be repeated, because a robot without commands is in the state that it causes.
     """
@@ -50,8 +50,8 @@ class Steering(ABC):
 
     Attributes:
         idle: The command that is applied if the last command has not been repeated for `TIMEOUT_NS`.
-        is_driven: True if the robot has received a command since the lab put it at its place.
-        is_placed: True if the lab has put it at a place.
+        is_driven: True if the robot has received a command since the lab last placed it.
+        is_placed: True if the lab has placed it.
         is_at_rest: True if it is at rest, no command is active, and this is recorded.
     """
 
@@ -73,7 +73,7 @@ class Steering(ABC):
         """Return the last command of the robot's programs, or None if there is none."""
 
     def poll_placement(self, now_ns: int) -> RobotMotion | None:
-        """Return the place at which the lab has put the robot since the last call, or None if it has not moved it.
+        """Return the motion at the position where the lab has placed the robot since the last call, or None.
 
         The robot is at rest there, and earlier commands are dropped.
         """
@@ -87,7 +87,7 @@ class Steering(ABC):
 
     @property
     def heading_rad(self) -> float:
-        """Heading at the place at which the lab put the robot."""
+        """Heading of the robot when the lab last placed it."""
         return self._start.heading_rad
 
     def commands(self, until_ns: int) -> Iterator[tuple[int, Command]]:

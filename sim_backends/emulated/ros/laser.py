@@ -48,7 +48,7 @@ def ranges_m(
 
 
 class _Scan:
-    """Distance to the nearest added surface, per beam. Arguments are those of `ranges_m`."""
+    """Distance to the nearest added surface, per beam. The arguments are those of `ranges_m`."""
 
     def __init__(self, position_m: Vector, heading_rad: float, beams: int, reach_m: float) -> None:
         self.ranges_m = [math.inf] * beams

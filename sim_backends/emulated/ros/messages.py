@@ -200,7 +200,7 @@ def _battery_state(_: Sensor, noise: Random, _motion: RobotMotion) -> bytes:
     measured_fields = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
     state = struct.pack("<3B?", discharging, good, polymer, present)
     no_cells = _float32s(()) * 2  # voltages and temperatures of the cells
-    return measured_fields + state + no_cells + packed_string("") * 2  # place and serial number of the battery
+    return measured_fields + state + no_cells + packed_string("") * 2  # location and serial number of the battery
 
 
 def _range(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
@@ -216,9 +216,9 @@ def _nav_sat_fix(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:
     latitude, longitude = math.degrees(north_m / NORTH_RADIUS_M), math.degrees(east_m / EAST_RADIUS_M)
     across, up = FIX_NOISE_M
     across_deg = math.degrees(across / EAST_RADIUS_M)
-    place = (*_gaussian(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
+    fix_position = (*_gaussian(noise, across_deg, latitude, longitude), noise.gauss(up_m, up))
     covariance = _diagonal(across**2, across**2, up**2)
-    return struct.pack("<bH", fix, gps) + _float64s(place, covariance) + struct.pack("<B", diagonal_known)
+    return struct.pack("<bH", fix, gps) + _float64s(fix_position, covariance) + struct.pack("<B", diagonal_known)
 
 
 def _magnetic_field(_: Sensor, noise: Random, motion: RobotMotion) -> bytes:

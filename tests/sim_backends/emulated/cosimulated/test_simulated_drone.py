@@ -125,7 +125,7 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
         nearest_m = WALL_M - DUCKIEDRONE.radius_m
 
         def push() -> bool:
-            vehicle.accept_set_point(SetPoint((1.0, 0.0, 0.0), is_place=False))
+            vehicle.accept_set_point(SetPoint((1.0, 0.0, 0.0), is_position=False))
             return vehicle.body.place_m[0] > nearest_m - 0.03
 
         push()
