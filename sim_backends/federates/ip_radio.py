@@ -120,7 +120,7 @@ class IpRadio:
         return {}
 
     def use_meter(self) -> None:
-        """Implement `RadioModel.use_meter`; the federate has its own counters."""
+        """Implement `RadioModel.use_meter`; the federate counts itself."""
 
     def sample(self, now_ns: int, utc_ns: int) -> dict[str, LinkSample]:  # noqa: ARG002 (see RadioModel)
         """Implement `RadioModel.sample`; samples are requested directly from the federate."""

@@ -107,14 +107,14 @@ class PositionEstimate:
         """Return a position in the world relative to the origin; None before there is an origin."""
         if self.origin_m is None:
             return None
-        east, north, up = (place - origin for place, origin in zip(world_m, self.origin_m, strict=True))
+        east, north, up = (world - origin for world, origin in zip(world_m, self.origin_m, strict=True))
         return east, north, up
 
     def to_world(self, local_m: Vector) -> Vector | None:
         """Return the position in the world of a point of the local frame; None before there is an origin."""
         if self.origin_m is None:
             return None
-        east, north, up = (place + origin for place, origin in zip(local_m, self.origin_m, strict=True))
+        east, north, up = (local + origin for local, origin in zip(local_m, self.origin_m, strict=True))
         return east, north, up
 
 

@@ -1,4 +1,4 @@
-"""The vehicle: arming, flight mode, and the motion that follows from them.
+"""The emulated drone as a vehicle: arming, flight mode, and the motion that follows from them.
 
 It has neither clock nor socket: `advance` receives the time.
 """

@@ -107,7 +107,7 @@ class VehicleBase:
         world_m = self.estimate.to_world(place_m)
         if world_m is None:
             return None
-        east, north, up = (place - home for place, home in zip(world_m, self.home_m, strict=True))
+        east, north, up = (world - home for world, home in zip(world_m, self.home_m, strict=True))
         return east, north, up
 
     @property

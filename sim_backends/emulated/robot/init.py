@@ -133,7 +133,7 @@ START_S: Final = 30.0
 
 _MESSAGE_S: Final = 10.0
 
-VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (the robot's own)
+VOLATILE: Final = ("/tmp", "/run", "/dev/shm")  # noqa: S108 (in the robot)
 """Folders whose content is in the robot's memory, and is lost without power; other folders are on its SD card."""
 
 
@@ -283,7 +283,7 @@ def _build(spec: RobotSpec) -> None:
 
 
 def _motion_files(spec: RobotSpec) -> list[int]:
-    """Return descriptors of the record of the robot's motion, and of the inputs of a simulated physics, if any."""
+    """Return descriptors of the robot's motion record, and of the files of a physics simulator that moves it, if any."""
     inputs: list[tuple[Path, int]] = []
     if spec.simulated_flight:
         inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLIGHT, os.O_RDWR)]

@@ -261,7 +261,7 @@ def run_ip(*commands: str) -> None:
     for command in commands:
         # Each command runs separately, because busybox's ip, which a robot may have, has no batch mode.
         result = subprocess.run(
-            ["ip", *command.split()],  # noqa: S607 (found on the robot's own PATH)
+            ["ip", *command.split()],  # noqa: S607 (found on the robot's PATH)
             capture_output=True,
             text=True,
             timeout=_TIMEOUT_S,
