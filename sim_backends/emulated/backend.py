@@ -338,7 +338,7 @@ def _check_ros(robot: "Robot | LabRobot", options: EmulatedOptions) -> None:
         )
     if ros.variant == "ros2" and any(topic.definition for topic in ros.topics):
         raise ConfigurationError(
-            f"profile {robot.profile.name} runs ros2, whose emulated recorder supports only the standard types of ROS",
+            f"profile {robot.profile.name} runs ros2, whose emulated recorder supports only standard types",
             where=robot.name,
             remedy="remove the topics that have a definition from a copy of the profile",
         )

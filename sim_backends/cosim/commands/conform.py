@@ -9,7 +9,7 @@ from fieldkit.cli.display import show_note
 from fieldkit.core.errors import ConfigurationError, FieldkitError
 from fieldkit.core.text import json_text, print_text
 from sim_backends.cosim.commands import settings
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _hello(scenario: CosimScenario, role: int) -> Hello:
     world = load_world(scenario.world)
-    return make_hello(scenario, world, bodies(scenario, world), scenario.seeds[0], role)
+    return make_hello(scenario, world, make_bodies(scenario, world), scenario.seeds[0], role)
 
 
 def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, deadline_s: float) -> tuple[int, str]:

@@ -20,7 +20,13 @@ from sim_backends.cosim.programs.senders import REPLY
 from sim_backends.cosim.recording.captures import CapturedFlow, PacketObserver, assign_addresses
 from sim_backends.cosim.run_record import IpObserver, Run, WindowObserver
 from sim_backends.cosim.scenario.agent_plans import FileTraffic, PingTraffic, QosOptions, Traffic
-from sim_backends.cosim.scenario.agent_setup import antennas, bodies, controllers, programs, stop_commands
+from sim_backends.cosim.scenario.agent_setup import (
+    antennas_of,
+    make_bodies,
+    make_controllers,
+    make_programs,
+    stop_commands,
+)
 from sim_backends.cosim.scenario.checks import check
 from sim_backends.cosim.scenario.external import carried_radio, open_network, open_physics, writes_captures
 from sim_backends.cosim.scenario.faults import JammerFault, LinkCutFault, NodeLossFault, StalledFederateFault
@@ -68,7 +74,7 @@ def radio_network(
             there are none. Fixed links ignore them.
         carrier: Network that carries its IP packets instead of the built-in radio, or None.
     """
-    stations = antennas(scenario)
+    stations = antennas_of(scenario)
     radio: RadioModel[Fragment]
     if carrier is not None:
         radio = carried_radio(carrier, tuple(stations))
@@ -158,7 +164,7 @@ def _qos(traffic: Traffic) -> Qos:
 
 def _disturbances(scenario: CosimScenario, world: World) -> Iterator[Disturbance]:
     """Yield the disturbances that are caused by faults, and those that switch off the radios of absent agents."""
-    stations = antennas(scenario)
+    stations = antennas_of(scenario)
     for name, lifetime in scenario.lifetimes.items():
         if name not in stations:
             continue
@@ -263,7 +269,7 @@ def build(
     world = load_world(scenario.world)
     check(scenario, world, lambda location: f"scenario {scenario.name}: {'.'.join(map(str, location))}")
     with ExitStack() as federates:
-        scenario_bodies = bodies(scenario, world)
+        scenario_bodies = make_bodies(scenario, world)
         federate_arguments = scenario, world, scenario_bodies, seed, deadline_s
         if physics is None and (physics := open_physics(*federate_arguments)) is not None:
             federates.callback(getattr(physics, "close", _nothing_to_close))
@@ -286,8 +292,8 @@ def build(
                     physics = with_stall(physics, stall)
                 else:
                     network = with_stall(network, stall)
-        scenario_programs = programs(
-            scenario, seed, controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
+        scenario_programs = make_programs(
+            scenario, seed, make_controllers(scenario, scenario_bodies, seed), stop_commands(scenario_bodies)
         )
         lifetimes = scenario.lifetimes
         starts = Bodies(scenario_bodies, world, lifetimes=lifetimes).start_states() if lifetimes else {}

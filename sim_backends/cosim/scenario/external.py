@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from fieldkit.core.errors import ConfigurationError
-from sim_backends.cosim.scenario.agent_setup import antennas, limits
+from sim_backends.cosim.scenario.agent_setup import antennas_of, limits_of
 from sim_backends.cosim.scenario.federate_choice import BUILT_IN
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates import remote
@@ -89,14 +89,14 @@ def make_hello(scenario: CosimScenario, world: World, bodies: Mapping[str, Body[
 
 def _configuration(scenario: CosimScenario, world: World, role: int) -> bytes:
     """Return the configuration as JSON; agents are in the order of the scenario, because results may depend on it."""
-    radios = antennas(scenario)
+    radios = antennas_of(scenario)
     options = (scenario.physics if role == PHYSICS else scenario.network).options
     configuration = {
         "scenario": without_federates(scenario).model_dump(mode="json", by_alias=True, exclude_none=True),
         "world": world.model_dump(mode="json", by_alias=True, exclude_none=True),
         "robots": {
             name: {
-                "body": dataclasses.asdict(limits(plan.robot)),
+                "body": dataclasses.asdict(limits_of(plan.robot)),
                 "radio": dataclasses.asdict(radios[name]) if name in radios else None,
             }
             for name, plan in scenario.agents.items()

@@ -9,7 +9,7 @@ import sys
 from functools import partial
 from typing import Any
 
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.build import radio_network
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
@@ -33,7 +33,7 @@ def make_federate(role: int, hello: Hello) -> Any:  # noqa: ANN401 (a physics or
     scenario = CosimScenario.model_validate(configuration["scenario"])
     world = World.model_validate(configuration["world"])
     if role == PHYSICS:
-        return Bodies(bodies(scenario, world), world, step_ns=hello.step_ns, lifetimes=scenario.lifetimes)
+        return Bodies(make_bodies(scenario, world), world, step_ns=hello.step_ns, lifetimes=scenario.lifetimes)
     return radio_network(scenario, world, hello.seed)
 
 

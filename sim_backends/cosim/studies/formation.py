@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_backends.cosim.federates import PhysicsFederate
 from sim_backends.cosim.scenario.agent_plans import FollowPlan
-from sim_backends.cosim.scenario.agent_setup import limits
+from sim_backends.cosim.scenario.agent_setup import limits_of
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.cosim.studies.intervals import Floats
 from sim_backends.physics.robot_limits import QuadrotorLimits
@@ -229,7 +229,7 @@ def compute_formation(scenario: CosimScenario, tracks: Tracks) -> Formation:
         if np.count_nonzero(is_present) < _MIN_SAMPLES:
             continue
         times_s, leaders, follower = tracks.times_s[is_present], row_m[is_present, :-1], row_m[is_present, -1:]
-        if isinstance(limits(plan.robot), QuadrotorLimits):
+        if isinstance(limits_of(plan.robot), QuadrotorLimits):
             station_errors.append(station_errors_m(leaders, follower[:, 0], plan.motion.distance))
         else:
             row_m = row_m[is_present]

@@ -283,7 +283,7 @@ def _build(spec: RobotSpec) -> None:
 
 
 def _motion_files(spec: RobotSpec) -> list[int]:
-    """Return descriptors of the robot's motion record, and of the files of a physics simulator that moves it, if any."""
+    """Return descriptors of the robot's motion record, and of the files of a physics simulator that moves it."""
     inputs: list[tuple[Path, int]] = []
     if spec.simulated_flight:
         inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLIGHT, os.O_RDWR)]
