@@ -1,7 +1,7 @@
 """Measure round-trip times with ping."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Final, Self
 
 import numpy as np
@@ -24,13 +24,16 @@ from fieldkit.remote import jobs
 from fieldkit.remote.jobs import Job
 from fieldkit.steps import routing
 from fieldkit.steps.along import AlongStep
-from fieldkit.steps.capabilities import HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
+from fieldkit.steps.capabilities import ChecksPlacement, HasNeeds, HasRefusals, Pings, SendsTraffic, Summarizes
 from fieldkit.steps.over_link import OverLink
 from fieldkit.steps.scene import Announce, Flow, Need, PingSource, Planned, Refusal, Scene, fragments
+from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.variants import PingTool, Tool
-from fieldkit.steps.view import View
+from fieldkit.steps.view import View, capture_around
 
 LAST_REPLY_S: Final = 2
+MAX_SEQUENCE_COUNT: Final = 0xFFFF
+"""Number of requests after which sequence numbers repeat."""
 _HEADER_BYTES: Final = 8
 OLD_INTERVAL_S: Final = 0.2
 MAX_COUNT: Final = 1_000_000
@@ -64,7 +67,7 @@ class Payloads(Strict):
         return {"tcp": data, "udp": data} if isinstance(data, int) and not isinstance(data, bool) else data
 
 
-class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
+class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, SendsTraffic, Pings, Summarizes):
     """Measures round-trip times with ping. Writes `ping.txt`.
 
     Attributes:
@@ -76,6 +79,9 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
         gap: Whether columns report the longest time without an answer, `rtt_gap_s`, and the requests lost in it,
             `rtt_gap_lost`. If the ping started or ended in the gap, the columns have lower bounds
             (`rtt_gap_at_least_s`).
+        duplicates: Whether a column reports the requests and replies that arrived again over another link,
+            `rtt_duplicates`. It needs `over` with a link whose interface is `lo`, and a `capture` over this link on
+            both robots around the ping.
         forwarded: Whether robots forward packets for each other; the checks then require a routing daemon on each.
     """
 
@@ -90,6 +96,7 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
     interval: Annotated[Duration, Field(ge=0.002)] = 0.2
     payload_bytes: Payloads = Payloads.defaults()
     gap: Bool = Field(default=False, exclude_if=schema.is_empty)
+    duplicates: Bool = Field(default=False, exclude_if=schema.is_empty)
     forwarded: Bool = Field(default=False, exclude_if=schema.is_empty)
 
     @schema.model_validator(mode="after")
@@ -97,6 +104,16 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
         if self.sender == self.receiver:
             raise schema.validation_error(f"{self.sender} cannot ping itself; name another robot", "to")
         return self
+
+    @override
+    def placement_error(self, earlier: Sequence[EarlierStep], within: Sequence[EnclosingStep]) -> str | None:
+        if not self.duplicates:
+            return None
+        if self.count > MAX_SEQUENCE_COUNT:
+            return f"duplicates allows at most {MAX_SEQUENCE_COUNT} requests, because their numbers repeat"
+        if not self.over or not all(capture_around(within, role) for role in (self.sender, self.receiver)):
+            return "duplicates needs `over`, and a capture on both robots around the ping"
+        return None
 
     @override
     def with_duration(self, seconds: float) -> Self:
@@ -189,6 +206,8 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             f"{self._file}: {reason}"
             for reason in ping_checks.check_output(result, self.count, payload_bytes, window)
         )
+        if self.duplicates:
+            yield from self._duplicate_contradictions(result, view)
         if result.received is not None and result.received != len(result.answers):
             yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
@@ -227,6 +246,29 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
                 for candidate in candidates
             ]
             yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
+
+    def _echoes(self, role: Role, view: View) -> tuple[Packets, Packets] | None:
+        """Return the requests and the replies in a robot's capture; None if it is missing or incomplete."""
+        from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+        capture = view.capture(role)
+        if capture is None:
+            return None
+        source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
+        size_bytes = self.payload_of(view.scene.protocol) + _HEADER_BYTES
+        requests, replies = (
+            ping_duplicates.sized_echoes(capture.packets, *ends, size_bytes)
+            for ends in ((source, destination), (destination, source))
+        )
+        return requests.where(requests.echo < ECHO_REPLY), replies.where(replies.echo >= ECHO_REPLY)
+
+    def _duplicate_contradictions(self, result: Ping, view: View) -> Iterator[str]:
+        from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (as above)
+
+        sender, receiver = (self._echoes(role, view) for role in (self.sender, self.receiver))
+        if sender is not None and receiver is not None:
+            reasons = ping_duplicates.contradictions(result, self.interval, sender, receiver)
+            yield from (f"{self._file}: {reason}" for reason in reasons)
 
     def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
@@ -275,11 +317,16 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
 
     @override
     def output_columns(self) -> tuple[Column, ...]:
-        if not self.gap:
-            return self.columns
-        from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
+        chosen: list[Column] = []
+        if self.gap:
+            from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
 
-        return (*self.columns, *ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS)
+            chosen += [*ping_gaps.GAP_COLUMNS, *ping_gaps.OPEN_GAP_COLUMNS]
+        if self.duplicates:
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+            chosen += ping_duplicates.COLUMNS
+        return (*self.columns, *chosen)
 
     @override
     def measure(self, view: View) -> Measured:
@@ -291,9 +338,16 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             from fieldkit.measure.evidence import ping_gaps  # noqa: PLC0415 (only with `gap: true`)
 
             gap = ping_gaps.measure_gap(result, self.interval)
+        duplicates = Measured()
+        if self.duplicates:
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+            sent, received = (self._echoes(role, view) for role in (self.sender, self.receiver))
+            duplicates = ping_duplicates.measure(received and received[0], sent and sent[1])
         return (
             ping.measure(result)
             | gap
+            | duplicates
             | position_columns.measure(view.evidence, ping.MOTION_COLUMNS, ends, reply_times_ns)
         )
 
@@ -304,6 +358,8 @@ class PingStep(AlongStep, OverLink, HasRefusals, HasNeeds, SendsTraffic, Pings, 
             yield f"ping loss {100 * loss:.1f} %{no_reply_text}"
         if isinstance(gap_s := values.get("rtt_gap_s"), float):
             yield f"longest gap {gap_s:.1f} s with {values['rtt_gap_lost']} lost"
+        if duplicates := values.get("rtt_duplicates"):
+            yield f"{format_count(int(duplicates), 'packet')} received over both links"
         if isinstance(open_s := values.get("rtt_gap_at_least_s"), float):
             yield f"longest gap >= {open_s:.1f} s with {values['rtt_gap_lost_at_least']} lost"
         if isinstance(median_s := values.get("rtt_median_s"), float):
