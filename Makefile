@@ -2,7 +2,7 @@
 .DELETE_ON_ERROR:
 .PHONY: trial test nightly compile lint rules types pages bench soak fuzz
 
-# Otherwise every worker, and every command that a test runs, would compile its imports again.
+# If this variable is set, every worker, and every command that a test runs, compiles its imports again.
 unexport PYTHONDONTWRITEBYTECODE
 
 FIELDKIT := .venv/bin/fieldkit
@@ -14,7 +14,7 @@ TOGETHER := --numprocesses 10 --dist loadscope --no-loadscope-reorder --hypothes
 # separate existing path would be parsed as a path of tests.
 RERUNS := .venv/reruns.txt
 
-# Files with tests that run alone. Without their names, pytest would import all files again.
+# Files with tests that run alone. They are named so that pytest does not import all files again.
 QUIET = $(shell grep -rl --include='test_*.py' 'mark\.quiet' tests)
 
 trial: ## a trial on emulated robots, shortened to about a minute

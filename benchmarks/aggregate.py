@@ -5,7 +5,7 @@ round runs `fieldkit aggregate` as a user would, once per number of tables, to s
 The peer reads the smallest number of tables in the same round: pandas concatenates and groups them, and scipy
 computes a bootstrap interval per cell and quantity. The benchmark stops if their means and medians differ.
 
-`--rows N` adds one table of N repeats: the CSV that `fieldkit export` makes of a whole campaign.
+`--rows N` adds one table of N repeats, like the CSV that `fieldkit export` writes for a campaign.
 """
 
 import argparse
@@ -106,14 +106,14 @@ def _random_value(column: Column, share: float, count: int) -> str:
 
 def _condition(number: int) -> dict[str, str]:
     """Return the fixed columns of a trial."""
-    metres, rest = 5 * (1 + number % 10), number // 10
+    metres, combination = 5 * (1 + number % 10), number // 10
     return {
         "schema_version": str(SCHEMA_VERSION),
         "trial": f"20261121T{number:06d}.000000Z_los_{metres}m_master",
-        "procedure": ("los", "nlos")[rest % 2],
-        "scenario": ("los", "nlos")[rest % 2],
-        "topology": ("master", "masterless")[rest // 2 % 2],
-        "backend": ("emulated", "field")[rest // 4 % 2],
+        "procedure": ("los", "nlos")[combination % 2],
+        "scenario": ("los", "nlos")[combination % 2],
+        "topology": ("master", "masterless")[combination // 2 % 2],
+        "backend": ("emulated", "field")[combination // 4 % 2],
         "distance": f"{metres}m",
         "distance_m": str(metres),
         "attempt": "1",
@@ -162,7 +162,7 @@ def check(fieldkit_output: Path, peer_output: Path) -> None:
         for name, estimate in cell["estimates"].items()
     }
     peer_figures: Figures = {
-        (tuple(key), name): tuple(rest[:4]) for key, name, *rest in json.loads(peer_output.read_bytes())
+        (tuple(key), name): tuple(values[:4]) for key, name, *values in json.loads(peer_output.read_bytes())
     }
     close = our_figures.keys() == peer_figures.keys() and all(
         math.isclose(our_value, peer_value, rel_tol=1e-6)

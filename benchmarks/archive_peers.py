@@ -25,7 +25,7 @@ def by_pandas(folder: Path) -> list[list[Any]]:
 
 
 def _query(folder: Path, text: str) -> Any:  # noqa: ANN401 (a relation of DuckDB)
-    """Return the result of a query; what does not fit into memory is written next to the archive."""
+    """Return the result of a query; DuckDB writes data that does not fit into memory next to the archive."""
     import duckdb  # noqa: PLC0415 (as above)
 
     duckdb.execute(f"SET temp_directory = '{folder.parent / 'duckdb'}'")

@@ -2,10 +2,10 @@
 
 Publishers and subscribers are separate programs on loopback. Plain pairs use the binding of each middleware as its
 documentation shows; `attached` adds the attachment and the time stamp that rmw_zenoh requires; `agent` uses
-fieldkit's adapters of the same library. A path over `fieldkit bridge` starts or ends at a plain end of ROS 1, and the
-plain pair of ROS 1 is its reference. All paths run in sequence: first messages at a fixed rate to measure the delay,
-then as many messages as possible for one second. Each message starts with the time of its creation on the machine's
-clock.
+fieldkit's adapters of the same library. Each path over `fieldkit bridge` has a plain publisher or subscriber of ROS
+1, and the plain pair of ROS 1 is its reference. All paths run in sequence: first messages at a fixed rate to measure
+the delay, then as many messages as possible for one second. Each message starts with the time of its creation on the
+machine's clock.
 """
 
 import argparse
@@ -81,7 +81,7 @@ PATHS: Final = (
 
 
 def dds_plain(name: str, deliver: Deliver | None) -> Write:
-    """Start an end of a topic with the binding of CycloneDDS, with a separate data type."""
+    """Start a publisher, or a subscriber if `deliver` is given, with the binding of CycloneDDS and its own type."""
     from cyclonedds.domain import Domain, DomainParticipant  # noqa: PLC0415
     from cyclonedds.idl import make_idl_struct, types  # noqa: PLC0415
     from cyclonedds.pub import DataWriter  # noqa: PLC0415
@@ -112,7 +112,10 @@ def dds_plain(name: str, deliver: Deliver | None) -> Write:
 
 
 def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: bool) -> Write:
-    """Start an end of a topic with the binding of Zenoh; `attached` adds attachment and time stamp of rmw_zenoh."""
+    """Start a publisher or subscriber with the binding of Zenoh.
+
+    `attached` adds the attachment and the time stamp of rmw_zenoh.
+    """
     import zenoh  # noqa: PLC0415
 
     from fieldkit.agent.messaging.zenoh import ATTACHMENT, GID_BYTES  # noqa: PLC0415
@@ -137,8 +140,8 @@ def zenoh_plain(name: str, deliver: Deliver | None, where: str, *, attached: boo
 
 
 def ros1_plain(name: str, deliver: Deliver | None) -> Write:
-    """Start an end of a topic with rospy."""
-    sys.path.append("/usr/lib/python3/dist-packages")  # of Debian
+    """Start a publisher or subscriber with rospy."""
+    sys.path.append("/usr/lib/python3/dist-packages")  # the packages of Debian's Python
     import rospy  # noqa: PLC0415
     from std_msgs.msg import UInt8MultiArray  # noqa: PLC0415
 
@@ -159,7 +162,7 @@ def endpoint(where: str) -> tuple[str, str]:
 
 
 def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) -> Write:
-    """Start an end of a topic with fieldkit's adapter."""
+    """Start a publisher or subscriber with fieldkit's adapter."""
     settings = dict([endpoint(where)]) if middleware_name == "zenoh" else {}
     running = middleware.adapter(middleware_name)(
         Network(HOST, discovery="peers", peers=(HOST,), domain=DOMAIN, settings=settings)
@@ -175,7 +178,10 @@ def agent(middleware_name: str, name: str, deliver: Deliver | None, where: str) 
 
 
 def end(kind: str, name: str, where: str, *, is_subscriber: bool) -> int:
-    """Run an end: a line `SECONDS RATE` makes a publisher send, any line makes a subscriber print its messages."""
+    """Run a publisher or subscriber, controlled by the lines of standard input.
+
+    After a line `SECONDS RATE` a publisher sends; after any line a subscriber prints the messages that it received.
+    """
     arrivals: list[tuple[int, int]] = []
 
     def deliver(data: bytes) -> None:
@@ -213,7 +219,7 @@ def _send(write: Write, duration_s: float, rate_hz: float) -> int:
 
 
 class RunningPath:
-    """A path whose ends are running."""
+    """A path whose publisher and subscriber are running."""
 
     def __init__(self, stack: ExitStack, message_path: MessagePath, environment: dict[str, str]) -> None:
         self.message_path, port = message_path, free_port()
@@ -227,7 +233,7 @@ class RunningPath:
         if source == target:
             self.subscriber, self.publisher = start("subscribe"), start("publish", "connect")
             return
-        # The end that does not use ROS 1 starts first, because the bridge connects to it.
+        # The program that does not use ROS 1 starts first, because the bridge connects to it.
         verbs = ("subscribe", "publish") if source == "ros1" else ("publish", "subscribe")
         other = target if source == "ros1" else source
         to = ("--router", f"{HOST}:{port}") if other == "zenoh" else ("--peer", HOST)
@@ -254,7 +260,7 @@ def _query(process: "subprocess.Popen[str]", line: str) -> str:
 
 @contextmanager
 def _program(words: Sequence[str], environment: dict[str, str]) -> Iterator["subprocess.Popen[str]"]:
-    """Run an end while the body runs."""
+    """Run a publisher or subscriber while the body runs."""
     argv = (sys.executable, "-m", "benchmarks.bridge", *words)
     pipe = subprocess.PIPE
     with subprocess.Popen(argv, stdin=pipe, stdout=pipe, text=True, env=environment) as process:
@@ -303,7 +309,7 @@ def measure(rounds: int) -> list[dict[str, Any]]:
         stack.callback(master.terminate)
         paths = [RunningPath(stack, message_path, environment) for message_path in PATHS]
         for path in paths:
-            path.run(SETTLING_S, RATE_HZ)  # until the ends have discovered each other
+            path.run(SETTLING_S, RATE_HZ)  # in this time publisher and subscriber discover each other
         for number in range(rounds):
             for path in paths if number % 2 else reversed(paths):
                 sent, received = path.run(COUNT / RATE_HZ, RATE_HZ)
@@ -312,12 +318,12 @@ def measure(rounds: int) -> list[dict[str, Any]]:
                 measurements.append(
                     {
                         "round": number,
-                        "way": path.message_path.name,
+                        "path": path.message_path.name,
                         "sent": sent,
-                        "came": len(received),
+                        "received": len(received),
                         "delay_ms": median(delay_ns for _, delay_ns in received) / 1e6,
                         "burst_sent": burst,
-                        "burst_came": len(arrived),
+                        "burst_received": len(arrived),
                         "per_s": (len(arrived) - 1) / lasted_s,
                     }
                 )
@@ -339,16 +345,16 @@ def main() -> int:
         print(json.dumps(measurements))
         return 0
     print(f"{'path':22} {'delay, ms':>24} {'more than the reference':>32} {'messages/s':>26} {'of a burst':>10}")
-    references = {(row["way"], row["round"]): row["delay_ms"] for row in measurements}
+    references = {(row["path"], row["round"]): row["delay_ms"] for row in measurements}
     for message_path in PATHS:
-        rows = [row for row in measurements if row["way"] == message_path.name]
+        rows = [row for row in measurements if row["path"] == message_path.name]
         delays = [row["delay_ms"] for row in rows]
         more = (
             [row["delay_ms"] - references[message_path.reference, row["round"]] for row in rows]
             if message_path.reference
             else []
         )
-        received = sum(row["burst_came"] for row in rows) / sum(row["burst_sent"] for row in rows)
+        received = sum(row["burst_received"] for row in rows) / sum(row["burst_sent"] for row in rows)
         rates = [row["per_s"] for row in rows]
         print(f"{message_path.name:22} {spread(delays):>24} {spread(more):>32} {spread(rates):>26} {received:>10.0%}")
     return 0

@@ -1,8 +1,9 @@
 """Cost of the discovery of topic participants: `python -m benchmarks.cosim_discovery`.
 
-Twenty participants are on a circle of 10 m radius, publish to the next one, and start within some time. The benchmark
-prints, over several seeds, the IP packets that they send in the first second (mean), and the time until all writers
-and readers have discovered each other (median and range). The results do not depend on the machine or its load.
+Twenty participants are on a circle of 10 m radius. Each publishes to the next one, and starts at a random time within
+an interval. The benchmark prints, over several seeds, the IP packets that they send in the first second (mean), and
+the time until all writers and readers have discovered each other (median and range). The results do not depend on the
+machine or its load.
 """
 
 import math
@@ -32,7 +33,7 @@ STANDARD: Final = "802.11n"
 SEEDS: Final = range(1, 7)
 
 ROWS: Final = ((0.0, None), (0.1, None), (5.0, None), (0.0, "g6"), (0.1, "g6"), (1.0, "g6"))
-"""Time in seconds within which they start, and the mode of every frame; None for rates chosen as in Linux."""
+"""Interval in seconds in which they start, and the mode of every frame; None for the rate control of Linux."""
 
 
 def discover(within_s: float, mode: str | None, seed: int) -> tuple[int, float]:

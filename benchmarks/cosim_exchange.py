@@ -2,9 +2,9 @@
 
 An exchange with a physics is a request without commands and an answer with the states of all agents; an exchange with
 a network is a request with these states and an answer without packets. The federate does nothing else. The time is
-that of the coordinator's call; the rounds of all transports alternate. The floor is a plain socket between two Python
-programs, which sends and receives as many bytes and does nothing with them. `to C` is
-`docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange as much in each step
+that of the coordinator's call; the rounds of all transports alternate. The lower bound is a plain socket between two
+Python programs, over which the same number of bytes is sent and received without further processing. `to C` is
+`docs/examples/federates/carts.c`. The peers, HELICS and mosaik, exchange the same amount of data in each step
 (`cosim_peers`).
 
 Both processes share the machine's processors, so other load changes the wall time: its minimum over the rounds is the
@@ -67,7 +67,7 @@ class StationaryPhysics:
         self._states = {agent.name: agent.start for agent in hello.agents}
 
     def advance(self, to_ns: int, commands: Mapping[str, object]) -> Mapping[str, State]:
-        """Return the starts."""
+        """Return the start states."""
         del to_ns, commands
         return self._states
 
@@ -87,7 +87,7 @@ class IdleNetwork:
 
 
 def make_hello(role: int, count: int) -> Hello:
-    """Return the beginning of a run with some agents."""
+    """Return the hello of a run with `count` agents."""
     agents = [AgentStart(f"r{number}", "husky", State((float(number), 0.0, 1.0))) for number in range(count)]
     return Hello(role, agents)
 
@@ -121,7 +121,7 @@ class ExchangePeer:
 
 
 @contextmanager
-def floor(request_bytes: int, answer_bytes: int) -> Iterator[ExchangePeer]:
+def plain_socket(request_bytes: int, answer_bytes: int) -> Iterator[ExchangePeer]:
     """Yield an exchange over a plain socket."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         sizes = (str(request_bytes), str(answer_bytes), str(server.getsockname()[1]))
@@ -144,19 +144,19 @@ def floor(request_bytes: int, answer_bytes: int) -> Iterator[ExchangePeer]:
 
 
 @contextmanager
-def opened(role: str, where: str, count: int, pids: Sequence[int] = ()) -> Iterator[ExchangePeer]:
-    """Yield an exchange with an external federate: `physics` or `network`."""
+def open_federate(role: str, address: str, count: int, pids: Sequence[int] = ()) -> Iterator[ExchangePeer]:
+    """Yield an exchange with an external federate; `role` is `physics` or `network`."""
     before = child_pids()
     if role == "physics":
-        with closing(open_physics(where, make_hello(PHYSICS, count), 60.0)) as physics:
+        with closing(open_physics(address, make_hello(PHYSICS, count), 60.0)) as physics:
             yield ExchangePeer(lambda to_ns: physics.advance(to_ns, {}), pids or sorted(child_pids() - before))
         return
     states = {agent.name: agent.start for agent in make_hello(NETWORK, count).agents}
-    with closing(open_network(where, make_hello(NETWORK, count), 60.0)) as network:
+    with closing(open_network(address, make_hello(NETWORK, count), 60.0)) as network:
         yield ExchangePeer(lambda to_ns: network.advance(to_ns, (), states), pids or sorted(child_pids() - before))
 
 
-def served(role: str, address: str = "") -> str:
+def serve_command(role: str, address: str = "") -> str:
     """Return the command of a federate of this benchmark."""
     return shlex.join(
         word for word in (sys.executable, "-m", "benchmarks.cosim_exchange", "--serve", role, address) if word
@@ -164,23 +164,23 @@ def served(role: str, address: str = "") -> str:
 
 
 @contextmanager
-def listening(role: str, scheme: str, count: int) -> Iterator[ExchangePeer]:
+def listening_federate(role: str, scheme: str, count: int) -> Iterator[ExchangePeer]:
     """Yield an exchange with a federate that listens."""
-    served_at = where = f"{scheme}:benchmark_{os.getpid()}"
+    listen_address = address = f"{scheme}:benchmark_{os.getpid()}"
     if scheme in {"tcp", "udp"}:
         port = free_port()
-        served_at, where = f"{scheme}-listen:127.0.0.1:{port}", f"{scheme}:127.0.0.1:{port}"
-    process = subprocess.Popen(shlex.split(served(role, served_at)))
+        listen_address, address = f"{scheme}-listen:127.0.0.1:{port}", f"{scheme}:127.0.0.1:{port}"
+    process = subprocess.Popen(shlex.split(serve_command(role, listen_address)))
     try:
-        with opened(role, where, count, [process.pid]) as party:
-            yield party
+        with open_federate(role, address, count, [process.pid]) as peer:
+            yield peer
     finally:
         process.terminate()
         process.wait()
 
 
 @contextmanager
-def connected_to(program: Path, count: int) -> Iterator[ExchangePeer]:
+def program_over_tcp(program: Path, count: int) -> Iterator[ExchangePeer]:
     """Yield an exchange over TCP with a program that has the connection as its standard input and output."""
     with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
 
@@ -191,8 +191,8 @@ def connected_to(program: Path, count: int) -> Iterator[ExchangePeer]:
                 return subprocess.Popen((program,), stdin=connection.fileno(), stdout=connection.fileno())
 
         started = pool.submit(start)
-        with opened("physics", f"tcp:127.0.0.1:{server.getsockname()[1]}", count) as party:
-            yield ExchangePeer(party.exchange, [started.result().pid])
+        with open_federate("physics", f"tcp:127.0.0.1:{server.getsockname()[1]}", count) as peer:
+            yield ExchangePeer(peer.exchange, [started.result().pid])
         started.result().wait()
 
 
@@ -241,44 +241,44 @@ class Times:
         return Times(statistics.median(walls), min(walls), statistics.median(cpus))
 
 
-def measure(parties: Mapping[str, ExchangePeer]) -> dict[str, Times]:
+def measure(peers: Mapping[str, ExchangePeer]) -> dict[str, Times]:
     """Return the times of each exchange."""
-    rounds: dict[str, list[tuple[float, float]]] = {name: [] for name in parties}
+    rounds: dict[str, list[tuple[float, float]]] = {name: [] for name in peers}
     to_ns = 0
     for _ in range(ROUNDS):
-        for name, party in parties.items():
-            cpu_s, started_s = processor_s(party.pids), time.perf_counter()
+        for name, peer in peers.items():
+            cpu_s, started_s = processor_s(peer.pids), time.perf_counter()
             for _ in range(EXCHANGES):
                 to_ns += STEP_NS
-                party.exchange(to_ns)
+                peer.exchange(to_ns)
             wall_s = time.perf_counter() - started_s
-            spent_s = wall_s, processor_s(party.pids) - cpu_s
+            spent_s = wall_s, processor_s(peer.pids) - cpu_s
             rounds[name].append((spent_s[0] / EXCHANGES * 1e6, spent_s[1] / EXCHANGES * 1e6))
     return {name: Times.of(values) for name, values in rounds.items()}
 
 
 def results(count: int, program: Path | None, *, has_ros: bool) -> dict[str, Times]:
-    """Return the times with a number of agents, by role and transport, and those of the peers."""
+    """Return the times for `count` agents, by role and transport, and those of the peers."""
     inproc = StationaryPhysics(make_hello(PHYSICS, count))
     with ExitStack() as stack:
-        parties = {"physics inproc": ExchangePeer(lambda to_ns: inproc.advance(to_ns, {}))}
+        peers = {"physics inproc": ExchangePeer(lambda to_ns: inproc.advance(to_ns, {}))}
         answer_bytes = _PHYSICS_ANSWER_BYTES + count * STATE.size
-        parties["plain socket"] = stack.enter_context(floor(_PHYSICS_REQUEST_BYTES, answer_bytes))
+        peers["plain socket"] = stack.enter_context(plain_socket(_PHYSICS_REQUEST_BYTES, answer_bytes))
         if program is not None:
-            parties["physics pipe to C"] = stack.enter_context(opened("physics", str(program), count))
-            parties["physics tcp to C"] = stack.enter_context(connected_to(program, count))
-        parties["physics pipe"] = stack.enter_context(opened("physics", served("physics"), count))
+            peers["physics pipe to C"] = stack.enter_context(open_federate("physics", str(program), count))
+            peers["physics tcp to C"] = stack.enter_context(program_over_tcp(program, count))
+        peers["physics pipe"] = stack.enter_context(open_federate("physics", serve_command("physics"), count))
         for scheme in ("tcp", "udp", "dds", *(("ros1",) if has_ros else ())):
-            parties[f"physics {scheme}"] = stack.enter_context(listening("physics", scheme, count))
-        parties["network pipe"] = stack.enter_context(opened("network", served("network"), count))
-        parties["network tcp"] = stack.enter_context(listening("network", "tcp", count))
-        times = measure(parties)
+            peers[f"physics {scheme}"] = stack.enter_context(listening_federate("physics", scheme, count))
+        peers["network pipe"] = stack.enter_context(open_federate("network", serve_command("network"), count))
+        peers["network tcp"] = stack.enter_context(listening_federate("network", "tcp", count))
+        times = measure(peers)
     rounds = {peer: [cosim_peers.measure(peer, count, STEPS) for _ in range(PEER_ROUNDS)] for peer in PEERS}
     return times | {peer: Times.of(values) for peer, values in rounds.items()}
 
 
-def compiled(folder: Path) -> Path | None:
-    """Return the federate in C, or None without a compiler."""
+def compile_carts(folder: Path) -> Path | None:
+    """Return the compiled federate in C, or None without a compiler."""
     if shutil.which("cc") is None:
         return None
     program = folder / "carts"
@@ -287,7 +287,7 @@ def compiled(folder: Path) -> Path | None:
 
 
 def main() -> None:
-    """Print the times, or be the other side of an exchange."""
+    """Print the times, or run the other side of an exchange."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     parser.add_argument("--serve", nargs="+", help=argparse.SUPPRESS)
@@ -301,11 +301,11 @@ def main() -> None:
         serve(StationaryPhysics if role == "physics" else IdleNetwork, address=address[0] if address else None)
         return
     with tempfile.TemporaryDirectory() as folder, ros_master() as has_ros:
-        program = compiled(Path(folder))
+        program = compile_carts(Path(folder))
         by_count = {count: results(count, program, has_ros=has_ros) for count in COUNTS}
     if arguments.json:
         by_name = {
-            count: {name: asdict(times) for name, times in by_party.items()} for count, by_party in by_count.items()
+            count: {name: asdict(times) for name, times in by_peer.items()} for count, by_peer in by_count.items()
         }
         print(json.dumps(by_name, indent=2))
         return

@@ -1,9 +1,9 @@
 """The exchange of `cosim_exchange` with HELICS and mosaik: `python -m benchmarks.cosim_peers PEER AGENTS STEPS`.
 
 In each step of one time unit, one federate publishes the states of all agents, and the other one a small message;
-each receives what the other one has published. With HELICS both publish bytes, with mosaik the states are numbers, as
-its interface is JSON. `PEER` is one of `PEERS`.
-Prints the microseconds of wall time and of processor time per step; the start is not included.
+each receives the data of the other one. With HELICS both publish bytes. With mosaik the states are numbers, because
+its interface is JSON. `PEER` is one of `PEERS`. The program prints the microseconds of wall time and of processor
+time per step, without the start.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from typing import Any, Final
 from sim_backends.federates.agent_states import STATE
 
 MESSAGE: Final = bytes(36)
-"""As many bytes as a request to a physics."""
+"""A message with the size of a request to a physics."""
 PEERS: Final = ("helics inproc", "helics zmq_ss", "mosaik inproc", "mosaik subprocess")
 """Without the core `ipc` of HELICS: its broker has one name for the whole machine, so two runs disturb each other."""
 _STATE_NUMBERS: Final = STATE.size // 8
@@ -120,7 +120,7 @@ def run_helics(core: str, count: int, steps: int) -> tuple[float, float]:
 
 
 def run_other_helics(core: str, count: int, steps: int, options: str) -> float:
-    """Run the federate with the states; return the seconds of processor time."""
+    """Run the federate that publishes the states; return the seconds of processor time."""
     federate = HelicsFederate(core, "states", "message", options)
     return federate.run(bytes(count * STATE.size), MESSAGE, steps)[1]
 
@@ -171,7 +171,7 @@ def run_mosaik(kind: str, count: int, steps: int) -> tuple[float, float]:
     )
     pids = sorted(child_pids())
     started_s, cpu_s = time.perf_counter(), processor_s(pids)
-    # A run that ends shuts the other process down, so its processor time is read before the last step.
+    # At the end of the run mosaik stops the other process, so its processor time is read before the last step.
     spent: list[tuple[float, float]] = []
     sys.modules[__name__].MessageSimulator.last_step = (
         steps - 1,
@@ -202,7 +202,7 @@ def processor_s(pids: Sequence[int]) -> float:
 
 
 def main() -> None:
-    """Measure one peer, or be the other side of an exchange."""
+    """Measure one peer, or run the other side of an exchange."""
     if sys.argv[1] == "states":
         import mosaik_api_v3  # noqa: PLC0415 (slow)
 

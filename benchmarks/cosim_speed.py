@@ -192,7 +192,8 @@ def measure_fleet(count: int, seconds: float) -> Figures:
         RuntimeError: Coordinator and plain loop deliver different packets.
     """
     fleet = Fleet(count)
-    # The plain loop runs before and after, so that a drift of the machine's speed favours neither.
+    # The plain loop runs before and after the coordinator, so that a drift of the machine's speed affects both
+    # equally.
     expected, before_s = run_plain_loop(fleet, seconds)
     arrivals, measured = run_coordinator(fleet, seconds)
     _, after_s = run_plain_loop(fleet, seconds)

@@ -4,9 +4,10 @@ Driving robots, 10 m apart, send packets of 1,000 bytes to the next robot by UDP
 with windows of 10 ms. *Alone* is the same program of ns-3 with the same packets and positions, read from a file and
 simulated in one `Run()`. *Minimal* passes the same requests through a pipe, one per window, and ignores the answers;
 it does not share a processor (`ProcessorSharing`). *Coupled* is the co-simulation: processor time of both processes,
-without that of physics and programs; states that the built-in physics computes on request are computed in its time.
-All three write the parts of every delay to a file. *Built-in* is the co-simulation with the built-in network. Figures
-are medians of several rounds; in each round the variants alternate. An error is raised if the delays differ.
+without that of physics and programs. States that the built-in physics usually computes later are computed in its
+`advance`, so that their time is excluded too. All three write the parts of every delay to a file. *Built-in* is the
+co-simulation with the built-in network. Figures are medians of several rounds; in each round the variants alternate.
+An error is raised if the delays differ.
 
 `taskset -c 0 python -m benchmarks.cosim_speed_ns3` shows the costs on one processor.
 """
@@ -109,7 +110,7 @@ def run_coupled(scenario: CosimScenario, requests: Path | None = None) -> Figure
         def advance_now(to_ns: int, commands: Mapping[str, Any]) -> Mapping[str, State]:
             return dict(advance(to_ns, commands))
 
-        # The parts of a run are usually measured in wall time.
+        # The parts of a run are usually measured in wall time; here processor time is needed.
         with patch.object(time, "perf_counter", time.process_time), patch.object(physics, "advance", advance_now):
             run = simulation.run()
         own_s = time.process_time() - started_s - run.wall_s["agents"]
@@ -140,7 +141,7 @@ def run_alone(requests: Path) -> float:
 
 
 def run_minimal(requests: Path) -> float:
-    """Return the processor time of both processes if each request only waits for its answer, in seconds."""
+    """Return the processor time of both processes in seconds, if the answer to each request is read and ignored."""
     frames, data = [], requests.read_bytes()
     while data:
         end = HEADER_BYTES + read_header(data).size
@@ -187,7 +188,7 @@ def measure(scenario: CosimScenario, requests: Path) -> Figures:
         "alone_s": alone_s,
         "minimal_s": minimal_s,
         "coupled_s": coupled["spent_s"],
-        "of_it_ns3_s": coupled["child_s"],
+        "coupled_ns3_s": coupled["child_s"],
         "minimal_adds_percent": 100 * (minimal_s / alone_s - 1),
         "coupling_adds_percent": 100 * (coupled["spent_s"] / alone_s - 1),
         "coordinator_us_per_packet": (coupled["spent_s"] - minimal_s) / packets * 1e6,

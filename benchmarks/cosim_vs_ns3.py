@@ -4,10 +4,10 @@ Needs ns-3 3.37 and a C++ compiler: `apt-get install libns3-dev g++`. One statio
 a wall, over 802.11g with the same power, noise, path loss, queue and slots in both. UDP sends 2 Mbit/s, and its loss
 is measured; TCP sends at full rate. The loss of the wall is computed here, and ns-3 gets the total path loss.
 
-There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension that ns-3
-models wrongly; and the latter with a corrected TCP, where ns-3 deviates from the standards at the edge of a link
-(`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the ratio. `--links
-g54` runs only the links with this text in their names.
+There are three variants of ns-3: unchanged in 802.11g; unchanged in 802.11a, which has no signal extension (ns-3
+models it wrongly); and the latter with a corrected TCP, because that of ns-3 deviates from the standards at the edge
+of a link (`ns3_link.cc` lists the corrections). Each link is run with enough seeds for a narrow interval of the
+ratio. `--links g54` runs only the links with this text in their names.
 """
 
 import argparse
@@ -228,7 +228,7 @@ def points_of(fieldkit: np.ndarray, ns3: np.ndarray) -> tuple[float, float]:
 
 
 def rows(ns3: Ns3, name_parts: Sequence[str]) -> Iterable[Row]:
-    """Yield the results of links whose name contains one of the given texts."""
+    """Yield the results of links whose name contains one of `name_parts`."""
     cells = [
         Cell(mode, wall, distance_m)
         for (mode, wall), distances_m in DISTANCES_M.items()

@@ -44,7 +44,7 @@ REFERENCES: Final = {
     "paper": {"mean": (5.377, 54.309), "loss": (0.0, 0.0)},
     "EMANE 1.5.3, RF Pipe": {"mean": (2.26, 2.26), "median": (2.12, 2.12), "loss": (0.0, 0.0)},
 }
-"""The paper's figures, and EMANE's as measured on 2 quiet cores; a move by 100 m did not change them."""
+"""The figures of the paper, and those of EMANE measured on 2 idle cores, which a move by 100 m did not change."""
 
 Figures = dict[str, float | None]
 
@@ -65,7 +65,7 @@ def fieldkit(lab_folder: Path, *words: str) -> str:
 
 @contextmanager
 def lab(radio: str) -> Iterator[Path]:
-    """Yield the folder of a lab that is up."""
+    """Yield the folder of a running lab."""
     with tempfile.TemporaryDirectory() as name:
         lab_folder = Path(name)
         (lab_folder / "fieldkit.yaml").write_text(SITE.format(radio=radio), encoding="utf-8")

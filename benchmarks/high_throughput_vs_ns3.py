@@ -1,11 +1,12 @@
 """802.11n, ac and ax compared with ns-3: `python -m benchmarks.high_throughput_vs_ns3 [--json]`.
 
-Needs what `radio_vs_ns3` needs. All modes: airtimes, and packet errors of 1000 bytes. Known differences of
-airtimes are ns-3's: it does not end the data of short guard intervals at multiples of 4 us (19.4.3, 21.4.3), omits
-VHT-SIG-B (4 us) of frames to one station, and gives each HE-LTF 8 us at all guard intervals. Then goodput with A-MPDU
-in one mode: one station at signal-to-noise ratios down to the end of its range; several stations, also without ns-3's
-retry limit and BlockAckReq (`bare`: 3.37 counts the failed aggregates to a receiver across successful ones, and drops
-a whole aggregate at the seventh); with RTS; and with access categories.
+The requirements are those of `radio_vs_ns3`. For all modes, airtimes and packet errors of 1000 bytes are compared.
+Known differences of airtimes are due to ns-3: it does not end the data of short guard intervals at multiples of 4 us
+(19.4.3, 21.4.3), omits VHT-SIG-B (4 us) of frames to one station, and uses 8 us for each HE-LTF at all guard
+intervals. Then goodput with A-MPDU is compared in one mode: for one station at signal-to-noise ratios down to the
+limit of its range; for several stations, also without ns-3's retry limit and BlockAckReq (`bare`: ns-3 3.37 does not
+reset the count of failed aggregates to a receiver after a successful one, and drops a whole aggregate at the seventh
+failure); with RTS; and with access categories.
 """
 
 import argparse

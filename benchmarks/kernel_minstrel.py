@@ -1,9 +1,9 @@
-"""Records the rates that minstrel_ht of Linux selects: `python -m benchmarks.kernel_minstrel TRACE`, as root.
+"""Record the rates that minstrel_ht of Linux selects: `python -m benchmarks.kernel_minstrel TRACE`, as root.
 
-Runs in the virtual machine of `minstrel_vs_kernel`, with two radios of mac80211_hwsim in an ad hoc cell. One sends a
-frame to the other at fixed intervals. This program is their medium: for each try of a frame it looks up the
-probability of an error in the trace. It prints a line for each frame: time in microseconds, stages
-`rate:tries:flags` of the chain, and tries made, with `+` if the frame was received.
+The program runs in the virtual machine of `minstrel_vs_kernel`, with two radios of mac80211_hwsim in an ad hoc cell.
+One radio sends a frame to the other at fixed intervals. The program is their medium: for each try of a frame it reads
+the probability of an error from the trace. It prints a line for each frame: time in microseconds, stages
+`rate:tries:flags` of the chain, and the number of tries, with `+` if the frame was received.
 """
 
 import json
@@ -22,7 +22,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RateStage,
     SentFrame,
     decode_event,
-    encode_received,
+    encode_reception,
     encode_status,
 )
 from sim_backends.emulated.linux_wifi.hwsim_socket import open_registered
@@ -32,7 +32,7 @@ from sim_backends.emulated.linux_wifi.radios import HwsimRadio, find_radios
 MAX_TRIES: Final = 7
 SIGNAL_DBM: Final = -50
 _PRIORITY: Final = 0x107
-"""Access category VO, which has no block-ACK session: in a session minstrel_ht ignores what hwsim reports."""
+"""Access category VO, which has no block-ACK session: in a session minstrel_ht ignores the reports of hwsim."""
 _ETHERTYPE: Final = 0x88B5  # for experiments: IEEE 802
 _DATA: Final = 0x08
 _JOIN_S: Final = 60.0
@@ -57,7 +57,7 @@ def mode_name(stage: RateStage) -> str | None:
 
 
 def tries_of(trace: dict[str, Any], frame: int, stages: Sequence[RateStage]) -> tuple[list[int], bool]:
-    """Return the tries made in each stage of a frame's chain, and whether the last one succeeded."""
+    """Return the number of tries in each stage of a frame's chain, and True if the last try succeeded."""
     tries: list[int] = []
     for stage in stages:
         tries.append(0)
@@ -82,7 +82,7 @@ class Cell:
         self._sent: SentFrame | None = None
 
     def poll(self) -> SentFrame | None:
-        """Pass on all frames but the data of the first radio; return the data frame if there is one."""
+        """Forward all frames except data frames of the first radio; return such a frame, or None if there is none."""
         for message in self._kernel.receive():
             event = None if message.type == NLMSG_ERROR else decode_event(message.payload)
             if not isinstance(event, SentFrame):
@@ -90,7 +90,7 @@ class Cell:
             if event.frame[0] & 0x0C == _DATA and not event.is_group and event.radio == self._addresses[0]:
                 return event
             other = self._addresses[event.radio == self._addresses[0]]
-            received = encode_received(event, type(event.radio)(other), rate_index=4, signal_dbm=SIGNAL_DBM)
+            received = encode_reception(event, type(event.radio)(other), rate_index=4, signal_dbm=SIGNAL_DBM)
             if received is not None:
                 self._kernel.send(received)
             self.report(event, [1], acknowledged=True)
@@ -103,7 +103,7 @@ class Cell:
 
 
 def record(trace: dict[str, Any], cell: Cell, link: socket.socket, packet: bytes) -> None:
-    """Send the frames of the trace and print what the kernel selected."""
+    """Send the frames of the trace and print the rates that the kernel selected."""
     start_ns = time.monotonic_ns()
     for number in range(len(trace["levels"])):
         while time.monotonic_ns() < start_ns + number * trace["step_ns"]:

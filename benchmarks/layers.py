@@ -1,10 +1,10 @@
 """Cost of each layer of the radio model: `python -m benchmarks.layers [--json]`, as root.
 
-The engine alone is measured first, in virtual time, as layers are added: processor time per packet of 64 bytes of UDP
-payload between two stations, one of which always has packets to send, and its share of the packets' air time (above
-100 % a saturated channel does not run in real time). Then all layers are measured with more stations, which are in
-range of each other and send to the first one. Then the medium is measured: round trips of ping between two
-namespaces, and their mean without the delays from the model.
+First the engine is measured in virtual time, without a medium, while layers are added: processor time per packet of
+64 bytes of UDP payload between two stations, one of which always has packets to send, and its share of the packets'
+air time (above 100 % a saturated channel does not run in real time). Then all layers are measured with more stations,
+which are in range of each other and send to the first one. Then the medium is measured: round trips of ping between
+two namespaces, and their mean without the delays from the model.
 """
 
 import argparse
@@ -61,7 +61,7 @@ class Layer:
     def model(self, stations: int) -> RadioModel[int]:
         """Return the radio model, without a medium."""
         options = self.radio()
-        if options.fixed:
+        if options.is_fixed:
             return UniformLinks(1, options)
         return WifiInWorld(1, options, {_name(n): antenna_of(RADIO) for n in range(stations)}, self.load())
 

@@ -1,8 +1,8 @@
 """Lifetimes of watched programs in chosen network namespaces, from kernel events and without effect on the programs.
 
 The kernel reports every exec and exit with its time on the monotonic clock (process events connector,
-linux/cn_proc.h). Therefore programs that are started in different ways are timed by the same definition: from the
-exec of the program to the exit of its process.
+linux/cn_proc.h). The lifetime of a program is therefore defined independently of how it is started: from the exec of
+the program to the exit of its process.
 """
 
 import ctypes
@@ -170,7 +170,7 @@ def _events() -> Iterator[tuple[int, int, int]]:
 
 
 def _filter_events(channel: socket.socket, *kinds: int) -> None:
-    """Make the kernel drop events of other kinds, since needless wake-ups delay the watcher."""
+    """Make the kernel drop events of other kinds, because unnecessary wake-ups delay the watcher."""
     # struct sock_filter, linux/filter.h: load the kind (in network byte order), compare, accept or drop.
     load = [(0x20, 0, 0, _HEADERS.size)]
     compare = [(0x15, len(kinds) - n, 0, socket.htonl(kind)) for n, kind in enumerate(kinds)]

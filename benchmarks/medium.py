@@ -2,10 +2,10 @@
 
 It uses two namespaces without robots. Each round measures for each path, in this order: round-trip time at zero delay
 (ping), TCP throughput (iperf3), 64-byte UDP payloads at full rate (iperf3: packets at the receiver's interface, and
-packets received by its program, which on two cores gets too little processor time first), and the error of a 5 ms
+packets received by its program, whose processor time is the first limit on two cores), and the error of a 5 ms
 delay: a sender writes its send time into a datagram every 2 ms, and the receiver's kernel records the arrival time by
-the same clock. The column of the bare timer shows the machine's part: the lateness of a 5 ms sleep at the same
-priority.
+the same clock. The column of the bare timer has the part of the error that is due to the machine: the lateness of a
+5 ms sleep at the same priority.
 """
 
 import argparse

@@ -1,10 +1,10 @@
-"""Linux's minstrel_ht and fieldkit's: `python -m benchmarks.minstrel_vs_kernel [--record] [--figure FILE]`.
+"""minstrel_ht of fieldkit compared with Linux: `python -m benchmarks.minstrel_vs_kernel [--record] [--figure FILE]`.
 
 A sender moves away from its receiver and back, on open ground, without and with fading. Both algorithms send the same
 frames at the same times; a try fails with the packet error of its mode at the signal of the frame, and has the same
 random draw for both. The kernel's choices are recordings of a virtual machine (`kernel_minstrel`), whose clock counts
-instructions, so a busy host does not change them; `--record` replaces them, as root. fieldkit's are computed here,
-for several seeds of its sampling.
+instructions, so a busy host does not change them; `--record` replaces them, as root. The choices of fieldkit are
+computed here, for several seeds of its sampling.
 """
 
 import argparse
@@ -38,14 +38,14 @@ from sim_backends.radio.random_streams import PacketDraws
 ROOT: Final = Path(__file__).resolve().parent.parent
 RECORDINGS: Final = ROOT / "tests/data/hwsim/6.1.176"
 TRACES: Final = {"walk": False, "walk with fading": True}
-"""Traces, and whether they have fading."""
+"""Traces by name; True if the trace has fading."""
 SEEDS: Final = 20
 
 FRAMES: Final = 6_000
 STEP_NS: Final = 5_000_000
 PAYLOAD_BYTES: Final = 1_000
 _FRAME_BYTES: Final = 1_036
-"""With the headers of 802.11 and LLC, and the FCS; as for the errors, which have no other use."""
+"""Size for which packet errors are computed: the payload with the headers of 802.11 and LLC, and the FCS."""
 _NEAR_M, _FAR_M, _EXPONENT, _NEAR_DB = 5.0, 80.0, 3.0, 40.0
 _LEVEL_DB, _LOWEST_DB, _LEVELS = 0.25, -10.0, 240
 _FADING_PATHS, _DOPPLER_HZ = 16, 8.0
@@ -68,7 +68,7 @@ class SelectedFrame:
 
     Attributes:
         time_ns: Time at which it was sent.
-        modes: Mode of each try that was made; None for a rate of 802.11b.
+        modes: Mode of each try; None for a rate of 802.11b.
         is_received: True if the last try succeeded.
         is_sample: True if the first try was a sample.
     """
@@ -80,10 +80,10 @@ class SelectedFrame:
 
 
 def signal_to_noise_db(frames: int, *, fading: bool) -> list[float]:
-    """Return the signal-to-noise ratio of each frame: 40 dB at 5 m, falling with the third power of the distance.
+    """Return the signal-to-noise ratio of each frame: 40 dB at 5 m, inverse to the third power of the distance.
 
-    The distance grows evenly to 80 m and shrinks again. Fading is a sum of paths with random directions and phases
-    (Clarke's model) with a Doppler shift of 8 Hz: 1 m/s at 2.4 GHz.
+    The distance increases linearly to 80 m and decreases again. Fading is a sum of paths with random directions and
+    phases (Clarke's model) with a Doppler shift of 8 Hz: 1 m/s at 2.4 GHz.
     """
     random = Random(1)
     paths = [(random.uniform(0, 2 * math.pi), random.uniform(0, 2 * math.pi)) for _ in range(_FADING_PATHS)]
@@ -153,8 +153,8 @@ def kernel_frames(text: str) -> list[SelectedFrame]:
     return frames
 
 
-def own_frames(content: dict[str, Any], times_ns: Sequence[int], seed: int) -> list[SelectedFrame]:
-    """Return the frames of fieldkit's minstrel_ht, sent at these times."""
+def fieldkit_frames(content: dict[str, Any], times_ns: Sequence[int], seed: int) -> list[SelectedFrame]:
+    """Return the frames of fieldkit's minstrel_ht, sent at `times_ns`."""
     control = MinstrelHt(mode_groups(_PHY, _PHY), PacketDraws(seed, "sender", "receiver"))
     frames = []
     for number, time_ns in enumerate(times_ns):
@@ -208,13 +208,15 @@ ROWS: Final[Mapping[str, Callable[[Sequence[SelectedFrame]], float]]] = {
 """Figures of a run, by their labels."""
 
 
-def lines(name: str, kernel: Sequence[SelectedFrame], own: Sequence[Sequence[SelectedFrame]]) -> Iterator[str]:
+def lines(
+    name: str, kernel: Sequence[SelectedFrame], fieldkit_runs: Sequence[Sequence[SelectedFrame]]
+) -> Iterator[str]:
     """Yield the table of a trace."""
-    yield f"{name}, {len(kernel)} frames: kernel; fieldkit, smallest to largest of {len(own)} seeds"
+    yield f"{name}, {len(kernel)} frames: kernel; fieldkit, smallest to largest of {len(fieldkit_runs)} seeds"
     for label, compute in ROWS.items():
-        values = [compute(frames) for frames in own]
+        values = [compute(frames) for frames in fieldkit_runs]
         yield f"  {label}: {compute(kernel):.2f}; {min(values):.2f} to {max(values):.2f}"
-    counts = [frames_per_mcs(frames) for frames in own]
+    counts = [frames_per_mcs(frames) for frames in fieldkit_runs]
     kernel_counts = frames_per_mcs(kernel)
     for mcs in map(str, range(16)):
         values = [count[mcs] for count in counts]
@@ -252,9 +254,9 @@ def main() -> None:
             recording(name).write_bytes(gzip.compress(record(content).encode(), mtime=0))
         kernel = kernel_frames(gzip.decompress(recording(name).read_bytes()).decode())
         times_ns = [frame.time_ns for frame in kernel]
-        own = [own_frames(content, times_ns, seed) for seed in range(SEEDS)]
-        results[name] = kernel, own[0]
-        sys.stdout.write("\n".join(lines(name, kernel, own)) + "\n")
+        fieldkit_runs = [fieldkit_frames(content, times_ns, seed) for seed in range(SEEDS)]
+        results[name] = kernel, fieldkit_runs[0]
+        sys.stdout.write("\n".join(lines(name, kernel, fieldkit_runs)) + "\n")
     if options.figure:
         draw(options.figure, results)
 

@@ -1,8 +1,8 @@
-"""Part of `cosim_speed`: the cost of the co-simulation over MuJoCo's own steps.
+"""Part of `cosim_speed`: the cost of the co-simulation in addition to the steps of MuJoCo.
 
 One robot in fifteen, and at least one, is a drone; the others are alternately Huskies and TurtleBots. All move. The
-coordinator advances them in windows of 10 ms beside a network without packets. The peer is a loop over the same model
-and the same controllers, without states, commands and coordinator: ten steps per call.
+coordinator advances them in windows of 10 ms, with a network without packets. The peer is a loop over the same model
+and the same controllers, ten steps per call, without states, commands and coordinator.
 """
 
 import gc
@@ -67,7 +67,7 @@ def moving_robots(count: int) -> MujocoPhysics:
 def measure_mujoco(count: int, seconds: float) -> dict[str, float]:
     """Return the figures for a number of robots: medians of blocks of ten windows.
 
-    MuJoCo alone and the co-simulation alternate, so that a drift of the machine's speed favours neither.
+    MuJoCo alone and the co-simulation alternate, so that a drift of the machine's speed affects both equally.
     """
     uncoupled, coupled = moving_robots(count), moving_robots(count)
     model, data = uncoupled.model, uncoupled.data

@@ -1,4 +1,4 @@
-"""Bare network namespaces for benchmarks and tests: without robots, removed with the process that made them."""
+"""Network namespaces without robots for benchmarks and tests; they are removed with the process that created them."""
 
 import ctypes
 import os
@@ -16,7 +16,10 @@ _CLONE_NEWNET: Final = 0x40000000  # linux/sched.h
 
 
 class Namespace:
-    """A network namespace, held by a process that is killed with its creating thread; use as a context manager."""
+    """A network namespace; use as a context manager.
+
+    A process keeps the namespace open. It is killed when the thread that created it exits.
+    """
 
     def __init__(self) -> None:
         script = "ip link set lo up && echo ready && exec sleep infinity"
@@ -55,7 +58,7 @@ class Namespace:
         self.run("ip", *words).check_returncode()
 
     def start(self, *argv: str, pass_fds: Sequence[int] = ()) -> subprocess.Popen[str]:
-        """Start a command in the namespace, its output piped."""
+        """Start a command in the namespace with a pipe as its output."""
         return subprocess.Popen(self.inside(argv), stdout=subprocess.PIPE, text=True, pass_fds=pass_fds, cwd=_ROOT)
 
     def tun(self, name: str, address: str) -> int:

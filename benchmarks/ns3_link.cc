@@ -1,8 +1,10 @@
-// Results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py. `errors`: frame error by mode and SNR;
-// `durations`: airtime in ns by frame size in bytes; `link`:
-// goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same distance
-// from each other; `udp`
-// and `tcp`: goodput and loss of a stream at a rate, or at the full rate of TCP, and the events of the TCP sender.
+// Prints results of ns-3 for 802.11 links, for radio_vs_ns3.py and cosim_vs_ns3.py:
+//
+// - `errors`: frame error by mode and SNR;
+// - `durations`: airtime in ns by frame size in bytes;
+// - `link`: goodput in Mbit/s, by traffic class, of saturated stations that send UDP to one receiver, all with the same
+//   distance from each other;
+// - `udp` and `tcp`: goodput and loss of a stream at a rate, or at the full rate of TCP, and the events of the TCP sender.
 
 #include "ns3/applications-module.h"
 #include "ns3/core-module.h"

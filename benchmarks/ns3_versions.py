@@ -1,10 +1,11 @@
 """Tests of the network ns-3 with other versions of ns-3: `python -m benchmarks.ns3_versions [trixie] [sid] [wheel]`.
 
-A name of a Debian release takes libns3-dev of that release with all libraries that it needs, from the mirror in the
-sources of apt; `wheel` takes the headers and libraries in the PyPI package `ns3`. They are extracted into a folder
-(about 1 GB per release), and nothing is installed. The g++ of this machine compiles the network against them, and the
-program runs with their libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run. Each line
-of the output states the version that the program reports, and the results. The exit code is 1 if something failed.
+The name of a Debian release selects libns3-dev of that release with all libraries that it needs, from the mirror in
+the sources of apt; `wheel` selects the headers and libraries in the PyPI package `ns3`. They are extracted into a
+folder (about 1 GB per release), and nothing is installed. The g++ of this machine compiles the network against them,
+and the program runs with their libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run.
+Each line of the output states the version that the program reports, and the results. The exit code is 1 if something
+failed.
 """
 
 import argparse
@@ -63,7 +64,7 @@ def extract_release(release: str, folder: Path) -> None:
     options += ["-o", "Debug::NoLocking=1", "-o", "APT::Sandbox::User=root", "-q"]
     run("apt-get", *options, "update")
     run("apt-get", *options, "install", "--download-only", "--no-install-recommends", "-y", *PACKAGES)
-    for link in ("bin", "lib", "lib64", "sbin"):  # a merged /usr, as base-files makes it
+    for link in ("bin", "lib", "lib64", "sbin"):  # a merged /usr, which base-files creates in an installed system
         (root / "usr" / link).mkdir(parents=True, exist_ok=True)
         if not (root / link).is_symlink():
             (root / link).symlink_to(f"usr/{link}")

@@ -1,4 +1,4 @@
-"""The own time of a repeat by phase, which is its wall time minus the time of the tools on the robots."""
+"""The own time of a repeat by phase: its wall time minus the time of the tools on the robots."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -2,11 +2,11 @@
 
 The captures are of a UDP transfer of 200,000 IP packets with a loss of 10 %: fragments of 8,192-byte datagrams, with
 128 bytes captured of each, as in a trial. Each peer reads both captures into columns and matches the packets by
-identification and offset; in every round all peers run one after the other, and all must compute the same losses.
-fieldkit does all that `fieldkit.measure.transfers.transfer_measures` does with captures: losses of packets, datagrams
-and bytes, the transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count lost packets. scapy
-would take minutes and reads only the first packets; tshark is omitted if it is not installed. Times are processor
-times, children included, which other load disturbs less.
+identification and offset. In every round all peers run one after the other, and all must compute the same losses.
+fieldkit computes all values that `fieldkit.measure.transfers.transfer_measures` computes from captures: losses of
+packets, datagrams and bytes, the transfer's time, the paper's counts. The peers, dpkt, tshark and scapy, only count
+lost packets. scapy would take minutes, so it reads only the first packets; tshark is omitted if it is not installed.
+Times are processor times, including child processes, because other load affects them less.
 
 At the end fieldkit streams a sparse file of 10 GB in a separate process, whose peak memory is printed. With `--whole
 MIB` another process reads a capture of this size into columns, as a trial does.
@@ -79,9 +79,9 @@ def fragments() -> Iterator[bytes]:
 
 
 def record(index: int, frame: bytes, wire_bytes: int) -> bytes:
-    """Return a frame with its record header, 0.1 ms after the one before."""
-    seconds, rest_ns = divmod(index * 100_000, 1_000_000_000)
-    return struct.pack("<4I", 1_700_000_000 + seconds, rest_ns, len(frame), wire_bytes) + frame
+    """Return a frame with its record header; its time is 0.1 ms after that of the previous frame."""
+    seconds, nanoseconds = divmod(index * 100_000, 1_000_000_000)
+    return struct.pack("<4I", 1_700_000_000 + seconds, nanoseconds, len(frame), wire_bytes) + frame
 
 
 def write_captures(folder: Path) -> tuple[Path, Path]:
@@ -160,7 +160,7 @@ def _keys_by_scapy(path: Path) -> Iterator[Key]:
 
 
 def first_packets(source: Path, count: int) -> Path:
-    """Write a file with the first packets of another one."""
+    """Write a file with the first packets of another capture; return its path."""
     record_bytes = 16 + len(next(fragments()))
     path = source.with_name(f"first-{source.name}")
     path.write_bytes(source.read_bytes()[: len(FILE_HEADER) + count * record_bytes])

@@ -121,7 +121,10 @@ def goodput_mbit_s(
 
 
 class _Equidistant(WorldChannel):
-    """All pairs of stations have the same distance, which is impossible in a plane, as in the ns-3 program."""
+    """A channel in which all pairs of stations have the same distance, as in the ns-3 program.
+
+    This is impossible in a plane, so the losses are set.
+    """
 
     def set_distance(self, distance_m: float) -> None:
         count = len(self.names)

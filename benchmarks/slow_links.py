@@ -1,4 +1,4 @@
-"""Control links with a given round-trip time, as on bad Wi-Fi, which count sequential round trips.
+"""Control links with a long round-trip time, as on bad Wi-Fi, which count sequential round trips.
 
 One thread carries streams over loopback and delays every byte by half a round trip. Trips are counted like logical
 clocks: data from this computer has a trip number one above the highest received over any link, and data from a robot

@@ -30,7 +30,7 @@ _BRAKING_SHARE: Final = 0.9
 _TIMEOUT_S: Final = 60.0
 FIGURES: Final = {
     "ssh": "`ssh box-1 true` (OpenSSH)",
-    "idle": "`fieldkit stop box-1`, which no program moves",
+    "idle": "`fieldkit stop box-1`; no program moves the robot",
     "brakes": "`fieldkit stop rover-1`, until the base brakes",
     "stationary": "until the robot is stationary",
     "printed": "until `stopped (stationary)` is printed",
@@ -106,7 +106,7 @@ def main() -> int:
     options = parser.parse_args()
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory(prefix="fieldkit-stop-") as folder, rover_lab(Path(folder)) as lab:
-        os.chdir(lab.folder)  # where the site file is
+        os.chdir(lab.folder)  # the folder of the site file
         lab.write_procedure(Role.SENDER, _PATH_M)
         rounds = [measure(lab, f"round-{number}") for number in range(options.rounds)]
         os.chdir("/")

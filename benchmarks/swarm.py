@@ -51,7 +51,7 @@ REFERENCE: Final = {
     "start_s": ("", "0.11", "0.30", "0.50"),
     "pss_mb": ("", "3.2", "2.5", "2.4"),
 }
-"""EMANE 1.5.3 on 2 quiet cores, nodes without SSH server or sensors; TCP by RF Pipe and Comm Effect."""
+"""EMANE 1.5.3 on 2 idle cores, with nodes without SSH server or sensors; TCP over RF Pipe and Comm Effect."""
 
 SENDER_SCRIPT: Final = f"""
 import socket, sys, time
@@ -89,7 +89,7 @@ def measure_medium(size: int, options: RadioOptions, seconds: float) -> Figures:
     """Return the figures of the medium for two of `size` robots."""
     with swarm(size, options) as (medium, (client, server, *_)):
         client.run("ping", "-c", "3", "10.9.0.2")
-        before = Counter(medium.stats().late)
+        before = Counter(medium.stats().packet_lateness_counts)
         figures = round_trips(client)
         figures |= lateness(medium, before)
         figures |= throughput(client, server, seconds)
@@ -114,7 +114,7 @@ def round_trips(client: Namespace) -> Figures:
 
 def lateness(medium: MediumClient, before: Counter[int]) -> Figures:
     """Return the lateness of the medium's packets since the counts `before`."""
-    late = Lateness(bound_ns=1, packets=Counter(medium.stats().late) - before)
+    late = Lateness(bound_ns=1, packets=Counter(medium.stats().packet_lateness_counts) - before)
     shares = {"median": 0.5, "p99": 0.99, "max": 1.0}
     return {
         f"late_{word}_ms": (lateness_quantile_ns(late.packets, share) or 0) / 1e6 for word, share in shares.items()
@@ -140,7 +140,7 @@ def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: i
     with swarm(size, options) as (medium, spaces):
         senders, receivers = spaces[: 2 * pairs : 2], spaces[1 : 2 * pairs : 2]
         packets_s_each = str(packets_s / len(senders))
-        before, arrived = Counter(medium.stats().late), sum(map(packets_in, receivers))
+        before, arrived = Counter(medium.stats().packet_lateness_counts), sum(map(packets_in, receivers))
         started_s, cpu_before_s = time.monotonic(), cpu_s(medium.pid)
         senders_running = [
             sender.start(
@@ -157,7 +157,7 @@ def measure_pairs(size: int, options: RadioOptions, seconds: float, packets_s: i
 
 
 def measure_startup(size: int) -> Figures:
-    """Return the start-up cost of `size` whole robots, including the lab, and the mean memory of a robot."""
+    """Return the start-up cost of `size` robots with their services and the lab, and the mean memory of a robot."""
     cast = EmulatedBackend(None, None).cast(Topology.MASTER)
     login, host_key = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=login, host_key=host_key)

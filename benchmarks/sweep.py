@@ -1,8 +1,8 @@
 """Runs of a sweep per second, compared with a bare process pool: `python -m benchmarks.sweep`.
 
 Each round runs the same simulations on 1 and on 2 processes, with `run_sweep` and with a `ProcessPoolExecutor` that
-keeps no results, in random order. Then it measures the cost of an empty task on processes and on a Dask cluster of
-two workers, and the cost of state on disk with many finished runs.
+stores no results, in random order. Then the benchmark measures the cost of an empty task on processes and on a Dask
+cluster of two workers, and the cost of the state on disk with many finished runs.
 """
 
 import argparse
@@ -81,7 +81,7 @@ def runs_per_s(plan: SweepPlan, folder: Path, rounds: int) -> dict[str, list[flo
     for number in range(rounds):
         for count in COUNTS:
             out = folder / f"{number}-{count}"
-            # One worker of a sweep is this process, so the peer with one process has its start in addition.
+            # One worker of a sweep is this process. The peer with one process must also start that process.
             methods: list[tuple[str, Callable[[], object]]] = [
                 ("bare", lambda count=count: run_bare(plan, count)),  # type: ignore[misc]
                 ("sweep", lambda count=count, out=out: run_sweep_in(plan, Workers(count), out)),  # type: ignore[misc]

@@ -1,8 +1,8 @@
 """TCP of the co-simulation compared with this machine's kernel: `python -m benchmarks.tcp_vs_kernel`, as root.
 
 One station sends to another at the full rate of TCP, over links with the same rate, delay and loss in both
-directions: the kernel with iperf3 between two namespaces on the medium of the emulated backend, the co-simulation
-over the same link model. Each run has a different seed. A row has the mean goodputs, and the ratio of the
+directions. The kernel runs iperf3 between two namespaces on the medium of the emulated backend; the co-simulation
+uses the same link model. Each run has a different seed. A row has the mean goodputs, and the ratio of the
 co-simulation to the kernel with its 95 % interval.
 """
 

@@ -52,7 +52,8 @@ PATTERNS: Final = {
     "burst of 20": Losses(range(100, 120)),
     "burst of 110": Losses(range(100, 210)),
 }
-"""The longest burst is the rest of a window, all packets that its ACKs release, and retransmissions twice."""
+"""The longest burst loses the remaining packets of a window, all packets that its ACKs release, and two series of
+retransmissions."""
 
 RANDOM_LOSSES: Final = {
     "2 % of data": (0.02, 0.0, SECONDS),

@@ -5,7 +5,7 @@ the kernel `iw` fails early, and the sampler gets a stored station text instead;
 added. The reference is a loop in the same shell that calls `iw` three times and sleeps 0.2 s. Processor time is the
 kernel's count for the shell and its children, per second.
 
-A telemetry source of a profile is a program that only prints a line, every 2 s.
+The telemetry source of a profile is a program that prints a line every 2 s.
 
 A slower computer is simulated by an `iw` that runs several times. The sampler must then call it less often to stay
 within its share of the processor.
@@ -65,7 +65,7 @@ _POLL: Final = ("poll", ".began", "-", "-", "-", "2", "2", "echo", "signal:")
 
 
 def measure(shell: Sequence[str], text: str, words: Sequence[str], seconds: float) -> tuple[float, int]:
-    """Run a script in a folder like an attempt's; return processor time in ms per second, and the sample count."""
+    """Run a script in a folder like that of an attempt; return processor time in ms per second, and sample count."""
     with tempfile.TemporaryDirectory() as folder:
         jobs = Path(folder, ".jobs", "link")
         jobs.mkdir(parents=True)

@@ -7,7 +7,7 @@ time, 1,000 bytes at nearly 200 Hz. Their rates differ slightly, so that over se
 other load vary, and are exchanged between rounds. Medians are over the time in which all pairs send; a ratio is the
 geometric mean over rounds. In every third round each pair then sends for a second at full rate, in sequence.
 
-A delay is from the creation of a sample until the subscriber's Python code has it.
+A delay is the time from the creation of a sample until the subscriber's Python code has received it.
 """
 
 import argparse
@@ -46,7 +46,7 @@ Times = Sequence[tuple[int, int]]
 
 
 class AgentPair:
-    """The two ends of a step `topics`, for streams in sequence.
+    """Publisher and subscriber of a step `topics`, for streams in sequence.
 
     Args:
         over: The middleware.
@@ -92,7 +92,7 @@ class AgentPair:
             return shared | {"discovery": "master", "server": HOST, "port": self._master_port, "settings": settings}
         settings = {}
         if self._over == "zenoh":
-            # One end listens and the other connects, as in the plain pair.
+            # The subscriber listens and the publisher connects, as in the plain pair.
             locators = json.dumps([f"tcp/{HOST}:{port}"])
             is_subscriber = verb == "subscribe"
             settings = {
@@ -133,8 +133,8 @@ def measure_round(over: str, number: int, agent_pair: AgentPair, environment: di
     pairs = (*PLAIN[over], "agent")
     rates_hz = [RATES_HZ[(place + number) % len(pairs)] for place in range(len(pairs))]
     with ExitStack() as stack:
-        ways = [f"{over} {pair}" for pair in PLAIN[over]]
-        plain = [RunningPath(stack, MessagePath(way, way, way), environment) for way in ways]
+        names = [f"{over} {pair}" for pair in PLAIN[over]]
+        plain = [RunningPath(stack, MessagePath(name, name, name), environment) for name in names]
         delays = stream_together(plain, agent_pair, rates_hz)
         bursts: list[Times] = []
         if number % BURST_EVERY == 0:

@@ -6,8 +6,8 @@ check their hashes. Own time is the wall time of a repeat minus the time of the 
 time from the start of the sending nc to the end of the listening one, and the process of ping. These times are from
 kernel events (`benchmarks.lifetimes`) for both peers. Each repeat checks that both run the same command lines.
 
-All of it is measured twice for both peers: over control links without delay, and with a round trip of 100 ms, as on
-bad Wi-Fi. On the latter, sequential round trips are counted, too.
+Both peers are measured over control links without delay, and over control links with a round trip of 100 ms, as on
+bad Wi-Fi. On the latter, sequential round trips are counted too.
 
 The script is `trial_overhead.sh`, over persistent OpenSSH connections. It does less than fieldkit: it does not
 inspect bag and captures, computes no loss, and writes no journal, intervals or manifest.
@@ -60,7 +60,7 @@ emulated:
 # The steps of procedures/los.yaml, with shorter waits.
 PROCEDURE: Final = """\
 name: overhead
-summary: the paper's steps, quicker
+summary: the paper's steps with shorter waits
 scenario: los
 topology: masterless
 protocols: [tcp, udp]
@@ -89,7 +89,7 @@ class AlternatingPeers:
         watch: Watches the tools on the robots.
         script: The other peer.
         repeats: The results, without the first repeat of each peer and protocol, which is a warm-up.
-        unseen: Number of repeats without times, because a tool exited before the watcher identified it.
+        untimed: Number of repeats without times, because a tool exited before the watcher identified it.
         slow: The slow control links, if any.
     """
 
@@ -97,7 +97,7 @@ class AlternatingPeers:
     script: BashPeer
     slow: SlowLinks | None = None
     repeats: list[Repeat] = field(default_factory=list)
-    unseen: int = 0
+    untimed: int = 0
     _start_ns: int = 0
     _start_trips: int = 0
     _phases: dict[str, int] = field(default_factory=dict)
@@ -142,7 +142,7 @@ class AlternatingPeers:
         try:
             tools = self.watch.read(sum(TOOLS.values()), self._start_ns)
         except TimeoutError:
-            self.unseen += 1
+            self.untimed += 1
             return ()
         if number > 1:
             own_ms = own_time_ms(self._start_ns, self._phases, end_ns, tools)
@@ -242,11 +242,13 @@ def main() -> None:
         peers = measure(options.rounds, parse_duration_s(options.record), parse_duration_s(text))
         if options.json:
             repeats = [asdict(repeat) for repeat in peers.repeats]
-            rows.append({"round_trip": text, "load_before": load_before, "unseen": peers.unseen, "repeats": repeats})
+            rows.append(
+                {"round_trip": text, "load_before": load_before, "untimed": peers.untimed, "repeats": repeats}
+            )
             continue
         print(f"control links with {text} of round trip")
         print(f"{options.rounds} rounds, median (lowest to highest); load before: {load_before:.2f}")
-        print(f"repeats that could not be timed: {peers.unseen}\n")
+        print(f"repeats that could not be timed: {peers.untimed}\n")
         show(peers.repeats)
         print()
     if options.json:

@@ -1,8 +1,8 @@
 """Every sync policy on every pair of simulators: `python -m benchmarks.studies.combinations run FILE.csv`.
 
-Runs one scenario with each physics, each network, each sync policy and each seed, and appends a row per run to a CSV
-file; combinations that the file has are not run again. `table FILE.csv --page docs/studies/simulators.md` writes the
-tables of the documentation. A Gazebo must be running for `gazebo`.
+The program runs one scenario with each physics, each network, each sync policy and each seed, and appends a row per
+run to a CSV file. It does not run combinations again that are in the file. `table FILE.csv --page
+docs/studies/simulators.md` writes the tables of the documentation. For `gazebo`, a Gazebo must be running.
 """
 
 import argparse
@@ -36,7 +36,7 @@ END: Final = "<!-- written by benchmarks.studies.combinations: to here -->"
 
 
 class StudyRow(NamedTuple):
-    """The result of one run; nan is unknown.
+    """The result of one run; nan if a value is unknown.
 
     Attributes:
         physics: Name of the physics.
@@ -78,7 +78,7 @@ _TEXTS: Final = {"physics", "network", "policy", "failure"}
 
 
 def make(scenario: str, changes: Mapping[str, object], policy: str, seed: int) -> Simulation:
-    """Return a run that is ready to start."""
+    """Return a simulation that is ready to start."""
     return build(load_scenario(scenario, changes), policy=policy, seed=seed)
 
 
@@ -135,7 +135,7 @@ def run(arguments: argparse.Namespace) -> None:
     for pair in itertools.product(arguments.physics, arguments.network):
         if pair in done:
             continue
-        began_s = time.monotonic()
+        start_s = time.monotonic()
         physics, network = pair
         changes = {
             "duration": arguments.duration,
@@ -151,7 +151,7 @@ def run(arguments: argparse.Namespace) -> None:
             workers=Workers(1),
         )
         append_rows(arguments.file, [*study_rows(physics, network, results)])
-        print_text(f"{physics} and {network}: {time.monotonic() - began_s:.0f} s", flush=True)
+        print_text(f"{physics} and {network}: {time.monotonic() - start_s:.0f} s", flush=True)
     print_tables(arguments)
 
 
@@ -165,7 +165,7 @@ def estimate_text(values: Sequence[float], scale: float, digits: int) -> str:
 
 
 def simulator_table(rows: Sequence[StudyRow]) -> Iterator[str]:
-    """Yield a table of the exact reference on each pair of simulators, beside the differences from the built-in pair.
+    """Yield a table of the exact reference on each pair of simulators, with the differences from the built-in pair.
 
     Differences are those of runs with the same seed.
     """

@@ -1,8 +1,9 @@
 """The paper's field trial on emulated robots: `python -m benchmarks.studies.field_shape [--figures FOLDER]`, as root.
 
 Four campaigns (benchmarks/studies/lawn/: two topologies, with line of sight and behind the wall) run in parallel,
-because a repeat mostly waits; 640 repeats take 21 to 25 minutes. It can be stopped at any time: the same command
-continues the campaigns. At the end it prints the table of docs/studies/field-shape.md and draws its two figures.
+because a repeat mostly waits; 640 repeats take 21 to 25 minutes. The program can be stopped at any time; the same
+command continues the campaigns. At the end it prints the table of docs/studies/field-shape.md and draws its two
+figures.
 """
 
 import argparse
@@ -64,7 +65,7 @@ SHOWN: Final = (
 
 
 def copy_lab(folder: Path, repeats_each: int | None) -> None:
-    """Copy the lab's files into a folder, unless it exists: a started campaign keeps its files."""
+    """Copy the lab's files into a folder if it does not exist; the files of a started campaign must not change."""
     if folder.exists():
         return
     shutil.copytree(LAB, folder)
@@ -133,7 +134,7 @@ def _panel(cells: Sequence[Cell], title: str, protocol: str, quantity: str) -> P
 
 
 def _end(source: Estimate, end: float | None, factor: float) -> float | None:
-    """Return an end of an interval to draw, or None if nothing was lost: it then shows only the repeat count."""
+    """Return an end of an interval to draw, or None without a loss: it would only depend on the number of repeats."""
     return None if end is None or source.value == 0 else factor * end
 
 

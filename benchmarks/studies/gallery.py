@@ -1,7 +1,7 @@
 """Pictures of docs/gallery.md, from stored trials: `python -m benchmarks.studies.gallery [--out docs/gallery]`.
 
-Makes a report of the trials in `TRIALS` and saves parts of it as pictures with Debian's Chromium. Needs
-neither root nor a network.
+The program writes a report of the trials in `TRIALS` and saves parts of it as pictures with Debian's Chromium. It
+needs neither root nor a network.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from fieldkit import cli
 TRIALS: Final = Path("tests/data/fieldkit/4/trials")
 CHROMIUM: Final = "/usr/bin/chromium"
 COLOURS: Final = 32
-"""Colours of a picture. Figures have few, and a palette makes files several times smaller."""
+"""Number of colours of a picture. Figures have few colours, and a palette makes files several times smaller."""
 HEIGHT: Final = 900
 
 

@@ -1,9 +1,9 @@
 """Time that a mesh takes to heal: `python -m benchmarks.studies.mesh --out FOLDER [--figure FILE.svg]`, as root.
 
-Trials of four layouts and two hello intervals on emulated robots without fading, with five repeats each, run in
-sequence unless FOLDER already has them; 2 hours in all. Then a table of `rtt_gap_s`, with the bound of 13.7 hello
-intervals (docs/studies/mesh.md), and a figure are made. The layout `row` has no other path, so its time starts when
-the robot is back.
+The program runs trials of four layouts and two hello intervals in sequence, unless FOLDER already has them, on
+emulated robots without fading, with five repeats each. This takes 2 hours. Then it prints a table of `rtt_gap_s`,
+with the bound of 13.7 hello intervals (docs/studies/mesh.md), and draws a figure. The layout `row` has no other path,
+so its time starts when the robot is on again.
 """
 
 import argparse
@@ -26,7 +26,8 @@ from fieldkit.report.theme import Style
 HERE: Final = Path(__file__).parent
 HELLOS_S: Final = (1, 4)
 BOUND_HELLOS: Final = 13.7
-"""12 missing hellos, the first 1.7 intervals after the last received one; babeld checks once per interval."""
+"""A neighbour is lost after 12 missing hellos. babeld checks once per interval, and detects the first missing hello
+1.7 intervals after the last received one."""
 
 SITE: Final = """\
 backend: emulated
@@ -78,7 +79,7 @@ LAYOUTS: Final = {
 
 
 def gaps_s(out: Path, name: str, hello_s: int, repeats: int) -> list[float]:
-    """Return the gap of each valid repeat of a layout; run its trial first unless it exists."""
+    """Return the gap of each valid repeat of a layout; run its trial first if it does not exist."""
     layout, lab = LAYOUTS[name], out / f"{name}-{hello_s}s"
     if not (lab / "trials").exists():
         _make_lab(lab, layout, hello_s)

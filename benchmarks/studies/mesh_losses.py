@@ -1,10 +1,10 @@
 """Time that a mesh takes to find another path: `python -m benchmarks.studies.mesh_losses [--losses N]`, as root.
 
-In each of three labs, which run at the same time, a path of three hops leads from the sender to the receiver, and a
-second path leads around it: one of four hops without fading, one of four with fading, one of three with fading.
-The first robot on the path in use is switched off until the receiver answers a ping of the sender again, or for at
-most `PATIENCE_S`. Then it is switched on again, and the next loss follows when packets use it again. At the end a
-table of the times without an answer is printed. 40 losses take about half an hour.
+Three labs run at the same time. Each has a path of three hops from the sender to the receiver, and a second path: in
+the first lab of four hops without fading, in the second of four hops with fading, in the third of three hops with
+fading. The first robot on the used path is switched off until the receiver answers a ping of the sender again, or for
+at most `PATIENCE_S`. Then it is switched on again. The next loss follows when packets use this robot again. At the
+end the program prints a table of the times without an answer. 40 losses take about half an hour.
 """
 
 import argparse
@@ -83,7 +83,7 @@ class DetourLab:
     shell: Shell
 
     def is_reachable(self, within_s: float) -> bool:
-        """Ping the receiver until it answers; return True if it does within `within_s`."""
+        """Ping the receiver until it answers; return True if it answers within `within_s`."""
         script = 'until ping -n -c 1 -W 0.2 "$0" >/dev/null 2>&1; do sleep 0.05; done'
         argv = ("timeout", str(within_s), "sh", "-c", script, self._address("receiver"))
         return self.shell.run(argv, deadline=Deadline.after(within_s + 60), check=False).exit_code == 0
@@ -122,13 +122,13 @@ def lab(detour: Detour) -> Iterator[DetourLab]:
 
 
 def healing_time_s(lab_robots: DetourLab, lost: Sequence[str]) -> float | None:
-    """Switch off the next hop, once it is one of `lost`; return the time until the receiver answers again.
+    """Wait until the next hop is one of `lost`, and switch it off; return the time until the receiver answers again.
 
     Returns:
         Seconds, or None if it is longer than `PATIENCE_S`.
 
     Raises:
-        TimeoutError: Packets did not use one of the robots before.
+        TimeoutError: Packets did not use one of these robots within `RETURN_S`.
     """
     route_deadline = Deadline.after(RETURN_S)
     time.sleep(SETTLE_S)

@@ -1,9 +1,9 @@
 """Compare middlewares on a lossy radio: `python -m benchmarks.studies.middleware [--figures FOLDER] [--table FILE]`.
 
-It needs root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly waits;
-`--only` selects some of them, `--full` those that last hours. It can be stopped at any time: the same command
-continues the campaigns. At the end it prints the conditions of the runs for docs/studies/middleware.md, writes the
-table docs/studies/middleware.csv, and draws the figures.
+The program needs root. Six campaigns of benchmarks/studies/middleware/ run in parallel, because a repeat mostly
+waits; `--only` selects some of them, `--full` those that last hours. The program can be stopped at any time; the same
+command continues the campaigns. At the end it prints the conditions of the runs for docs/studies/middleware.md,
+writes the table docs/studies/middleware.csv, and draws the figures.
 
 Two repeats, as in the campaigns, show only large differences. On a quiet machine `--repeats 12` measures each place
 twelve times, in about two and a half hours. Then the intervals treat the repeat as the independent unit.
@@ -54,7 +54,7 @@ ROBOTS_DODGE: Final = 0.06
 
 
 def copy_lab(folder: Path, repeats: int | None = None) -> None:
-    """Copy the lab's files into a folder if they are missing: a started campaign keeps its files.
+    """Copy missing files of the lab into a folder; the files of a started campaign do not change.
 
     Args:
         folder: The folder.
@@ -157,7 +157,7 @@ def by_robots(findings: MiddlewareFindings) -> Chart:
 
 
 def _series(label: str, points: Sequence[tuple[float, MiddlewareCell]], drawn: "DrawnFigure") -> Series:
-    """Return the points of a middleware with their intervals; no line joins them, as intervals are too wide."""
+    """Return the points of a middleware with their intervals, without a line, because intervals are too wide."""
     measured = sorted(((x, cell) for x, cell in points if drawn.value(cell) is not None), key=lambda pair: pair[0])
     ends = [drawn.interval(cell) for _, cell in measured]
     return Series(

@@ -1,9 +1,9 @@
 """Losses of 1 MB images over Zenoh, per repeat: `python -m benchmarks.studies.zenoh_images [--rounds N] [--page P]`.
 
-It needs root. Two emulated robots of a separate lab are 20 m apart. The agent of the step `topics` is compared with a
-plain pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports nothing of
-fieldkit), with several settings; each round runs all of them in sequence. Losses of this stream are bimodal, so each
-repeat is printed instead of a mean.
+The program needs root. Two emulated robots of a separate lab are 20 m apart. The agent of the step `topics` is
+compared with a plain pair of Zenoh sessions on the same robots (benchmarks/studies/zenoh_plain.py, which imports
+nothing of fieldkit), with several settings; each round runs all of them in sequence. Losses of this stream are
+bimodal, so each repeat is printed instead of a mean.
 
 A repeat takes 11 s, a round of six settings about 70 s.
 """
@@ -90,15 +90,15 @@ class ImageLab:
         placed = ("env", f"PYTHONPATH={ROOT}", *argv)
         return ["ssh", "-F", str(self._folder / "lab.ssh"), robot, shlex.join(placed)]
 
-    def lost(self, setting: ImageSetting) -> list[int]:
+    def lost_images(self, setting: ImageSetting) -> list[int]:
         """Return the numbers of the images that did not arrive in one repeat.
 
         Raises:
-            RuntimeError: A program failed, or the publisher found no subscription.
+            RuntimeError: A program failed, or the publisher discovered no subscription.
         """
         sent, arrived = self._agent(setting) if setting.profile else self._plain(setting)
         if not sent:
-            raise RuntimeError(f"{setting.label}: nothing was sent")
+            raise RuntimeError(f"{setting.label}: no image was sent")
         return sorted(set(range(SAMPLES)) - set(arrived))
 
     def _plain(self, setting: ImageSetting) -> tuple[list[int], list[int]]:
@@ -149,7 +149,7 @@ class ImageLab:
         return [int(number) for number in log.samples.sequence]
 
     def _stream(self, ends: Mapping[str, Sequence[str]], up: str) -> tuple[list[int], list[int]]:
-        """Run both ends; return the numbers that plain ends print, or empty lists for the agent's."""
+        """Run subscriber and publisher; return the numbers that they print, which are empty lists for the agent."""
         pid = "echo pid $$; exec " + shlex.join((self._python, "-u", *ends["subscribe"])) + " 2>&1"
         with subprocess.Popen(
             self.command(SUBSCRIBER[0], "sh", "-c", pid),
@@ -191,7 +191,7 @@ def measure(folder: Path, rounds: int) -> dict[str, list[list[int]]]:
         lab = ImageLab(folder)
         for number in range(rounds):
             for setting in SETTINGS:
-                lost_images[setting.label].append(lab.lost(setting))
+                lost_images[setting.label].append(lab.lost_images(setting))
                 print(number, setting.label, lost_images[setting.label][-1], file=sys.stderr, flush=True)
     finally:
         _fieldkit(folder, "lab", "down")

@@ -1,8 +1,8 @@
 """A plain pair of Zenoh sessions, the reference for the agent: `python zenoh_plain.py subscribe|publish JSON`.
 
-It imports nothing of fieldkit, so that it does not repeat errors of fieldkit's adapter. Each end prints a line of
-JSON for each sample: its number and times in nanoseconds since 1970 UTC. The subscriber exits at the end of its
-standard input.
+It does not import fieldkit, so that it does not contain errors of fieldkit's adapter. Publisher and subscriber print
+a line of JSON for each sample: its number and times in nanoseconds since 1970 UTC. The subscriber exits at the end of
+its standard input.
 """
 
 import json
@@ -49,7 +49,7 @@ def publish(session: Any, request: dict[str, Any]) -> None:  # noqa: ANN401 (unt
 
 
 def main() -> None:
-    """Open a session and run one end."""
+    """Open a session and run the publisher or the subscriber."""
     verb, request = sys.argv[1], json.loads(sys.argv[2])
     config = zenoh.Config()
     for path, value in request["config"].items():

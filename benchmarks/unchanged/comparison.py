@@ -1,4 +1,4 @@
-"""Compare two recorded outputs: they are equal, differ only in words, or differ in other parts.
+"""Compare two recorded outputs: they can be equal, differ only in words, or differ in other parts.
 
 Machine-readable output (commands of dry runs, tables, exports, hashes, exit codes) must be equal byte by byte. Other
 text (help, messages, tables on a terminal, reports) may differ in words, which are listed as labels; its numbers and

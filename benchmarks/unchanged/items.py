@@ -50,10 +50,10 @@ class Item:
         kind: Its kind.
         arguments: The words after `fieldkit` on the command line.
         working_folder: Relative to the laboratory folder.
-        outputs: Files and folders that it makes there; they are moved away and compared.
+        outputs: Files and folders that it creates there; they are moved to the results and compared.
         simulation: The simulation; then there are no arguments.
-        succeeds: True if it must succeed with the base; otherwise its outputs prove nothing.
-        counts_lines: True to count the lines of imported modules after it; it must run first.
+        succeeds: True if it must succeed with the base, because the outputs of a failed command prove nothing.
+        counts_lines: True to count the lines of imported modules after the item, which must then run first.
     """
 
     kind: ItemKind
@@ -201,7 +201,7 @@ cosim table nothing
 nothing
 --version
 """
-"""Command lines, wrong ones and others, in a folder with the stored trials in `trials`."""
+"""Valid and wrong command lines, in a folder with the stored trials in `trials`."""
 
 SIMULATED_NS: Final = 1_000_000_000
 SEEDS: Final = 3
@@ -243,7 +243,7 @@ def _site_folder(tree: Tree, name: str, text: str) -> None:
 
 
 def items(base: Tree, kinds: Sequence[ItemKind]) -> list[Item]:
-    """Return the items of some kinds. The files that ship with the base determine them."""
+    """Return the items of some kinds; they depend on the files that ship with the base."""
     makers: dict[ItemKind, Callable[[Tree], Iterable[Item]]] = {
         ItemKind.TRIALS: _trial,  # first: it counts the lines of imported modules
         ItemKind.TABLES: _tables,

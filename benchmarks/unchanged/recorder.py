@@ -1,4 +1,4 @@
-"""Run commands of one exported tree and store what they print and write.
+"""Run commands of one exported tree, and store their output and the files that they write.
 
 Runs as a program in an environment in which Python imports that tree: `python -P recorder.py ITEMS RESULTS`, where
 ITEMS is a JSON file of a list of items (`items.Item` as dictionaries) and RESULTS a folder, which is made. With
@@ -25,7 +25,7 @@ from typing import Any
 def record(item: dict[str, Any], folder: Path) -> None:
     """Run an item; write `exit_code`, `stdout`, `stderr` and its outputs into `folder`.
 
-    Outputs that it makes are moved, so that it can run again; those that it changes are copied.
+    Outputs that the item creates are moved, so that it can run again; outputs that it changes are copied.
     """
     folder.mkdir(parents=True)
     os.chdir(item["working_folder"])
@@ -102,7 +102,7 @@ def _help(group: Sequence[str]) -> str:
 
 
 def commands() -> list[list[str]]:
-    """Return the words of every command and group of commands, found in the help of the group above."""
+    """Return the words of every command and group of commands, read from the help of the parent group."""
     result: list[list[str]] = []
     waiting: list[list[str]] = [[]]
     while waiting:

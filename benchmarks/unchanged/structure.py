@@ -55,10 +55,10 @@ def table(base: Tree, head: Tree) -> str:
 def imported(tree: Tree) -> dict[str, str]:
     """Return the number of own lines that a dry run imports, and by package those that an emulated trial imported."""
     command = (*python(), "-c", _COUNT_IN_DRY_RUN)
-    done = subprocess.run(
+    completed = subprocess.run(
         command, cwd=tree.folder, env=tree.environment(), capture_output=True, text=True, check=True
     )
-    shown = {"own lines in `trial los 30ft --dry-run`": f"{done.stdout.splitlines()[-1]}; at most 25000"}
+    shown = {"own lines in `trial los 30ft --dry-run`": f"{completed.stdout.splitlines()[-1]}; at most 25000"}
     path = tree.results / "imported_lines.json"
     lines = json.loads(path.read_text(encoding="ascii")) if path.exists() else {}
     return shown | {
@@ -67,7 +67,7 @@ def imported(tree: Tree) -> dict[str, str]:
 
 
 def numbers(tree: Path) -> Iterator[tuple[str, str]]:
-    """Yield the name of each number, and the number with its target behind a semicolon."""
+    """Yield the name of each number, and the number with its target after a semicolon."""
     paths = modules(tree)
     texts = [path.read_text(encoding="utf-8") for path in paths]
     count = sum(text.count("\n") for text in texts)

@@ -2,8 +2,8 @@
 
 Functions are compared by their shape: the syntax tree without names, docstrings, annotations and imports, in which a
 string counts only by its digits. A function is matched with one of the same shape anywhere in the other tests, so it
-may move; the rest is matched by name. Inside of an assertion equal names must stay equal, so that `assert a == b` is
-not `assert a == a`. Outside of assertions, a replaced name is not detected.
+may move; the remaining functions are matched by name. Inside of an assertion equal names must remain equal, so that
+`assert a == b` differs from `assert a == a`. Outside of assertions, a replaced name is not detected.
 """
 
 import ast
@@ -54,8 +54,8 @@ class Changes:
     Attributes:
         same: Tests that are the same.
         added: Tests that the second commit adds.
-        removed: Tests that it no longer has, and helpers with assertions.
-        assertions: Assertions that it no longer has in a function that it still has.
+        removed: Tests, and helpers with assertions, that the second commit does not have.
+        assertions: Assertions that are missing in a function of the second commit.
         bodies: Functions with the same assertions, but other statements or numbers around them.
     """
 
@@ -129,7 +129,7 @@ def _match_by_shape(
 def _match_by_name(
     old_units: Sequence[Unit], new_units: Sequence[Unit]
 ) -> tuple[list[tuple[Unit, Unit]], list[Unit], list[Unit]]:
-    """Return pairs of units of the same file and name, or of the same name alone, and the units of both without."""
+    """Return pairs of units with the same file and name, or with the same name, and the unmatched units of both."""
     pairs = []
     unmatched_new_units = list(new_units)
     unmatched: list[Unit] = list(old_units)
@@ -179,19 +179,19 @@ def module_units(source: str, file: str) -> Iterator[Unit]:
 
 
 def _units_in(body: Sequence[ast.stmt], prefix: str, file: str, imports: set[str]) -> Iterator[Unit]:
-    rest: list[ast.stmt] = []
+    statements: list[ast.stmt] = []
     for node in body:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield _unit([node], f"{prefix}{node.name}", file, imports)
         elif isinstance(node, ast.ClassDef):
             yield from _units_in(node.body, f"{prefix}{node.name}.", file, imports)
-            rest += [ast.Expr(value) for value in (*node.bases, *node.decorator_list)]
+            statements += [ast.Expr(value) for value in (*node.bases, *node.decorator_list)]
         else:
-            rest.append(node)
-    if rest := [
-        node for node in rest if not isinstance(node, ast.Import | ast.ImportFrom) and not _is_docstring(node)
+            statements.append(node)
+    if statements := [
+        node for node in statements if not isinstance(node, ast.Import | ast.ImportFrom) and not _is_docstring(node)
     ]:
-        yield _unit(rest, f"{prefix}(statements)", file, imports)
+        yield _unit(statements, f"{prefix}(statements)", file, imports)
 
 
 def _is_docstring(node: ast.stmt) -> bool:

@@ -14,7 +14,7 @@ from typing import Final
 ROOT: Final = Path(__file__).resolve().parents[2]
 """The clone in which the proof runs."""
 
-WORKING_TREE: Final = "the files as they are now"
+WORKING_TREE: Final = "the current files"
 
 
 class UnknownCommitError(Exception):
@@ -59,7 +59,7 @@ def export(commit: str, folder: Path) -> Tree:
     """Export a commit.
 
     Args:
-        commit: Anything that git resolves to a commit; `WORKING_TREE` for the tracked files as they are now.
+        commit: A name that git resolves to a commit; `WORKING_TREE` for the current tracked files.
         folder: Folder to create.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Write the reference pages; with `--check`, exit with 1 if a page differs from what would be written."""
+"""Write the reference pages; with `--check`, exit with 1 if a page is not up to date."""
 
 import argparse
 import sys

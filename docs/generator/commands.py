@@ -46,12 +46,12 @@ def commands() -> str:
     """Return the page."""
     top = cli.parser()
     names = top.subcommands()
-    summaries = {name: COMMANDS.get(name) or _foreign(top, name) for name in names}
+    summaries = {name: COMMANDS.get(name) or _entry_point_summary(top, name) for name in names}
     overview = table(("command", "purpose"), ((f"[`{name}`](#fieldkit-{name})", summaries[name]) for name in names))
     blocks = [
         (
-            "`fieldkit COMMAND --help` prints the same. `fieldkit --version` prints the version. "
-            "[Exit codes](exit-codes.md), [quantities](../values.md)."
+            "`fieldkit COMMAND --help` prints the same text. `fieldkit --version` prints the version. See also "
+            "[exit codes](exit-codes.md) and [values](../values.md)."
         ),
         overview,
     ]
@@ -61,12 +61,12 @@ def commands() -> str:
         parser.complete()
         blocks += [f"## fieldkit {name}", *_command(parser)]
         if name in GUIDES:
-            blocks.append(f"More: [{_title(GUIDES[name])}](../{GUIDES[name]}).")
-        blocks += list(_inner(parser, 3))
+            blocks.append(f"Guide: [{_title(GUIDES[name])}](../{GUIDES[name]}).")
+        blocks += list(_subcommands(parser, 3))
     return page("Commands", *blocks)
 
 
-def _foreign(top: Parser, name: str) -> str:
+def _entry_point_summary(top: Parser, name: str) -> str:
     """Return the description of a command that an entry point adds."""
     parser = top.command(name)
     assert parser is not None
@@ -80,7 +80,7 @@ def _title(name: str) -> str:
     return text.partition("# ")[2].partition("\n")[0]
 
 
-def _inner(parser: Parser, level: int) -> Iterator[str]:
+def _subcommands(parser: Parser, level: int) -> Iterator[str]:
     for name in parser.subcommands():
         inner = parser.command(name)
         assert inner is not None
@@ -88,7 +88,7 @@ def _inner(parser: Parser, level: int) -> Iterator[str]:
             continue  # its only argument is in the usage of the command
         yield f"{'#' * level} {inner.prog}"
         yield from _command(inner, _help(parser, name))
-        yield from _inner(inner, level + 1)
+        yield from _subcommands(inner, level + 1)
 
 
 def _help(parser: Parser, name: str) -> str:
@@ -127,7 +127,8 @@ def _is_listed(action: argparse.Action) -> bool:
 
 
 def _invocation(action: argparse.Action) -> str:
-    metavar = action.metavar or ("" if action.nargs == 0 else (action.dest if not action.choices else ""))
+    default_metavar = action.dest.upper() if action.option_strings else action.dest
+    metavar = action.metavar or ("" if action.nargs == 0 or action.choices else default_metavar)
     value = metavar if isinstance(metavar, str) else " ".join(metavar)
     if action.choices and not action.metavar:
         value = "{" + ",".join(map(str, action.choices)) + "}"
@@ -152,7 +153,7 @@ def _expanded(parser: Parser, text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a text in which no character is Markdown by accident: names in capitals, stars, angle brackets."""
+    """Return a text with escaped characters of Markdown; a text with code spans is not changed."""
     return text.replace("<", "&lt;").replace("*", "\\*").replace("_", "\\_") if "`" not in text else text
 
 

@@ -45,18 +45,22 @@ LINKS = {
 }
 
 WITHOUT_VECTOR = {"pong", "busy", "done", "release", "bye", "sample links"}
-"""Messages with an empty body or that of ping."""
+"""Messages whose body is empty or equals that of ping."""
 
 DESCRIPTION = """\
-A frame of each layout of the [protocol](../federates.md) in hexadecimal, without the messages that have an empty
-body or that of ping. Values: a run `demo` of 2 s, seed 7, step 1 ms, configuration `{}`, token `s3cret`; its agent
-`ugv` (`husky`, antenna at 0.5 m, limit 3 m/s^2) starts at (1, 2, 0.5) with heading 0.25. The physics `carts`,
-`carts 1.0`, is deterministic and supports both commands. From 10 to 11.1 ms `ugv` drives at 0.5 m/s and turns at
--0.125 rad/s, and agent 1 flies at (1, 0, 0.25) m/s. Agent 1, `uav`, appears in the states at (-1.5, 0, 10) with the
-velocity (0, 0.5, -0.25). Packet 9, number 4 of `pose`, has 300 bytes, is sent at 10 ms and enters at 10.5 ms.
-`ugv` hears `uav` with -61.5 dBm, has sent it 12 packets at 54 Mbit/s, last, and received 11 at an unknown rate.
+This page has a frame of each layout of the [protocol](../federates.md) in hexadecimal. Messages whose body is empty
+or equals that of ping are omitted. The values are those of a run `demo` of 2 s with seed 7, step 1 ms, configuration
+`{}` and token `s3cret`.
+
+- The agent `ugv` (`husky`, antenna at 0.5 m, limit 3 m/s^2) starts at (1, 2, 0.5) with heading 0.25.
+- The physics `carts`, `carts 1.0`, is deterministic and supports both commands.
+- From 10 to 11.1 ms `ugv` drives at 0.5 m/s and turns at -0.125 rad/s, and agent 1 flies at (1, 0, 0.25) m/s.
+- Agent 1, `uav`, appears in the states at (-1.5, 0, 10) with the velocity (0, 0.5, -0.25).
+- Packet 9, number 4 of `pose`, has 300 bytes, is sent at 10 ms and enters the network at 10.5 ms.
+- `ugv` receives `uav` with -61.5 dBm. It has sent 12 packets to `uav`, the last at 54 Mbit/s, and has received 11
+  packets at an unknown rate.
 """
-"""Text of their page."""
+"""Text of the page of test vectors."""
 
 
 def agents() -> AgentTable:

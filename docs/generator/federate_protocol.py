@@ -26,7 +26,7 @@ def federate_protocol() -> str:
     return page(
         "Rules and layouts of the federate protocol",
         f"Version {frames.VERSION} of the [protocol](../federates.md#protocol) of external federates. "
-        "[Test vectors](federate-vectors.md) have a frame of each in hexadecimal.",
+        "[Test vectors](federate-vectors.md) has an example of each frame in hexadecimal.",
         _NUMBERS,
         "## Rules",
         relative(_without_title(exchanges.__doc__)),

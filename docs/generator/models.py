@@ -37,7 +37,8 @@ def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]
     meanings = attribute_meanings(model)
     for name, field in model.model_fields.items():
         key = field.alias or name
-        # By name first: the alias may be the name of an attribute of a base class, such as `Step.columns`.
+        # The name is searched first, because the alias may be the name of an attribute of a base class, such as
+        # `Step.columns`.
         meaning = meanings.get(name) or meanings[key]
         yield f"`{prefix}{key}`", default(model, name), relative(meaning)
         if field.discriminator:
@@ -51,7 +52,7 @@ def rows(model: type[Strict], prefix: str = "") -> Iterator[tuple[str, str, str]
 
 
 def _models_in(annotation: object) -> Iterator[tuple[str, type[Strict]]]:
-    """Yield the models in an annotation, each with the text between its key and that of its field."""
+    """Yield each model in an annotation, after the mark that its keys have: `[]` for a list, `.*` for a mapping."""
     if inspect.isclass(annotation) and issubclass(annotation, Strict):
         yield "", annotation
         return
@@ -73,7 +74,7 @@ def default(model: type[Strict], name: str) -> str:
         return "none"
     if isinstance(value, Strict):
         return "all defaults"
-    # Without its alias, which has no meaning outside of its model.
+    # The alias is removed, because it has no meaning outside of its model.
     bare = Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
     adapter: TypeAdapter[Any] = TypeAdapter(cast("Any", bare))
     return f"`{_yaml(adapter.dump_python(value, mode='json'))}`"

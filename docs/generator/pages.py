@@ -42,7 +42,9 @@ from sim_backends.world.world import SHIPPED as WORLDS
 from sim_backends.world.world import World
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "reference"
-_MARKS: Final = "`[]` means each item of a list, `*` each name of a mapping. Values: [quantities](../values.md)."
+_MARKS: Final = (
+    "`[]` means each item of a list, `*` each name of a mapping. [Values](../values.md) describes quantities."
+)
 
 
 def pages() -> dict[str, str]:
@@ -87,7 +89,7 @@ def step_capabilities() -> str:
 
 
 def _line_in(capability: type) -> Callable[[str], int]:
-    """Return the function that gives the position of a method in its class."""
+    """Return a function that returns the position of a method in its class."""
     return list(vars(capability)).index
 
 
@@ -101,23 +103,26 @@ def index() -> str:
     """Return the first page of the reference."""
     entries = (
         ("[Commands](commands.md)", "every command with its arguments"),
-        ("[Exit codes](exit-codes.md)", "of all commands"),
+        ("[Exit codes](exit-codes.md)", "exit codes of all commands"),
         ("[Site file](site-file.md)", "`fieldkit.yaml`: robots and roles of a lab"),
         ("[Robot profile](robot-profile.md)", "`robots/NAME.yaml`"),
         ("[Procedure](procedure.md)", "`procedures/NAME.yaml`"),
         ("[Steps](steps.md)", "the kinds of step of a procedure"),
-        ("[Capabilities of steps](step-capabilities.md)", "for a kind of step of your own"),
+        ("[Capabilities of steps](step-capabilities.md)", "optional methods of your own kind of step"),
         ("[Campaign file](campaign-file.md)", "the file of `fieldkit campaign`"),
         ("[Scenario file](scenario-file.md)", "`scenarios/NAME.yaml` of the co-simulation"),
         ("[Options of simulators](simulator-options.md)", "`physics.options` and `network.options` of a scenario"),
         ("[World file](world-file.md)", "`worlds/NAME.yaml` of emulated robots and of the co-simulation"),
         ("[Values in files](../values.md)", "quantities with units, YAML, expectations"),
         ("[Trial folder](../trial-folder.md)", "files of a trial"),
-        ("[Options of pytest](pytest-options.md)", "of the pytest plugin"),
-        ("[Columns](columns.md)", "of `trial.csv`, `summary.csv` and comparisons"),
+        ("[Options of pytest](pytest-options.md)", "options of the pytest plugin"),
+        ("[Columns](columns.md)", "columns of `trial.csv`, `summary.csv` and comparisons"),
         ("[Rows of tables](table-rows.md)", "the column of each row that `trial`, `aggregate` and `report` print"),
         ("[Tables of a recording](recording-tables.md)", "packets, states and windows of a co-simulation"),
-        ("[Classes of the co-simulation](cosim-protocols.md)", "for a sync policy, physics or network of your own"),
+        (
+            "[Classes of the co-simulation](cosim-protocols.md)",
+            "for your own sync policy, physics or network",
+        ),
         ("[JSON events](events.md)", "output of `--json`"),
         ("[Rules and layouts of the federate protocol](federate-protocol.md)", "messages of external federates"),
         ("[Test vectors of federates](federate-vectors.md)", "frames of the protocol of external federates"),
@@ -167,9 +172,9 @@ def procedure() -> str:
         keys_table(Procedure),
         "## Keys of every step",
         table(HEAD, rows(Step)),
-        "With a `name`, a step works as without one, but the names of its jobs, its files and its columns begin with "
-        "it: `up.listen`, `up.recv.bag`, `up.file_loss`. The `paper_*` columns of a transfer use the ping that has "
-        "the same name. [Kinds of step](steps.md).",
+        "If a step has a `name`, the names of its jobs, its files and its columns begin with it: `up.listen`, "
+        "`up.recv.bag`, `up.file_loss`. The `paper_*` columns of a transfer use the ping that has the same name. "
+        "[Steps](steps.md) lists the kinds of step.",
         "## for",
         _dedented(loops.__doc__),
         table(
@@ -192,8 +197,9 @@ def steps() -> str:
     built_in = {kind: model for kind, model in step_types().items() if model.__module__.startswith("fieldkit.")}
     blocks = [
         (
-            "The keys of each kind of step, in addition to those of [every step](procedure.md#keys-of-every-step). "
-            f"Packages can add kinds: [add a procedure](../add-a-procedure.md). {_MARKS}"
+            "This page lists the keys of each kind of step, in addition to those of [every "
+            "step](procedure.md#keys-of-every-step). Packages can [add "
+            f"kinds](../add-a-procedure.md#add-a-kind-of-step). {_MARKS}"
         ),
         table(
             ("step", "purpose"),
@@ -279,8 +285,8 @@ def columns() -> str:
     files = {"trial.csv": trial, "summary.csv": summary, "fieldkit compare": declared(DifferenceRow)}
     blocks = [
         (
-            "`fieldkit columns` prints the same; `fieldkit columns PROCEDURE` the columns that a procedure fills. "
-            "A missing value is empty, never 0. More: [trial folder](../trial-folder.md#columns)."
+            "`fieldkit columns` prints this list; `fieldkit columns PROCEDURE` prints those that a procedure fills. "
+            "A missing value is empty, never 0. See also [trial folder](../trial-folder.md#columns)."
         ),
     ]
     for name, file_columns in files.items():
@@ -306,7 +312,8 @@ def json_events() -> str:
     blocks = [
         (
             "`fieldkit trial`, `resume`, `campaign` and `check` with `--json` print one JSON object per line, with "
-            "`event`, `utc_ns` and the fields below. How a program answers requests: [automation](../automation.md)."
+            "`event`, `utc_ns` and the fields below. [Automation](../automation.md) describes how a program answers "
+            "requests."
         ),
     ]
     for record in _event_types():

@@ -14,7 +14,7 @@ from sim_backends.federates.named import federates
 from sim_backends.federates.simulator_options import SimulatorOptions
 
 _UNITS: Final = {"_per_s": "1/s", "_m_s2": "m/s²", "_bytes": "bytes", "_s": "s", "_m": "m"}
-"""Unit of a key by its ending; the first one that fits."""
+"""Units of keys by the ending of the key; the first matching ending applies."""
 _TYPES: Final[Mapping[object, str]] = {bool: "`true`, `false`", int: "integer", float: "number", str: "text"}
 _BOUNDS: Final = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
 
@@ -79,7 +79,7 @@ def values(annotation: Any, metadata: Any = (), unit: str = "") -> str:  # noqa:
 
 
 def _with_items(kind: object, parts: list[Any], unit: str) -> str:
-    """Return the description of a choice, a mapping or a list."""
+    """Return the description of the values of a choice, a mapping or a list."""
     if kind is Literal:
         return ", ".join(f"`{part}`" for part in parts)
     if kind is dict:

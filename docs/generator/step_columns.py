@@ -63,8 +63,8 @@ def table_rows() -> str:
     )
     return page(
         "Rows of tables",
-        "Rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns in `trial.csv`. "
-        "FLOW is `transfer`, `iperf3`, `soak` or `topic`. After a reboot; other faults have the same rows. "
-        "[Losses and marks](../glossary.md).",
+        "This page lists the rows of the tables of `trial`, `aggregate`, `compare` and `report`, with their columns "
+        "in `trial.csv`. FLOW is `transfer`, `iperf3`, `soak` or `topic`. Flows have the rows of a reboot also for "
+        "other faults. The [glossary](../glossary.md) explains losses and marks.",
         table(("row", "column", "meaning"), lines),
     )

@@ -1,4 +1,4 @@
-"""Cells: the repeats under one condition, aggregated into estimates with intervals."""
+"""Cells: repeats under the same condition, aggregated into estimates with intervals."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,12 +29,12 @@ Indices = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class RepeatValues:
-    """The values of the single repeats of an estimate, each array of shape (n,).
+    """The values of the repeats of an estimate; all arrays have shape (n,).
 
     Attributes:
-        low: Value of each repeat; its lower bound if it is censored.
-        high: Upper bound of the value of each repeat: infinity if it is censored, or if the statistic over all sent
-            items (see `columns.Figure.of_sent`) is infinite.
+        low: Value of each repeat; the lower bound of the value if it is censored.
+        high: Upper bound of the value of each repeat; infinity if the value is censored, or if the statistic over all
+            sent items (see `columns.Figure.of_sent`) is infinite.
         lost: Number of lost items, or 1 for true; None unless the quantity is counted or a flag.
         sent: Number of sent items, or 1 for a flag.
     """
@@ -52,11 +52,11 @@ class Estimate:
     Attributes:
         quantity: The quantity.
         n: Number of valid repeats that have a value.
-        value: The point estimate, by the quantity's kind: share of all counted items, mean or median.
+        value: The point estimate: share of all counted items, mean or median, depending on the quantity's kind.
         low: Lower end of the 95 % interval, with repeats as sampling units; None for a single repeat.
-        high: Upper end; None for a single repeat, and if it is open because of censored repeats.
-        assured: Coverage of the interval for any distribution of the repeats; None unless it is a median of at least
-            two repeats.
+        high: Upper end of the interval; None for a single repeat, and if it is open because of censored repeats.
+        assured: Coverage of the interval for any distribution of the repeats; None unless the estimate is a median of
+            at least two repeats.
         p_order: p-value of the independence of the repeats in time (`independence.p_values`), corrected for the
             number of all estimates; None if it was not tested.
         wilson_low: Lower end of the 95 % Wilson interval, which assumes that all counted items are independent; None
@@ -71,11 +71,11 @@ class Estimate:
         minimum: Smallest value of a repeat.
         maximum: Largest value of a repeat.
         n_censored: Number of repeats among `n` with a right-censored value.
-        is_lower_bound: Whether `value` is a lower bound because of censored values.
+        is_lower_bound: True if `value` is a lower bound because of censored values.
         missing: Number of valid repeats of the cell without a value.
-        high_of_sent: Upper end of the interval if the value of lost items is infinite; None if it is
-            open. It equals `high` for quantities that are not computed from received items only.
-        sample: Values of the single repeats; None for an estimate that was not computed from repeats.
+        high_of_sent: Upper end of the interval if lost items have an infinite value; None if this end is open. It
+            equals `high`, except for quantities that are computed only from received items.
+        sample: Values of the repeats; None for an estimate that was not computed from repeats.
     """
 
     quantity: Quantity
@@ -108,16 +108,16 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Cell:
-    """The repeats under one condition.
+    """The repeats under the same condition.
 
     Attributes:
         key: Value of each column that identifies the condition, in the requested order; "" or None if missing.
         n_valid: Number of valid repeats, from which all estimates are computed.
         n_void: Number of attempts with incomplete evidence.
         n_failed: Number of attempts that failed.
-        estimates: Estimates by name of the quantity, in the order of quantities. Quantities that no valid repeat has
+        estimates: Estimates by name of the quantity, in the order of quantities. Quantities without a valid repeat
             are omitted.
-        tallies: Word counts by name of the column, in order. Columns that no valid repeat has are omitted.
+        tallies: Word counts by name of the column, in order. Columns without a valid repeat are omitted.
         payload_bytes: ICMP payload sizes of the valid repeats, ascending, by the name of each quantity that depends
             on them; see `Quantity.payload`.
         quantities_without_value: Quantities that were measured in the valid repeats, but have no value in any of
@@ -141,7 +141,7 @@ def aggregate(
     quantities: Sequence[Quantity] | None = None,
     words: Sequence[Column] | None = None,
 ) -> tuple[Cell, ...]:
-    """Return one cell per condition, sorted by the columns `by` in their order; distances are sorted by length.
+    """Return one cell per condition, sorted by the columns `by`; distances are sorted by length.
 
     Args:
         repeats: Attempts of repeats, including void and failed attempts.
@@ -167,13 +167,13 @@ def aggregate(
         for cell, tally in tallies(column, words_with_cell):
             tallies_by_cell[cell][column.name] = tally
     named_keys = (dict(zip(by, key, strict=True)) for key in keys)
-    chosen = repeats.quantities if quantities is None else quantities
+    selected = repeats.quantities if quantities is None else quantities
     ends = np.searchsorted(cells[rows], np.arange(1, len(keys)))  # rows of a cell are adjacent
     rows_by_cell = np.split(rows, ends) if keys else []
-    payloads = [_payload_sizes(repeats, chosen, cell_rows) for cell_rows in rows_by_cell]
+    payloads = [_payload_sizes(repeats, selected, cell_rows) for cell_rows in rows_by_cell]
     without_value = [
-        _quantities_without_value(repeats, chosen, cell_rows, of_cell)
-        for cell_rows, of_cell in zip(rows_by_cell, estimates, strict=True)
+        _quantities_without_value(repeats, selected, cell_rows, cell_estimates)
+        for cell_rows, cell_estimates in zip(rows_by_cell, estimates, strict=True)
     ]
     cell_fields = zip(
         named_keys, valid, void, failed, estimates, tallies_by_cell, payloads, without_value, strict=True
@@ -261,17 +261,18 @@ def _estimates(repeats: Repeats, quantity: Quantity, rows: Indices, cells: Indic
     sizes = np.diff(starts, append=len(rows))
     for n in np.unique(sizes):
         same_size = starts[sizes == n]
-        chosen = rows[same_size[:, None] + np.arange(n)]
-        yield from zip(cell_of_row[same_size].tolist(), _same_size_estimates(repeats, quantity, chosen), strict=True)
+        cell_rows = rows[same_size[:, None] + np.arange(n)]
+        estimates = _same_size_estimates(repeats, quantity, cell_rows)
+        yield from zip(cell_of_row[same_size].tolist(), estimates, strict=True)
 
 
-def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) -> Iterator[Estimate]:
-    """Yield the estimates of cells with the same number of repeats, whose rows are `chosen`, shape (cells, n)."""
+def _same_size_estimates(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> Iterator[Estimate]:
+    """Yield the estimates of cells with the same number of repeats, whose rows are `cell_rows`, shape (cells, n)."""
     observed, is_bound = repeats.observed(quantity)
-    values, censored = observed[chosen], is_bound[chosen]
+    values, censored = observed[cell_rows], is_bound[cell_rows]
     upper = np.where(censored, np.inf, values)
-    of_sent = _upper_of_sent(repeats, quantity, chosen, upper)
-    counts = _counts(repeats, quantity, chosen)
+    of_sent = _upper_of_sent(repeats, quantity, cell_rows, upper)
+    counts = _counts(repeats, quantity, cell_rows)
     mean, median, p95 = values.mean(axis=1), np.median(values, axis=1), np.percentile(values, 95, axis=1)
     if counts is not None:
         lost, sent = (count.sum(axis=1) for count in counts)
@@ -295,7 +296,7 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) 
         point_estimates.value.tolist(),
         *map(_or_none, (point_estimates.low, point_estimates.high)),
         [coverage] * len(values),
-        _or_none(_p_order(repeats, quantity, chosen)),
+        _or_none(_p_order(repeats, quantity, cell_rows)),
         *map(_or_none, (pooled.low, pooled.high)),
         *counted,
         *(column.tolist() for column in (mean, median, p95, values.min(axis=1), values.max(axis=1))),
@@ -310,18 +311,18 @@ def _same_size_estimates(repeats: Repeats, quantity: Quantity, chosen: Indices) 
 
 
 def _upper_of_sent(
-    repeats: Repeats, quantity: Quantity, chosen: Indices, upper: NDArray[np.float64]
+    repeats: Repeats, quantity: Quantity, cell_rows: Indices, upper: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return upper bounds of the values if lost items have an infinite value; infinity if unknown."""
+    """Return upper bounds of the values, with infinite values for lost items; infinity if unknown."""
     if quantity.of_sent is None:
         return upper
     column = repeats.numbers.get(quantity.of_sent)  # tables of earlier versions do not have the column
-    of_sent = np.full_like(upper, np.nan) if column is None else column[chosen]
+    of_sent = np.full_like(upper, np.nan) if column is None else column[cell_rows]
     return np.where(np.isnan(of_sent), np.inf, np.maximum(of_sent, upper))
 
 
 def _mean_or_median(quantity: Quantity, values: NDArray[np.float64], upper: NDArray[np.float64]) -> Intervals:
-    """Return the mean or median over repeats, for quantities that are not counted."""
+    """Return the mean or median over repeats of a quantity that is not counted."""
     least, most = quantity.possible
     if quantity.kind is Kind.MEDIAN:
         return medians(values, least, most, upper=upper)
@@ -331,31 +332,31 @@ def _mean_or_median(quantity: Quantity, values: NDArray[np.float64], upper: NDAr
     return Intervals(mean.value, np.maximum(mean.low, least), np.minimum(mean.high, most))
 
 
-def _p_order(repeats: Repeats, quantity: Quantity, chosen: Indices) -> NDArray[np.float64]:
-    """Return the p-value of independence in time of each cell; NaN if a start time is unknown, and for flags."""
+def _p_order(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> NDArray[np.float64]:
+    """Return the p-value of the independence in time of each cell; NaN for flags, or if a start time is unknown."""
     if quantity.kind is Kind.FLAG or "started_utc_ns" not in repeats.numbers:
-        return np.full(len(chosen), np.nan)
-    if chosen.shape[1] < MIN_FOR_INDEPENDENCE_TESTS:
-        return np.full(len(chosen), np.nan)
+        return np.full(len(cell_rows), np.nan)
+    if cell_rows.shape[1] < MIN_FOR_INDEPENDENCE_TESTS:
+        return np.full(len(cell_rows), np.nan)
     from fieldkit.analysis import independence  # noqa: PLC0415 (few repeats cannot be tested)
 
-    p_values = independence.p_values(repeats.observed(quantity)[0][chosen])
-    return np.where(np.isnan(repeats.numbers["started_utc_ns"][chosen]).any(axis=1), np.nan, p_values)
+    p_values = independence.p_values(repeats.observed(quantity)[0][cell_rows])
+    return np.where(np.isnan(repeats.numbers["started_utc_ns"][cell_rows]).any(axis=1), np.nan, p_values)
 
 
-def _counts(repeats: Repeats, quantity: Quantity, chosen: Indices) -> tuple[NDArray[np.float64], ...] | None:
-    """Return the numbers of lost and of sent items per repeat; for a flag, its values and ones.
+def _counts(repeats: Repeats, quantity: Quantity, cell_rows: Indices) -> tuple[NDArray[np.float64], ...] | None:
+    """Return the numbers of lost and of sent items of each repeat. For a flag, these are its values and ones.
 
     The result is None for other quantities. A number of lost items can be negative: with segmentation offload, the
-    paper's filter matches other frames at either end.
+    paper's filter matches different frames at the two ends.
     """
     if quantity.kind is Kind.FLAG:
-        flags = repeats.numbers[quantity.name][chosen]
+        flags = repeats.numbers[quantity.name][cell_rows]
         return flags, np.ones_like(flags)
     if quantity.arrived is None or quantity.sent is None:
         return None
-    sent = repeats.numbers[quantity.sent][chosen]
-    return sent - repeats.numbers[quantity.arrived][chosen], sent
+    sent = repeats.numbers[quantity.sent][cell_rows]
+    return sent - repeats.numbers[quantity.arrived][cell_rows], sent
 
 
 def _or_none(bound: NDArray[np.float64]) -> list[float | None]:

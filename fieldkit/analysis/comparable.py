@@ -1,4 +1,4 @@
-"""Comparability of two runs: differences in conditions that make their numbers incomparable."""
+"""Comparability of two runs: differences between their conditions that make their numbers incomparable."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -27,24 +27,24 @@ SAME: Final = (
 """Columns that must have the same values in both runs."""
 
 VARIED: Final = frozenset({"distance_m"})
-"""Columns among `SAME` that may be the variable of a comparison. Another protocol or topology changes too many
-conditions.
+"""Columns of `SAME` that may be the variable of a comparison. Protocol and topology are excluded, because they change
+too many conditions.
 """
 
 _KERNEL_COLUMNS: Final = frozenset({"tcp_congestion_control"})
-"""Columns of the robots' operating systems. A comparison of backends includes their difference: the kernels of real
-robots, of the laptop that emulates them, or the TCP of a simulation."""
+"""Columns of the operating systems. They may differ in a comparison of backends, which have the kernels of real
+robots, the kernel of the laptop that emulates robots, or the TCP of a simulation."""
 
 _IDENTITY_COLUMNS: Final = frozenset({"profiles_sha256", "procedure_sha256"})
 
 SIZE_TOLERANCE: Final = 0.05
-"""Largest acceptable difference of the median sent sizes, as a share of the smaller one."""
+"""Maximum difference of the median sent sizes, as a share of the smaller size."""
 
 _MIXTURES: Final = (
     (
         "code_sha256",
         "schema_version",
-        "Different versions of fieldkit ran these trials; each trial was measured by its version unless rebuilt.",
+        "Different versions of fieldkit measured these trials; fieldkit rebuild measures them with the same version.",
     ),
     ("profiles_sha256", "topology", "The robots or their profiles differ between trials of the same topology."),
     ("procedure_sha256", "procedure", "A procedure differs between its trials."),
@@ -56,14 +56,14 @@ _PAYLOAD: Final = "rtt_payload_bytes"
 MIXTURE_COLUMNS: Final = frozenset(
     (*(name for column, grouping, _ in _MIXTURES for name in (column, grouping)), _PAYLOAD)
 )
-"""Columns that `mixtures` needs in addition to the columns that identify conditions."""
+"""Columns that `mixtures` needs, in addition to the columns that identify conditions."""
 
 MARKS: Final = "marks"
 """Column with the marks of a repeat: conditions that can explain a difference."""
 NO_MARKS: Final = "none"
 MARK_SEPARATOR: Final = " and "
 _HARMLESS_MARKS: Final = frozenset({"no time source"})
-"""Marks that affect no figure, because fieldkit measures the offsets of clocks itself."""
+"""Marks that affect no figure: fieldkit measures the offsets of clocks, so time sources are not needed."""
 
 _RADIO_COLUMNS: Final = (
     "sender_channel",
@@ -71,13 +71,13 @@ _RADIO_COLUMNS: Final = (
     "sender_regulatory_domain",
     "receiver_regulatory_domain",
 )
-"""Settings of the radios whose difference is noted."""
+"""Settings of the radios. A difference causes a note."""
 
 _MESSAGES: Final = 2
-"""Acceptable difference of recorded sizes in messages, because a recorder starts and stops between two messages."""
+"""Maximum difference of recorded sizes in messages. A recorder starts and stops between two messages."""
 
 DATAGRAM_FACTOR: Final = 1.5
-"""Largest acceptable ratio of datagram sizes: netcat sends 8,192 or 16,384 bytes, and less at the end of a file."""
+"""Maximum ratio of datagram sizes: netcat sends 8,192 or 16,384 bytes, and fewer at the end of a file."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ class Concern:
     Attributes:
         what: The column, or a description of a value that is computed from columns.
         a: Value of A as text; `unknown` if its rows do not contain it.
-        b: Value of B.
-        cells: Names of the affected conditions; empty for all.
-        refuses: Whether the difference makes the runs incomparable; otherwise it is only a note.
+        b: Value of B as text; `unknown` if its rows do not contain it.
+        cells: Names of the affected conditions; empty if all conditions are affected.
+        refuses: True if the difference makes the runs incomparable; otherwise it is only a note.
     """
 
     what: str
@@ -115,7 +115,7 @@ def concerns(
     value in each run; it then causes no refusal.
 
     Args:
-        pairs: Name of each condition, and its valid repeats in A and in B, at least one each.
+        pairs: Name of each condition, and its valid repeats in A and in B; at least one in each run.
         by: Columns that identify a condition.
         varied: Further columns that may be the variable of the comparison.
     """
@@ -131,7 +131,7 @@ def concerns(
 
 
 def mixtures(repeats: Repeats, by: Sequence[str] = DEFAULT_BY) -> Iterator[str]:
-    """Yield a sentence for each setting that differs within one run although the names of conditions are the same.
+    """Yield a sentence for each setting that differs within a run, although the conditions have the same name.
 
     Args:
         repeats: All attempts of the run.
@@ -173,11 +173,11 @@ def _pair_concerns(a: Repeats, b: Repeats, varied: Collection[str]) -> Iterator[
 
 
 def _compare_column(name: str, a: Repeats, b: Repeats, *, refuses: bool) -> Iterator[Concern]:
-    of_a, of_b = _values(name, a), _values(name, b)
-    unknown = UNKNOWN in {of_a, of_b}
+    text_a, text_b = _values(name, a), _values(name, b)
+    is_unknown = UNKNOWN in {text_a, text_b}
     # A column that is missing in both runs is not a difference, unless it identifies robots or procedure.
-    if of_a != of_b or (unknown and name in _IDENTITY_COLUMNS):
-        yield Concern(name, of_a, of_b, (), refuses and (not unknown or name in _IDENTITY_COLUMNS))
+    if text_a != text_b or (is_unknown and name in _IDENTITY_COLUMNS):
+        yield Concern(name, text_a, text_b, (), refuses and (not is_unknown or name in _IDENTITY_COLUMNS))
 
 
 def _values(name: str, rows: Repeats) -> str:
@@ -186,15 +186,15 @@ def _values(name: str, rows: Repeats) -> str:
 
 
 def _file_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    of_a, of_b = (_median(rows.numbers["sent_bytes"]) for rows in (a, b))
+    value_a, value_b = (_median(rows.numbers["sent_bytes"]) for rows in (a, b))
     message_a, message_b = (_bytes_per("bag_messages", rows) for rows in (a, b))
-    tolerance = np.fmax(SIZE_TOLERANCE * min(of_a, of_b), _MESSAGES * np.fmax(message_a, message_b))
-    yield from _compare_sizes("sent_bytes, median", of_a, of_b, tolerance)
+    tolerance = np.fmax(SIZE_TOLERANCE * min(value_a, value_b), _MESSAGES * np.fmax(message_a, message_b))
+    yield from _compare_sizes("sent_bytes, median", value_a, value_b, tolerance)
 
 
 def _datagram_sizes(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    of_a, of_b = (_bytes_per("datagrams_sent", rows) for rows in (a, b))
-    yield from _compare_sizes("bytes per datagram", of_a, of_b, (DATAGRAM_FACTOR - 1) * min(of_a, of_b))
+    value_a, value_b = (_bytes_per("datagrams_sent", rows) for rows in (a, b))
+    yield from _compare_sizes("bytes per datagram", value_a, value_b, (DATAGRAM_FACTOR - 1) * min(value_a, value_b))
 
 
 def _bytes_per(name: str, rows: Repeats) -> float:
@@ -203,11 +203,11 @@ def _bytes_per(name: str, rows: Repeats) -> float:
     return _median(rows.numbers["sent_bytes"] / np.where(counts > 0, counts, np.nan))
 
 
-def _compare_sizes(what: str, of_a: float, of_b: float, tolerance: float) -> Iterator[Concern]:
-    """Yield a concern if two sizes in bytes differ by more than `tolerance`, or if one of them is unknown (NaN)."""
-    n_known = int(np.isfinite([of_a, of_b]).sum())
-    if n_known == 1 or abs(of_a - of_b) > tolerance:
-        yield Concern(what, _bytes(of_a), _bytes(of_b), (), refuses=n_known == 2)
+def _compare_sizes(what: str, value_a: float, value_b: float, tolerance: float) -> Iterator[Concern]:
+    """Yield a concern if two sizes in bytes differ by more than `tolerance`, or if one size is unknown (NaN)."""
+    n_known = int(np.isfinite([value_a, value_b]).sum())
+    if n_known == 1 or abs(value_a - value_b) > tolerance:
+        yield Concern(what, _bytes(value_a), _bytes(value_b), (), refuses=n_known == 2)
 
 
 def _bytes(size: float) -> str:
@@ -220,13 +220,13 @@ def _median(values: Numbers) -> float:
 
 
 def _offload_state(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    of_a, of_b = (_offload_text(rows) for rows in (a, b))
-    if of_a != of_b:
-        yield Concern("segmentation offload", of_a, of_b, (), refuses=UNKNOWN not in {of_a, of_b})
+    value_a, value_b = (_offload_text(rows) for rows in (a, b))
+    if value_a != value_b:
+        yield Concern("segmentation offload", value_a, value_b, (), refuses=UNKNOWN not in {value_a, value_b})
 
 
 def _offload_text(rows: Repeats) -> str:
-    """Return `on` if the captures of any repeat have frames that only offload creates, otherwise `off`."""
+    """Return `on` if a capture contains frames that only offload creates, otherwise `off`."""
     frames = rows.numbers["tcp_superframes"]
     finite = frames[np.isfinite(frames)]
     if not len(finite):
@@ -235,16 +235,16 @@ def _offload_text(rows: Repeats) -> str:
 
 
 def _marks(a: Repeats, b: Repeats) -> Iterator[Concern]:
-    """Yield a concern for each mark that a different share of the repeats of A and B has.
+    """Yield a concern for each mark whose share of the repeats differs between A and B.
 
-    It is a note for marks that affect no figure, and if the marks of a run are not known.
+    The concern is only a note for marks that affect no figure, and if the marks of a run are unknown.
     """
     if MARKS not in a.texts or MARKS not in b.texts:
         return
-    of_a, of_b = ([set(marks.split(MARK_SEPARATOR)) for marks in rows.texts[MARKS]] for rows in (a, b))
-    is_known = all({""} != set().union(*of_run) for of_run in (of_a, of_b))
-    for name in sorted(set().union(*of_a, *of_b) - {"", NO_MARKS}):
-        count_a, count_b = (sum(name in marks for marks in of_run) for of_run in (of_a, of_b))
-        if count_a * len(of_b) != count_b * len(of_a):
-            texts = (f"it in {count_a} of {len(of_a)} repeats", f"it in {count_b} of {len(of_b)}")
+    value_a, value_b = ([set(marks.split(MARK_SEPARATOR)) for marks in rows.texts[MARKS]] for rows in (a, b))
+    is_known = all({""} != set().union(*run_marks) for run_marks in (value_a, value_b))
+    for name in sorted(set().union(*value_a, *value_b) - {"", NO_MARKS}):
+        count_a, count_b = (sum(name in marks for marks in run_marks) for run_marks in (value_a, value_b))
+        if count_a * len(value_b) != count_b * len(value_a):
+            texts = (f"it in {count_a} of {len(value_a)} repeats", f"it in {count_b} of {len(value_b)}")
             yield Concern(f"{MARKS}, {name}", *texts, (), refuses=is_known and name not in _HARMLESS_MARKS)

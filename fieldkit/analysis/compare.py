@@ -21,16 +21,16 @@ PAIRED_BY: Final = ("scenario", "topology", "distance_m", "protocol")
 
 @dataclass(frozen=True)
 class Difference:
-    """Difference of one quantity under one condition between both runs.
+    """Difference of one quantity under one condition between two runs.
 
     Attributes:
         quantity: The quantity.
         a: Estimate of A; None if A did not measure it.
         b: Estimate of B; None if B did not measure it.
         interval: B - A with its 95 % interval; None if one of the estimates has no interval.
-        cliffs_delta: Effect size over repeats, see `significance.cliffs_delta`; None unless both measured it.
+        cliffs_delta: Effect size over repeats (`significance.cliffs_delta`); None unless both runs measured it.
         p_holm: p-value, corrected for the number of all comparisons; None without an interval.
-        threshold: Largest acceptable difference; None if none was given.
+        threshold: Maximum acceptable difference; None without a threshold.
     """
 
     quantity: Quantity
@@ -43,17 +43,17 @@ class Difference:
 
     @property
     def value(self) -> float | None:
-        """B - A; None unless both measured it."""
+        """B - A; None unless both runs measured the quantity."""
         return None if self.a is None or self.b is None else self.b.value - self.a.value
 
     @property
     def excludes_zero(self) -> bool:
-        """Whether 0 is outside of the interval."""
+        """True if 0 is outside of the interval."""
         return self.interval is not None and not self.interval.low <= 0 <= self.interval.high
 
     @property
     def within(self) -> bool | None:
-        """Whether the whole interval is within plus or minus the threshold; None without a threshold."""
+        """True if the whole interval is within plus or minus the threshold; None without a threshold."""
         if self.threshold is None:
             return None
         return self.interval is not None and max(-self.interval.low, self.interval.high) <= self.threshold
@@ -65,7 +65,7 @@ class Pair:
 
     Attributes:
         name: Name of the condition, such as `los, master, 9.144 m, udp`.
-        key: Value of each column that identifies it.
+        key: Value of each column that identifies the condition.
         a: The cell of A; None if A has no such condition.
         b: The cell of B; None if B has no such condition.
         differences: Differences of the quantities that either cell has.
@@ -84,7 +84,7 @@ class Pair:
 
     @property
     def words(self) -> tuple[tuple[Tally, Tally], ...]:
-        """Word counts of A and B for each column of words that either cell has; empty for a cell without words."""
+        """Word counts of A and B for each column of words in either cell; a cell without words has empty counts."""
         a, b = (cell.tallies if cell else {} for cell in (self.a, self.b))
         empty = {name: replace(tally, counts={}) for name, tally in (*a.items(), *b.items())}
         return tuple((a.get(name, tally), b.get(name, tally)) for name, tally in empty.items())
@@ -111,17 +111,17 @@ class Comparison:
 
     @property
     def n_compared(self) -> int:
-        """Number of differences that have an interval, for which `p_holm` is corrected."""
+        """Number of differences with an interval. `p_holm` is corrected for this number."""
         return sum(difference.interval is not None for difference in self.differences)
 
     @property
     def refusals(self) -> tuple[Concern, ...]:
-        """Reasons why the runs are not comparable; empty if they are."""
+        """Reasons why the runs are not comparable; empty if they are comparable."""
         return tuple(concern for concern in self.concerns if concern.refuses)
 
     @property
     def varied(self) -> tuple[Concern, ...]:
-        """Variables of the comparison: each run has one value, and they do not identify conditions."""
+        """Variables of the comparison: columns that have one value in each run, and do not identify conditions."""
         return tuple(
             concern
             for concern in self.concerns
@@ -132,7 +132,7 @@ class Comparison:
 
     @property
     def exceeds_threshold(self) -> bool:
-        """Whether any difference with a threshold is not shown to be within it."""
+        """True if a difference is not shown to be within its threshold."""
         return any(difference.within is False for difference in self.differences)
 
 
@@ -144,35 +144,35 @@ def compare(
     thresholds: Mapping[str, float] | None = None,
     varied: Collection[str] = (),
 ) -> Comparison:
-    """Compare two runs, with repeats as sampling units; the runs are assumed to be independent.
+    """Compare two runs, which are assumed to be independent. Repeats are the sampling units.
 
     Args:
         a: All attempts of A.
         b: All attempts of B.
         by: Columns that identify a condition.
-        thresholds: Largest acceptable difference by name of the quantity, in its unit.
+        thresholds: Maximum acceptable difference by name of the quantity, in its unit.
         varied: Columns that may differ, because they are the variable of the comparison.
     """
-    compared = _quantities(a, b)
+    all_quantities = _quantities(a, b)
     cells_a, cells_b = (_cells(rows, by) for rows in (a, b))
     rows_a, rows_b = (_valid(rows, by) for rows in (a, b))
     pairs = []
     for key in cells_a | cells_b:
         sides = cells_a.get(key), cells_b.get(key)
-        differences = _differences(sides, (rows_a.get(key), rows_b.get(key)), compared, thresholds or {})
+        differences = _differences(sides, (rows_a.get(key), rows_b.get(key)), all_quantities, thresholds or {})
         pairs.append(Pair(_condition_name(by, key), dict(zip(by, key, strict=True)), *sides, differences))
-    both = [(_condition_name(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
-    return Comparison(tuple(by), _with_holm(pairs), (*comparable.concerns(both, by, varied), *comparable.notes(a, b)))
+    common = [(_condition_name(by, key), rows_a[key], rows_b[key]) for key in rows_a if key in rows_b]
+    return Comparison(
+        tuple(by), _with_holm(pairs), (*comparable.concerns(common, by, varied), *comparable.notes(a, b))
+    )
 
 
 def _quantities(a: Repeats, b: Repeats) -> tuple[Quantity, ...]:
     """Return the quantities of either run, in the order of tables."""
-    has_either = {quantity.name for rows in (a, b) for quantity in rows.quantities}
+    names = {quantity.name for rows in (a, b) for quantity in rows.quantities}
     columns = {column.name: column for column in (*b.columns, *a.columns)}
     ordered = dict.fromkeys(column.name for column in (*a.columns, *b.columns))
-    return tuple(
-        quantity for quantity in quantities(columns[name] for name in ordered) if quantity.name in has_either
-    )
+    return tuple(quantity for quantity in quantities(columns[name] for name in ordered) if quantity.name in names)
 
 
 def _cells(rows: Repeats, by: Sequence[str]) -> dict[Key, Cell]:
@@ -219,7 +219,7 @@ def _interval(a: Estimate, b: Estimate) -> Interval | None:
 
 
 def _with_holm(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
-    """Return pairs whose p-values are corrected for the number of the differences of all conditions."""
+    """Return pairs with p-values that are corrected for the number of differences of all conditions."""
     intervals = [
         difference.interval for pair in pairs for difference in pair.differences if difference.interval is not None
     ]
@@ -237,7 +237,7 @@ def _with_holm(pairs: Sequence[Pair]) -> tuple[Pair, ...]:
 
 
 def _condition_name(by: Sequence[str], key: Key) -> str:
-    """Return the name of a condition: `los, master, 9.144 m, udp`."""
+    """Return the name of a condition, such as `los, master, 9.144 m, udp`."""
     units = {"distance_m": " m"}
     return ", ".join(
         f"no {name}" if value in {"", None} else f"{cell(value)}{units.get(name, '')}"

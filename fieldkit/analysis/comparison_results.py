@@ -1,4 +1,4 @@
-"""Results of comparisons: verdicts and conclusions in words, CSV and JSON."""
+"""Results of comparisons: verdicts and conclusions as text, tables as CSV and JSON."""
 
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -15,11 +15,11 @@ from fieldkit.core.text import json_text
 from fieldkit.core.units import format_count
 
 NOT_JUDGED: Final = "words are counted, not judged"
-"""Verdict of a comparison of word counts, which has no interval."""
+"""Verdict on word counts, whose comparison has no interval."""
 
 
 def difference_rows(comparison: Comparison) -> Iterator[tuple[Pair, DifferenceRow]]:
-    """Yield each condition with each of its rows: one per quantity, or a single row if there is no quantity."""
+    """Yield conditions and their rows. A condition has a row per quantity, or one row if it has no quantity."""
     for pair in comparison.pairs:
         missing_in = pair.missing_in or None
         rows = [_difference_row(difference, missing_in, comparison.n_compared) for difference in pair.differences]
@@ -78,9 +78,9 @@ def _difference_row(difference: Difference, missing_in: str | None, comparisons:
 
 
 def _word_rows(a: Tally, b: Tally, missing_in: str | None) -> Iterator[DifferenceRow]:
-    """Yield a row per word that either run has in a column."""
+    """Yield a row for each word in a column of either run."""
     for word in dict.fromkeys((*a.counts, *b.counts)):
-        of_a, of_b = a.share(word), b.share(word)
+        share_a, share_b = a.share(word), b.share(word)
         yield DifferenceRow(
             missing_in=missing_in,
             quantity=a.quantity(word),
@@ -88,15 +88,15 @@ def _word_rows(a: Tally, b: Tally, missing_in: str | None) -> Iterator[Differenc
             estimate=Kind.WORDS,
             n_a=a.n or None,
             n_b=b.n or None,
-            a=of_a,
-            b=of_b,
-            difference=None if of_a is None or of_b is None else of_b - of_a,
+            a=share_a,
+            b=share_b,
+            difference=None if share_a is None or share_b is None else share_b - share_a,
             verdict=NOT_JUDGED,
         )
 
 
 def verdict(difference: Difference, comparisons: int) -> str:
-    """Return the verdict on a difference: `B 3.10 points more [1.20, 5.00]`.
+    """Return the verdict on a difference, such as `B 3.10 points more [1.20, 5.00]`.
 
     Args:
         difference: The difference.
@@ -114,8 +114,8 @@ def verdict(difference: Difference, comparisons: int) -> str:
         if not is_significant(difference):
             text += f"; may be chance among {comparisons}"
     else:
-        most = max(abs(difference.interval.low), abs(difference.interval.high))
-        text = f"no difference seen; up to {_amount(most, difference)} possible"
+        largest = max(abs(difference.interval.low), abs(difference.interval.high))
+        text = f"no difference seen; up to {_amount(largest, difference)} possible"
     return text + _threshold(difference)
 
 

@@ -23,7 +23,7 @@ def _schema(folder: Path) -> pa.Schema:
     """Return the schema of a dataset.
 
     Raises:
-        EvidenceError: It has no file, or its file is damaged.
+        EvidenceError: The dataset has no file, or its first file is damaged.
     """
     first = next(iter(sorted(folder.rglob("*.parquet"))), None)
     if first is None:
@@ -39,17 +39,17 @@ def _metadata(folder: Path, key: str) -> object:
 
 
 def condition(folder: Path) -> dict[str, str]:
-    """Return the columns that identify a condition: the flow and the factors of the sweep; errors as `read`.
+    """Return the columns that identify a condition, the flow and the factors of the sweep; raises as `read`.
 
     Returns:
-        For each column, in order, the column that has its values as written in the command of the sweep.
+        The columns in order. The value is the column with the same values as written in the command of the sweep.
     """
     by, partitions = ([*map(str, _metadata(folder, key))] for key in ("by", "partitions"))  # type: ignore[call-overload]
     return dict(zip(by, (*by[:1], *partitions), strict=True))
 
 
 def declared_columns(folder: Path) -> tuple[Column, ...]:
-    """Return the columns that the dataset declares; errors as `read`."""
+    """Return the columns that the dataset declares; raises as `read`."""
     partitions = dict(_metadata(folder, "partitions") or {})  # type: ignore[call-overload]
     return (
         *(Column(name, "text", meaning) for name, meaning in partitions.items()),
@@ -58,7 +58,7 @@ def declared_columns(folder: Path) -> tuple[Column, ...]:
 
 
 def names(folder: Path) -> tuple[str, ...]:
-    """Return the names of all columns; errors as `read`."""
+    """Return the names of all columns; raises as `read`."""
     return tuple(dict.fromkeys((*(column.name for column in declared_columns(folder)), *_schema(folder).names)))
 
 
@@ -70,7 +70,7 @@ def read(folder: Path, declared: Mapping[str, Column]) -> tuple[dict[str, Number
     """
     partitions = pa.schema([(name, pa.string()) for name in dict(_metadata(folder, "partitions") or {})])  # type: ignore[call-overload]
     partitioning = pa.dataset.partitioning(partitions, flavor="hive")
-    base = folder.absolute()  # threads of pyarrow open the files; their working folder may differ
+    base = folder.absolute()  # pyarrow opens the files in threads, which may have another working folder
     try:
         dataset = pa.dataset.dataset(
             sorted(map(str, base.rglob("*.parquet"))),

@@ -1,4 +1,4 @@
-"""Removal of attempts that are in several tables; tables that contradict each other are an error."""
+"""Removal of duplicate attempts from the combined rows of several tables. Contradictory tables are an error."""
 
 from collections import Counter
 
@@ -34,6 +34,7 @@ def deduplicated(repeats: Repeats) -> tuple[Repeats, tuple[str, ...]]:
 
 
 def _check_equal(kept: Repeats, other: Repeats) -> None:
+    """Raise an error if two tables have different values in the same row."""
     differ = {name: column != other.texts[name] for name, column in kept.texts.items() if name != SOURCE}
     for name, column in kept.numbers.items():
         differ[name] = (column != other.numbers[name]) & ~(np.isnan(column) & np.isnan(other.numbers[name]))
@@ -43,5 +44,5 @@ def _check_equal(kept: Repeats, other: Repeats) -> None:
                 f"{kept.name(index)} of {kept.texts['trial'][index]} has another {name} "
                 f"than in {kept.texts[SOURCE][index]}",
                 where=other.texts[SOURCE][index],
-                remedy="give only one of the two",
+                remedy="name only one of these two sources",
             )

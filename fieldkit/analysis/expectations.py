@@ -19,15 +19,15 @@ _TEXT: Final = re.compile(
 )
 _FORMS: Final = "ip_loss < 2 %; every rtt_gap_s < 300 ms; 90 % of rtt_gap_s < 300 ms; ip_loss < 2 % of all packets"
 MAX_SHARE: Final = 0.9999
-"""Largest share of all repeats that an expectation may require."""
+"""Maximum share of all repeats that an expectation may require."""
 _MIN_LOSS: Final = 1e-9
 
 
 class Scope(StrEnum):
     """Subject of an expectation.
 
-    `figure`: the estimate over all repeats, by its 95 % interval; `every`: each repeat of the trial; `share`: a share
-    of all possible repeats, with 95 % confidence; `packets`: the packets of all repeats together.
+    `figure` is the estimate over all repeats with its 95 % interval, `every` each repeat of the trial, `share` a
+    share of all possible repeats with 95 % confidence, and `packets` the packets of all repeats together.
     """
 
     FIGURE = "figure"
@@ -38,15 +38,15 @@ class Scope(StrEnum):
 
 @dataclass(frozen=True)
 class Expectation:
-    """A requirement on a figure: `udp up.file_loss < 5 %`.
+    """A requirement on a figure, such as `udp up.file_loss < 5 %`.
 
     Attributes:
         text: The text as written by the operator.
         quantity: Name of the figure.
-        is_below: Whether the figure must be below the bound; otherwise above it.
+        is_below: True if the figure must be below the bound; otherwise it must be above the bound.
         bound: The bound, in the figure's unit.
-        protocol: Protocol of the repeats; None for all.
-        is_inclusive: Whether the figure may be equal to the bound: `<=`, `>=`.
+        protocol: Protocol of the repeats; None for all protocols.
+        is_inclusive: True if the figure may equal the bound (`<=` or `>=`).
         scope: Subject of the expectation.
         share: Required share of all repeats; None unless the scope is `share`.
     """
@@ -71,24 +71,25 @@ def parse(text: str, quantities: Iterable[Quantity]) -> Expectation:
     """Parse the text of an expectation.
 
     Args:
-        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`. The prefix `every` (or `max` with `<`, `min`
-            with `>`) refers to each repeat. The prefix `90 % of` refers to a share of all repeats, and the suffix `of
-            all packets` to all packets together. `tcp` or `udp` at the start restricts it to one protocol.
+        text: `NAME < AMOUNT`, with `<`, `<=`, `>` or `>=`. With the prefix `every` (or `max` with `<`, `min` with
+            `>`), each repeat must meet it; with the prefix `90 % of`, this share of all repeats. With the suffix `of
+            all packets`, the bound is for all packets together. `tcp` or `udp` at the start restricts it to one
+            protocol.
         quantities: The possible figures.
 
     Raises:
         ConfigurationError: The text is not an expectation, or its figure is unknown.
     """
-    by_name = {quantity.name: quantity for quantity in quantities}
+    quantities_by_name = {quantity.name: quantity for quantity in quantities}
     match = _TEXT.fullmatch(text.strip())
     if match is None:
         raise ConfigurationError(f"{text[:60]!r} is not an expectation", remedy=f"write for example: {_FORMS}")
-    if (name := match["name"]) not in by_name:
+    if (name := match["name"]) not in quantities_by_name:
         raise ConfigurationError(
             f"the expected figure {name!r} does not exist",
-            remedy=did_you_mean(name, by_name, f"figures are: {', '.join(by_name)}"),
+            remedy=did_you_mean(name, quantities_by_name, f"figures are: {', '.join(quantities_by_name)}"),
         )
-    quantity, amount = by_name[name], match["amount"].strip()
+    quantity, amount = quantities_by_name[name], match["amount"].strip()
     is_below = match["sign"].startswith("<")
     scope, share = _scope(match, quantity, is_below=is_below)
     sign = -1.0 if amount.startswith("-") else 1.0

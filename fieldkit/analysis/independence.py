@@ -1,8 +1,8 @@
 """Independence of repeats in time: two rank tests, for a trend and for positive autocorrelation.
 
-An interval over repeats assumes that they are independent. If the place, the weather or a battery changes slowly,
-consecutive repeats are correlated, and the interval is too narrow. Both tests are valid for any distribution,
-including ties: their variances are computed over all permutations of the values.
+An interval over repeats assumes that the repeats are independent. If the place, the weather or a battery changes
+slowly, consecutive repeats are correlated, and the interval is too narrow. Both tests are valid for any distribution,
+including ties, because their variances are computed over all permutations of the values.
 """
 
 from math import erfc, sqrt
@@ -45,8 +45,8 @@ def p_values(values: Floats) -> Floats:
 def corrected(p_values: Floats) -> Floats:
     """Return p-values corrected for their number, in the same order (Benjamini and Hochberg 1995).
 
-    If values below 0.05 are reported, about 5 % of the tables of independent repeats have a report (4 to 9 % in
-    simulations), and on average at most 5 % of all reports are false. J. R. Stat. Soc. B 57:289.
+    If values below 0.05 are reported, about 5 % of the tables of independent repeats contain a report (4 to 9 % in
+    simulations), and on average at most 5 % of all reports are false (J. R. Stat. Soc. B 57:289).
 
     Args:
         p_values: Shape (n,), without NaN.
@@ -72,8 +72,9 @@ def _spearman(centred: Floats) -> tuple[Floats, Floats]:
 def _von_neumann(centred: Floats) -> tuple[Floats, Floats]:
     """Return 1 minus half of the rank von Neumann ratio, and its variance (Bartels 1982, J. Am. Stat. Assoc. 77:40).
 
-    The variance is over all permutations of the centred ranks x, with S and Q their sums of squares and of fourth
-    powers. The products of two terms (x_i - x_j)^2 are grouped by whether the pairs share both, one or no index.
+    The variance is computed over all permutations of the centred ranks x; s and q are the sums of their squares and
+    of their fourth powers. Products of two terms (x_i - x_j)^2 are grouped by the number of common indices: two, one
+    or none.
     """
     n = centred.shape[1]
     s, q = (centred**2).sum(axis=1), (centred**4).sum(axis=1)
@@ -89,7 +90,7 @@ def _von_neumann(centred: Floats) -> tuple[Floats, Floats]:
 
 
 def _upper_tail(statistic: Floats, variance: Floats) -> Floats:
-    """Return the upper tail probability of a statistic with mean 0 in -1..1, treated as a correlation coefficient.
+    """Return the upper tail probability of a statistic in -1..1 with mean 0, treated as a correlation coefficient.
 
     The coefficient is converted to Student's t with 1/variance - 1 degrees of freedom, whose tail is approximated by
     the tail of a normal distribution after Wallace's transformation (1959, Ann. Math. Stat. 30:1121).
@@ -102,7 +103,7 @@ def _upper_tail(statistic: Floats, variance: Floats) -> Floats:
 
 
 def _ranks(values: Floats) -> Floats:
-    """Return the rank of each value in its row; equal values get the mean of their ranks."""
+    """Return the rank of each value in its row. Equal values have the mean of their ranks."""
     order = np.argsort(values, axis=1, kind="stable")
     ordered = np.take_along_axis(values, order, axis=1)
     position = np.broadcast_to(np.arange(values.shape[1]), values.shape)

@@ -7,19 +7,19 @@ from fieldkit.analysis.judgements import Judgement
 
 
 def judgement_texts(judgement: Judgement) -> tuple[str, str, str, str, str]:
-    """Return texts of the expectation, the protocol, the measured value, its interval, and the ruling."""
+    """Return the texts of a judgement: expectation, protocol, measured value, interval, and ruling."""
     expectation = judgement.expectation
     protocol = str((judgement.cell and judgement.cell.key.get("protocol")) or expectation.protocol or "").upper()
     ruling = f"{judgement.ruling}: {judgement.why}" if judgement.why else str(judgement.ruling)
     if judgement.estimate is None:
         return expectation.text, protocol, "nothing", "", ruling
     value, bounds = _measured(judgement, judgement.estimate)
-    part = wording.incomplete(judgement.estimate)
-    return expectation.text, protocol, f"{value} ({part})" if part else value, bounds, ruling
+    note = wording.incomplete(judgement.estimate)
+    return expectation.text, protocol, f"{value} ({note})" if note else value, bounds, ruling
 
 
 def _measured(judgement: Judgement, estimate: Estimate) -> tuple[str, str]:
-    """Return the measured value of a judgement, and the interval or bound that decided it."""
+    """Return the measured value of a judgement, and the interval or bound that determines the ruling."""
     expectation = judgement.expectation
     value_scale = wording.scale_of(estimate.quantity, [estimate.value])
     if expectation.scope is Scope.EVERY:

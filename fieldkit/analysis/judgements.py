@@ -1,4 +1,4 @@
-"""Judgements of expectations by measured figures. Missing or censored repeats never make an expectation hold."""
+"""Judgements of expectations by measured figures. Missing or censored repeats never cause the ruling `holds`."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,7 +13,7 @@ from fieldkit.analysis import one_sided_bounds
 from fieldkit.analysis.cells import Cell, Estimate, RepeatValues
 from fieldkit.analysis.expectations import Expectation, Scope
 
-_LOST_AS_LATE: Final = "if lost items count as infinitely late, the interval extends beyond the bound"
+_LOST_AS_LATE: Final = "if the delay of lost items is infinite, the interval extends beyond the bound"
 
 
 class Ruling(StrEnum):
@@ -33,9 +33,11 @@ class Judgement:
         cell: The repeats; None if there are none.
         ruling: The outcome.
         estimate: The estimate; None if no valid repeat has a value.
-        why: Reason that the numbers do not show: repeats without a value, or the number of repeats that are needed.
-        met: Number of single repeats that meet it; None if it is not about single repeats.
-        limit: The decisive 95 % bound, of the share of repeats that meet it or of the loss; None if there is none.
+        why: Reason for the ruling that the numbers do not show: repeats without a value, or the number of repeats
+            that are needed.
+        met: Number of repeats that meet the expectation; None if it does not refer to single repeats.
+        limit: One-sided 95 % bound that determines the ruling, of the share of repeats that meet the expectation or
+            of the loss; None if the ruling depends on no such bound.
     """
 
     expectation: Expectation
@@ -48,13 +50,13 @@ class Judgement:
 
     @property
     def holds(self) -> bool:
-        """Whether the figure is shown to satisfy the expectation."""
+        """True if the repeats show that the expectation is met."""
         return self.ruling is Ruling.HOLDS
 
 
 @dataclass(frozen=True)
 class _Decision:
-    """Ruling by the repeats that have a value; its attributes have the same meaning as in `Judgement`."""
+    """Ruling from the repeats that have a value. The attributes have the same meaning as in `Judgement`."""
 
     ruling: Ruling
     why: str = ""
@@ -63,14 +65,14 @@ class _Decision:
 
 
 def judge(expectations: Sequence[Expectation], cells: Sequence[Cell]) -> tuple[Judgement, ...]:
-    """Return the judgements of expectations by cells, in the order of expectations; undecided if there is no cell."""
+    """Return the judgements of expectations, in their order. They are undecided without cells."""
     return tuple(judgement for expectation in expectations for judgement in _judge_cells(expectation, cells))
 
 
 def judge_by_trial(cells: Iterable[tuple[Cell, Iterable[Expectation]]]) -> tuple[Judgement, ...]:
-    """Return the judgements of cells by the expectations of their trials, in the order of expectations.
+    """Return the judgements of the expectations of several trials, in the order of expectations.
 
-    Trials under one condition are judged together.
+    Trials under the same condition are judged together.
 
     Args:
         cells: Each cell with the expectations of its trials.
@@ -104,12 +106,12 @@ def _judge_cells(expectation: Expectation, cells: Sequence[Cell]) -> Iterator[Ju
 
 
 def _limitations(expectation: Expectation, estimate: Estimate, valid: int) -> Iterator[str]:
-    """Yield the reasons why an expectation must not hold although the repeats with a value meet it."""
+    """Yield the reasons why the ruling cannot be `holds`, even if the repeats with a value meet the expectation."""
     if missing := max(valid - estimate.n, estimate.missing):
         yield f"{missing} of {estimate.n + missing} repeats have no value"
     if estimate.n_censored:
         share = f"{estimate.n_censored} of {estimate.n}"
-        yield f"in {share} repeats the timed event had not ended, so they give only lower bounds"
+        yield f"in {share} repeats the timed event had not ended, so their values are only lower bounds"
     if expectation.is_below and estimate.quantity.of_sent and estimate.sample is not None:
         infinite = int(np.isinf(estimate.sample.high).sum()) - estimate.n_censored
         if infinite:
@@ -131,9 +133,9 @@ def _decide(expectation: Expectation, estimate: Estimate) -> _Decision:
 
 
 def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
-    """Decide by the interval: it must satisfy the bound at both ends.
+    """Decide by the interval: both ends must satisfy the bound.
 
-    For a figure of received items, the upper end of the statistic over all sent items is used. An open end is
+    For a figure of received items, the upper end is that of the statistic over all sent items. An open end is
     infinite.
     """
     if estimate.low is None:
@@ -145,8 +147,8 @@ def _decide_figure(expectation: Expectation, estimate: Estimate) -> _Decision:
         return _Decision(Ruling.HOLDS)
     if not any(ends):
         return _Decision(Ruling.FAILS)
-    late = high is not None and estimate.high is not None and high > estimate.high
-    return _Decision(Ruling.OPEN, _LOST_AS_LATE if late and expectation.is_met(estimate.high or 0.0) else "")
+    is_extended = high is not None and estimate.high is not None and high > estimate.high
+    return _Decision(Ruling.OPEN, _LOST_AS_LATE if is_extended and expectation.is_met(estimate.high or 0.0) else "")
 
 
 def _count_met(expectation: Expectation, sample: RepeatValues) -> tuple[int, int]:
@@ -173,7 +175,7 @@ def _decide_share(expectation: Expectation, n: int, met: int, violated: int) -> 
 
 
 def _decide_packets(expectation: Expectation, estimate: Estimate, sample: RepeatValues) -> _Decision:
-    """Decide by the share of all packets that were lost, and its upper bound."""
+    """Decide by the share of lost packets in all repeats, and its upper bound."""
     if sample.lost is None or sample.sent is None:
         return _Decision(Ruling.OPEN)
     limit = one_sided_bounds.loss_high(sample.lost, sample.sent)
@@ -182,5 +184,5 @@ def _decide_packets(expectation: Expectation, estimate: Estimate, sample: Repeat
     if expectation.is_met(limit):
         return _Decision(Ruling.HOLDS, limit=limit)
     needed, sent = one_sided_bounds.packets_for(expectation.bound), int(sample.sent.sum())
-    why = f"{sent} packets were sent, at least {needed} are needed" if sent < needed else ""
+    why = f"{sent} packets were sent, but at least {needed} are needed" if sent < needed else ""
     return _Decision(Ruling.OPEN, why, limit=limit)

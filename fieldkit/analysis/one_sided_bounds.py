@@ -1,4 +1,4 @@
-"""One-sided 95 % bounds for expectations: share of repeats, and share of packets that are lost in bursts."""
+"""One-sided 95 % bounds for expectations: share of repeats that meet a requirement, share of lost packets."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ SHORTEST_BURST: Final = 10
 """Shortest burst of losses that a bound assumes, in packets.
 
 This is a convention, because data without losses contain no information about bursts. If losses occur in longer
-bursts that are so rare that none was in the run, the true loss can be above the bound.
+bursts that are too rare to occur during the run, the true loss can be above the bound.
 """
 
 _BISECTIONS: Final = 60
@@ -22,8 +22,8 @@ _BISECTIONS: Final = 60
 def share_low(met: int, n: int) -> float:
     """Return the one-sided lower bound of the share of all repeats that meet a requirement.
 
-    Exact (Clopper and Pearson 1934, Biometrika 26:404): the share for which the probability of `met` or more among
-    `n` repeats is 5 %.
+    The bound is exact (Clopper and Pearson 1934, Biometrika 26:404): it is the share for which `met` or more of `n`
+    repeats meet the requirement with a probability of 5 %.
     """
     if met == 0:
         return 0.0
@@ -36,9 +36,9 @@ def share_high(met: int, n: int) -> float:
 
 
 def repeats_for(share: float) -> int:
-    """Return how many repeats must all meet a requirement to show that this share of all repeats meets it.
+    """Return the number of repeats needed to show that this share of all repeats meets a requirement.
 
-    From `share_low`: the smallest n with share^n <= 5 %.
+    All of these repeats must meet the requirement. By `share_low`, it is the smallest n with share^n <= 5 %.
     """
     return math.ceil(math.log(1 - CONFIDENCE) / math.log(share) * (1 - 1e-12))
 
@@ -47,12 +47,12 @@ def loss_high(lost: ArrayLike, sent: ArrayLike) -> float:
     """Return the one-sided upper bound of the share of lost packets, over the packets of all repeats.
 
     Losses occur in bursts. The assumed length of a burst is the number of losses in the worst repeat, which is the
-    longest burst that the data allow, and at least `SHORTEST_BURST`. The number of bursts is assumed to be Poisson:
-    with L packets per burst, and X of N packets lost, the bound is L/N times the 95 % quantile of the gamma
-    distribution of shape X/L + 1 (Garwood 1936, Biometrika 28:437). Without losses it is 3 L/N: the rule of three
-    with N/L trials.
+    longest burst that the data permit, and at least `SHORTEST_BURST`. The number of bursts is assumed to have a
+    Poisson distribution. With L packets per burst, and X of N packets lost, the bound is L/N times the 95 % quantile
+    of the gamma distribution with the shape X/L + 1 (Garwood 1936, Biometrika 28:437). Without losses, it is 3 L/N:
+    the rule of three with N/L trials.
 
-    The bound increases with X and with L, so fewer losses in any repeat never make it larger.
+    The bound increases with X and with L. Fewer losses in a repeat therefore never increase it.
 
     Args:
         lost: Lost packets of each repeat, shape (n,); a negative number, caused by duplicates, counts as 0.

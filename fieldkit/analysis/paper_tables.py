@@ -26,7 +26,7 @@ _LATEX_SPECIAL: Final = {
 def to_markdown(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
     """Return a Markdown table of the estimates with their intervals, followed by word counts.
 
-    The values that all cells have in common are in a line above the table.
+    Values that are equal in all cells are in a line above the table.
     """
     varying, common = wording.varying_and_common(by, cells)
     shown = [(line, line.scale(cells)) for line in lines(cells, quantities)]
@@ -51,13 +51,13 @@ def markdown_line(parts: Iterable[str]) -> str:
 
 
 def markdown_escaped(text: str) -> str:
-    """Return an untrusted text escaped for a table cell, so that it is not markup, a link or HTML."""
+    """Return an untrusted text, escaped for a table cell so that it is not interpreted as markup, a link or HTML."""
     return _MARKUP.sub(r"\\\g<0>", one_line(text))
 
 
 @dataclass(frozen=True)
 class _Column:
-    """One column of figures; its head has one line per attribute, empty if the cells do not differ in it."""
+    """One column of figures. Its head has one line per attribute, which is empty if all cells have the same value."""
 
     scenario: str
     line: TableLine
@@ -69,7 +69,7 @@ class _Column:
 
 
 def to_latex(by: Sequence[str], cells: Sequence[Cell], quantities: Sequence[Quantity]) -> str:
-    """Return a LaTeX `table` of column width (needs booktabs and graphicx); columns without a figure are omitted."""
+    """Return a LaTeX `table` of column width (needs booktabs and graphicx). Columns without figures are omitted."""
     row_keys, common = (
         [name for name in names if name not in _ACROSS_COLUMNS] for names in wording.varying_and_common(by, cells)
     )
@@ -121,7 +121,7 @@ def _latex_caption(common: Sequence[str], cells: Sequence[Cell]) -> str:
 def _latex_head(
     row_keys: Sequence[str], columns: Sequence[_Column], scales: Mapping[TableLine, wording.Scale]
 ) -> Iterator[str]:
-    """Yield the lines of the head; a cell over several columns has a rule below it."""
+    """Yield the lines of the table's head. A cell over several columns has a rule below it."""
     labels = [scales[column.line].head(column.line.label) for column in columns]
     levels: list[list[tuple[str, ...]]] = [
         [(column.scenario,) for column in columns],

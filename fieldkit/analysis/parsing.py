@@ -1,4 +1,4 @@
-"""Conversion of CSV lines to columns by pyarrow. If it fails, `table_errors` reads the lines to find the error."""
+"""Conversion of CSV lines to columns with pyarrow. If it fails, `table_errors` reads the lines to find the error."""
 
 from collections.abc import Mapping, Sequence
 from itertools import count
@@ -23,9 +23,9 @@ def columns(
     """Return columns of numbers and of texts, as in `repeats.Repeats`, and the number of rows.
 
     Args:
-        names: All columns of the table, in order.
-        body: Its lines without the header, each with its line end.
-        declared: The requested columns; columns that the table does not have are missing in all rows.
+        names: Names of all columns of the table, in order.
+        body: Lines of the table without the header, with their line ends.
+        declared: The requested columns. Columns that the table does not have are missing in all rows.
 
     Raises:
         ValueError: A line or a value is invalid.
@@ -37,7 +37,7 @@ def columns(
 def csv_columns(
     names: Sequence[str], body: bytes, declared: Mapping[str, Column]
 ) -> tuple[Mapping[str, pa.ChunkedArray], int]:
-    """Return the columns of a table that are declared, with the types of `arrow_type`, and the number of rows.
+    """Return the declared columns of a table, with the types of `arrow_type`, and the number of rows.
 
     Arguments and errors as for `columns`.
     """
@@ -63,7 +63,7 @@ def arrow_columns(
     """Return columns of numbers and of texts, as in `repeats.Repeats`; missing columns are missing in all rows.
 
     Args:
-        by_name: Columns of Arrow, of the types of `arrow_type`.
+        by_name: Arrow columns with the types of `arrow_type`.
         declared: The requested columns.
         rows: Number of rows.
     """
@@ -87,14 +87,14 @@ def codes(column: Texts) -> NDArray[np.int64]:
 
 
 def arrow_type(column: Column) -> pa.DataType:
-    """Return the Arrow type by which a column is read."""
+    """Return the Arrow type of a column."""
     if column.type is str:
         return pa.dictionary(pa.int32(), pa.string())
     return {"bool": pa.bool_(), "ns": pa.int64()}.get(column.unit, pa.float64())
 
 
 def _numpy_type(column: Column) -> type[np.float64] | type[np.longdouble]:
-    """Return the type of a column's numbers; nanoseconds since 1970 need 61 bits, more than a double's precision."""
+    """Return the type of a column's numbers. Nanoseconds since 1970 need 61 bits, which is more than a double has."""
     return np.longdouble if column.unit == "ns" else np.float64
 
 
@@ -124,9 +124,9 @@ def _missing(column: pa.ChunkedArray) -> NDArray[np.bool_]:
 
 
 def _buffer_values(array: pa.Array, kind: type[np.generic]) -> NDArray[Any]:
-    """Return the value buffer of an Arrow array without copying; missing values are arbitrary.
+    """Return the value buffer of an Arrow array without copying it; missing values are arbitrary.
 
-    `to_numpy` would import pandas if that is installed, which takes longer than reading a table.
+    `to_numpy` would import pandas if it is installed, which takes longer than reading a table.
     """
     _, values = array.buffers()
     return np.frombuffer(values, kind, len(array), array.offset * np.dtype(kind).itemsize)

@@ -1,4 +1,4 @@
-"""Quantities: columns of trial.csv that are aggregated over repeats as declared by their figures."""
+"""Quantities: columns of trial.csv that are aggregated over repeats, as their figures declare."""
 
 import re
 import sys
@@ -31,8 +31,8 @@ class Quantity:
         sent: Column with the number of sent items; None unless counted.
         possible: Smallest and largest possible value of a repeat.
         rank: Sort key in tables.
-        at_least: Column of lower bounds (right-censored values), None if there is none; see `columns.Figure`.
-        of_sent: Column of the same statistic over all sent items, None if there is none; see `columns.Figure`.
+        at_least: Column of lower bounds (right-censored values), or None; see `columns.Figure`.
+        of_sent: Column of the same statistic over all sent items, or None; see `columns.Figure`.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Quantity:
 
     @classmethod
     def of(cls, column: Column) -> Self | None:
-        """Return the quantity of a column; None if the column has no figure, or a figure of the kind `words`."""
+        """Return the quantity of a column, or None if the column has no figure or a figure of the kind `words`."""
         figure = column.figure
         if figure is None or figure.kind is Kind.WORDS:
             return None
@@ -67,7 +67,7 @@ class Quantity:
 
     @property
     def step(self) -> str:
-        """Name of the step that measures it; empty if the step has no name."""
+        """Name of the step that measures the quantity; empty if the step has no name."""
         return self.name.rpartition(".")[0]
 
     @property
@@ -77,12 +77,12 @@ class Quantity:
 
     @property
     def is_builtin(self) -> bool:
-        """Whether it is a built-in quantity; False if another package or a lab declares it."""
+        """True for a built-in quantity, False if another package or a lab declares it."""
         return not FIRST_EXTERNAL_RANK <= self.rank < BACKGROUND
 
     @property
     def payload(self) -> str | None:
-        """Column with the ICMP payload size, on which a round-trip time depends; None for other quantities."""
+        """Column with the ICMP payload size, which affects a round-trip time; None for other quantities."""
         return step_prefixed(self.step, "rtt_payload_bytes") if plain_name(self.name) == "rtt_median_s" else None
 
     @property
@@ -92,7 +92,7 @@ class Quantity:
         return name and step_prefixed(self.step, name)
 
     @property
-    def needed(self) -> tuple[str, ...]:
+    def needed_columns(self) -> tuple[str, ...]:
         """All columns for a table of the quantity: `columns`, `optional_columns`, `payload` and `implied_by`."""
         return (
             *self.columns,
@@ -102,12 +102,12 @@ class Quantity:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The columns that a repeat must have for a value, starting with the column of the quantity."""
+        """The columns in which a repeat must have values, starting with the column of the quantity."""
         return tuple(name for name in (self.name, self.arrived, self.sent) if name is not None)
 
     @property
     def optional_columns(self) -> tuple[str, ...]:
-        """Additional columns of lower bounds and of the statistic over all sent items, which may be missing."""
+        """Further columns, which may be missing: lower bounds, and the statistic over all sent items."""
         return tuple(name for name in (self.at_least, self.of_sent) if name is not None)
 
 
@@ -121,7 +121,7 @@ def quantities(columns: Iterable[Column]) -> tuple[Quantity, ...]:
 
 
 def with_plain_name(quantities: Iterable[Quantity], name: str) -> list[Quantity]:
-    """Return the quantities with a name, for any name of a step; the quantity of an unnamed step is first."""
+    """Return the quantities with this name, of all steps. The quantity of the step without a name is first."""
     return sorted(
         (quantity for quantity in quantities if plain_name(quantity.name) == name),
         key=lambda quantity: quantity.step != "",
@@ -134,14 +134,14 @@ def in_order(quantities: Iterable[Quantity]) -> tuple[Quantity, ...]:
 
 
 def symbols(unit: str) -> tuple[str, ...]:
-    """Return the symbols in which values of a unit, and differences of them, are written."""
+    """Return the symbols with which values of a unit, and their differences, are written."""
     return (
         tuple(PER_UNIT[unit]) if unit in PER_UNIT else tuple(dict.fromkeys((unit, DIFFERENCE_UNITS.get(unit, unit))))
     )
 
 
 def parse_amount(text: str, unit: str, what: str) -> float:
-    """Return a value of a quantity, or a difference of values, in its unit: `2%`, `5ms`, `3 dB`.
+    """Return a value of a quantity, or a difference of values, in its unit, for example for `2%`, `5ms` or `3 dB`.
 
     Args:
         text: The text to parse. A unit with only one symbol may be omitted.
@@ -149,7 +149,7 @@ def parse_amount(text: str, unit: str, what: str) -> float:
         what: Description of the value, for the message.
 
     Raises:
-        ConfigurationError: The text is not a value in this unit, or below 0.
+        ConfigurationError: The text is not a value in this unit, or the value is below 0.
     """
     if unit in PER_UNIT:
         return parse_quantity(text, PER_UNIT[unit], what)
@@ -162,20 +162,21 @@ def parse_amount(text: str, unit: str, what: str) -> float:
 
 
 LOSSES: Final = ("datagram_loss", "tcp_byte_loss", "ip_loss", "file_loss", "rtt_loss")
-"""Losses, the most informative one first."""
+"""Columns of losses, the most informative one first."""
 
 PER_UNIT: Final = MappingProxyType({"share": FRACTION_PER_UNIT, "s": SECONDS_PER_UNIT, "bit/s": BITS_PER_S_PER_UNIT})
-"""Symbols and factors of units that are written in several ways; other units are written as they are."""
+"""Symbols and factors of units that can be written in several ways. Other units have one symbol."""
 
 DIFFERENCE_UNITS: Final = MappingProxyType({"share": "points", "dBm": "dB"})
-"""Unit of the difference of two values, if it is not the unit of the values."""
+"""Unit of the difference of two values, if it differs from the unit of the values."""
 
 DEFAULT_BY: Final = ("procedure", "scenario", "topology", "backend", "distance", "distance_m", "protocol")
 """Columns that identify a condition by default."""
 
 
 _SEPARATOR: Final = "="
-"""Separator of column and word in a table with a line per word: `grass=wet`. Names of columns cannot contain it."""
+"""Separator of column and word in a table with a line per word, such as `grass=wet`. It is not allowed in the names
+of columns."""
 
 
 @dataclass(frozen=True)
@@ -184,8 +185,8 @@ class Tally:
 
     Attributes:
         name: Name of the column.
-        label: Its label.
-        counts: Number of valid repeats by word, sorted by decreasing count, then alphabetically.
+        label: Label of the column.
+        counts: Number of valid repeats by word, in the order of decreasing counts, then alphabetically.
     """
 
     name: str
@@ -202,7 +203,7 @@ class Tally:
         return self.counts.get(word, 0) / self.n if self.n else None
 
     def quantity(self, word: str) -> str:
-        """Return the name of a word's line in a table: `grass=wet`."""
+        """Return the name of a word's line in a table, such as `grass=wet`."""
         return f"{self.name}{_SEPARATOR}{word}"
 
 
@@ -212,11 +213,11 @@ def word_columns(columns: Iterable[Column]) -> tuple[Column, ...]:
 
 
 def tallies(column: Column, words_with_cell: Iterable[tuple[int, str]]) -> Iterator[tuple[int, Tally]]:
-    """Yield the index of each cell in which a column has words, with their counts.
+    """Yield the index of each cell in which a column has words, and the counts of these words.
 
     Args:
         column: The column.
-        words_with_cell: Cell and word of each valid repeat; the word is empty if missing.
+        words_with_cell: Cell and word of each valid repeat; a missing word is empty.
     """
     counts: dict[int, Counter[str]] = {}
     for cell, word in words_with_cell:

@@ -1,4 +1,4 @@
-"""Attempts of repeats as columns: the rows of one trial.csv or of many."""
+"""Attempts of repeats as columns: the rows of one or several trial.csv."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -21,7 +21,7 @@ Key = tuple[str | float | None, ...]
 """Values of some columns in one row; a missing text is empty, a missing number None."""
 
 SOURCE: Final = "source"
-"""The column that `table_files.read` adds."""
+"""Name of the column that `table_files.read` adds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +29,10 @@ class Repeats:
     """Attempts of repeats, valid or not, as one numpy column per column of trial.csv.
 
     Attributes:
-        numbers: Float columns of shape (n,), NaN if missing; a bool is 0 or 1. Times in ns are long doubles.
-        texts: Columns of str, shape (n,), empty if missing; `source` is the trial's folder or the CSV file of a row,
-            empty for rows that were not read from a file.
+        numbers: Columns of numbers, shape (n,); missing numbers are NaN, a bool is 0 or 1, times in ns are long
+            doubles.
+        texts: Columns of texts, shape (n,); missing texts are empty. `source` is the trial's folder or the CSV file
+            of a row, and empty for rows that were not read from a file.
         columns: Declarations of the columns, without `source`.
     """
 
@@ -53,11 +54,11 @@ class Repeats:
     def __len__(self) -> int:
         return len(next(iter(self.texts.values())))
 
-    def where(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
-        """Return the rows of a mask, or the rows with these indices in their order."""
+    def where(self, selection: NDArray[np.bool_] | NDArray[np.int64]) -> Self:
+        """Return the rows that a mask selects, or the rows at the indices of an array, in its order."""
         return type(self)(
-            {name: column[chosen] for name, column in self.numbers.items()},
-            {name: column[chosen] for name, column in self.texts.items()},
+            {name: column[selection] for name, column in self.numbers.items()},
+            {name: column[selection] for name, column in self.texts.items()},
             self.columns,
         )
 
@@ -72,7 +73,7 @@ class Repeats:
         return list(values)
 
     def observed(self, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
-        """Return the values of a quantity, NaN if missing, and a mask of the rows in which they are lower bounds."""
+        """Return the values of a quantity, NaN if missing, and a mask of the values that are lower bounds."""
         values = self.numbers[quantity.name]
         bounds = self.numbers.get(quantity.at_least or "")
         if bounds is None:
@@ -85,30 +86,30 @@ class Repeats:
         return list(zip(*map(self.column, names), strict=True)) if names else [()] * len(self)
 
     def codes(self, names: Sequence[str]) -> NDArray[np.int64]:
-        """Return a number per row, from 0, which is equal for rows with equal values in the columns `names`."""
+        """Return a number for each row, from 0. Rows with equal values in the columns `names` have equal numbers."""
         codes = np.zeros(len(self), np.int64)
         for name in names:
             texts = self.texts.get(name)
-            of_column = (
+            column_codes = (
                 np.unique(self.numbers[name], return_inverse=True)[1] if texts is None else parsing.codes(texts)
             )
-            codes = np.unique(codes * (of_column.max(initial=0) + 1) + of_column, return_inverse=True)[1]
+            codes = np.unique(codes * (column_codes.max(initial=0) + 1) + column_codes, return_inverse=True)[1]
         return codes
 
     def groups(self, names: Sequence[str]) -> dict[Key, NDArray[np.int64]]:
-        """Return the indices of the rows by key; keys and rows are in the order of the rows."""
-        by_key: dict[Key, list[int]] = {}
+        """Return the indices of the rows by key. Keys and indices are in the order of the rows."""
+        rows_by_key: dict[Key, list[int]] = {}
         for row, key in enumerate(self.keys(names)):
-            by_key.setdefault(key, []).append(row)
-        return {key: np.array(rows) for key, rows in by_key.items()}
+            rows_by_key.setdefault(key, []).append(row)
+        return {key: np.array(rows) for key, rows in rows_by_key.items()}
 
     def name(self, row: int) -> str:
-        """Return the name of the repeat in a row: `udp-07`."""
+        """Return the name of the repeat in a row, such as `udp-07`."""
         number = self.numbers["repeat"][row]
         return f"{self.texts['protocol'][row]}-{'??' if np.isnan(number) else f'{number:02.0f}'}"
 
     def folder(self, row: int) -> str | None:
-        """Return the name of the folder of the attempt in a row: `udp-07`; None if the row has invalid values."""
+        """Return the name of the attempt's folder, such as `udp-07`, or None if the row has invalid values."""
         texts, numbers = self.texts, self.numbers
         try:
             repeat = RepeatId(Protocol(texts["protocol"][row]), int(numbers["repeat"][row]))
@@ -150,19 +151,19 @@ class Repeats:
 
 
 def parse(content: bytes, declared: Iterable[Column], where: str = "trial.csv") -> Repeats:
-    """Return the rows of a trial.csv; columns that it does not have are missing in all rows.
+    """Return the rows of a trial.csv. Columns that it does not have are missing in all rows.
 
     Raises:
         EvidenceError: A value is not possible for its column.
     """
     header, _, body = content.partition(b"\n")
-    named = by_name(declared)
+    columns_by_name = by_name(declared)
     try:
-        return parse_rows(header_names(header), body, named)
+        return parse_rows(header_names(header), body, columns_by_name)
     except ValueError as error:
         from fieldkit.analysis.table_errors import first_problem  # noqa: PLC0415 (tables of fieldkit are valid)
 
-        raise first_problem(where, content, named) or EvidenceError(
+        raise first_problem(where, content, columns_by_name) or EvidenceError(
             f"its values do not agree with the declarations of its columns: {error}",
             where=where,
             remedy="correct the declarations under columns: in trial.yaml",

@@ -14,7 +14,7 @@ MORE: Final = "more_wanted"
 
 
 def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
-    """Yield the table rows of a cell: one per quantity and word, or a single row if it has none."""
+    """Yield the table rows of a cell: one per quantity and per word, or one row if the cell has neither."""
     counts: dict[str, Any] = {"n_valid": cell.n_valid, "n_void": cell.n_void, "n_failed": cell.n_failed}
     if not cell.estimates and not cell.tallies:
         yield EstimateRow(**counts)
@@ -44,12 +44,12 @@ def estimate_rows(cell: Cell) -> Iterator[EstimateRow]:
 
 
 def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
-    """Return cells as CSV: the columns `by` that identify them, then the columns of `EstimateRow`.
+    """Return cells as CSV: the columns `by` that identify a cell, then the columns of `EstimateRow`.
 
     Args:
         by: Columns that identify cells.
         cells: The cells.
-        more: Number of additional repeats by quantity, for each cell; if given, it is the last column.
+        more: Number of additional repeats by quantity, for each cell. If it is not empty, it is the last column.
     """
     names = [column.name for column in declared(EstimateRow)]
     additional = more or ({},) * len(cells)
@@ -65,9 +65,11 @@ def to_csv(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str,
 def to_json(by: Sequence[str], cells: Sequence[Cell], more: Sequence[Mapping[str, int]] = ()) -> str:
     """Return cells as one JSON object with the names, units and digits of `to_csv`; missing values are null."""
     additional = more or ({},) * len(cells)
-    listed = [_cell_object(cell, counts if more else None) for cell, counts in zip(cells, additional, strict=True)]
+    cell_objects = [
+        _cell_object(cell, counts if more else None) for cell, counts in zip(cells, additional, strict=True)
+    ]
     cautions = list(wording.cautions(cells))
-    document = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": listed}
+    document = {"schema_version": SCHEMA_VERSION, "by": list(by), "cautions": cautions, "cells": cell_objects}
     return json_text(document, indent=1, allow_nan=False) + "\n"
 
 

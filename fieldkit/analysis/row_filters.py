@@ -1,8 +1,8 @@
 """Conditions on rows of a table, written as expressions of Python: `distance_m < 20 and topology == "master"`.
 
-Only comparisons of columns and constants and their combinations with `and`, `or` and `not` are allowed; nothing is
-executed. A comparison with a missing value is neither true nor false (three-valued logic, Kleene 1938), so a row is
-chosen only if its values decide the condition.
+Comparisons of columns and constants are allowed, and their combinations with `and`, `or` and `not`; no code is
+executed. A comparison with a missing value is neither true nor false (three-valued logic, Kleene 1938). A row is
+therefore selected only if its values are sufficient to decide the condition.
 """
 
 import ast
@@ -32,11 +32,11 @@ Mask = NDArray[np.bool_]
 
 
 class Truth(NamedTuple):
-    """The result of a condition for each row; neither mask is set where missing values leave it undecided.
+    """The result of a condition for each row. If missing values leave it undecided, neither mask is set.
 
     Attributes:
-        true: Rows in which it is true. Shape (n,).
-        false: Rows in which it is false. Shape (n,).
+        true: Mask of the rows in which the condition is true. Shape (n,).
+        false: Mask of the rows in which the condition is false. Shape (n,).
     """
 
     true: Mask
@@ -49,7 +49,7 @@ class RowFilter:
 
     Attributes:
         text: The expression.
-        names: Names of the columns in it.
+        names: Names of the columns in the expression.
     """
 
     text: str
@@ -68,7 +68,7 @@ def parse_filter(text: str, columns: Mapping[str, Column]) -> RowFilter:
         columns: The columns of the table by name; `source` is also allowed.
 
     Raises:
-        ConfigurationError: It has another form, or a column that does not exist or has another type.
+        ConfigurationError: The expression has another form, or a column in it does not exist or has another type.
     """
     try:
         body = ast.parse(text.strip(), mode="eval").body

@@ -1,7 +1,6 @@
-"""Sample sizes: the repeats or packets that expectations need, and the additional repeats that a cell needs.
+"""Sample sizes: the number of repeats or packets that expectations need, and of additional repeats for a cell.
 
-Expectations are checked before the trial runs. The additional repeats narrow the interval of a cell to a requested
-width.
+Expectations are checked before the trial runs. Additional repeats narrow the interval of a cell to a requested width.
 """
 
 import math
@@ -27,16 +26,16 @@ _USUAL_SHARE = 0.9
 def unmet_requirements(
     expectations: Iterable[Expectation], figures: Iterable[Quantity], repeats: int
 ) -> Iterator[str]:
-    """Yield a sentence for each expectation that needs more repeats or packets than a trial has.
+    """Yield a sentence for each expectation that may need more repeats or packets than a trial has.
 
     Args:
         expectations: Expectations of the trial.
-        figures: Quantities that its repeats measure, including the quantities of the expectations.
+        figures: Quantities that the repeats measure, including the quantities of the expectations.
         repeats: Number of repeats per protocol.
     """
-    by_name = {quantity.name: quantity for quantity in figures}
+    figures_by_name = {quantity.name: quantity for quantity in figures}
     for expectation in expectations:
-        if needs := _needs(expectation, by_name[expectation.quantity], repeats):
+        if needs := _needs(expectation, figures_by_name[expectation.quantity], repeats):
             yield f"expected {expectation.text}: {needs}"
 
 
@@ -44,7 +43,7 @@ def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
     has = f"this trial has {repeats}"
     if expectation.scope is Scope.PACKETS:
         packets = one_sided_bounds.packets_for(expectation.bound)
-        return f"needs at least {packets} packets per condition for 95 % confidence, if none is lost"
+        return f"needs at least {packets} packets per condition for 95 % confidence, even if no packet is lost"
     if expectation.scope is Scope.SHARE and expectation.share is not None:
         needed = one_sided_bounds.repeats_for(expectation.share)
         text = f"needs at least {needed} repeats for 95 % confidence, if all meet it; {has}"
@@ -71,7 +70,7 @@ def _needs(expectation: Expectation, quantity: Quantity, repeats: int) -> str:
 
 
 def _best_case(quantity: Quantity) -> str:
-    """Return a description of the best results, for which this number of repeats is enough."""
+    """Return a description of the results for which this number of repeats is sufficient."""
     if quantity.kind is Kind.FLAG:
         return "if it is true in all of them"
     return "even if nothing is lost" if quantity.unit == "share" else "which give an interval"
@@ -80,7 +79,8 @@ def _best_case(quantity: Quantity) -> str:
 def _for_interval(expectation: Expectation, quantity: Quantity) -> int:
     """Return the smallest number of repeats with which the 95 % interval of a figure can be within the bound.
 
-    For shares this is the score interval of repeats without any loss (Wilson 1927), whose end is z²/(n + z²).
+    For a share, it is computed with the score interval of repeats without loss (Wilson 1927), whose end is
+    z²/(n + z²).
     """
     if quantity.unit != "share" or quantity.kind is Kind.MEDIAN:
         return 2
@@ -96,7 +96,7 @@ _BISECTIONS: Final = 60  # enough for every number of repeats that a float repre
 def additional_repeats_by_cell(
     cells: "Sequence[Cell]", half_widths: Mapping[str, float]
 ) -> tuple[Mapping[str, int], ...]:
-    """Return `additional_repeats` of all estimates: for each cell, by name of the quantity.
+    """Return the result of `additional_repeats` for all estimates of each cell, by name of the quantity.
 
     Args:
         cells: Cells with estimates of any quantities.
@@ -122,14 +122,14 @@ def additional_repeats(
 ) -> NDArray[np.float64]:
     """Return the number of additional repeats until the half-width of an interval is at most `half_width`.
 
-    It is assumed that further repeats have the same dispersion as the existing repeats, so the number is only a rough
-    estimate if it is computed from few repeats. For a share, the effective number of trials per repeat follows from
-    the formula of the score interval, even without any loss. For other quantities, the width decreases with the
-    square root of the number of repeats. The decrease of Student's quantile is taken into account.
+    Additional repeats are assumed to have the same dispersion as the existing repeats, so the number is only a rough
+    estimate if there are few repeats. For a share, the effective number of trials per repeat follows from the formula
+    of the score interval, even without losses. For other quantities, the width is proportional to the inverse square
+    root of the number of repeats. The decrease of Student's quantile is included.
 
     Args:
         intervals: Intervals as returned by `statistics` or `cells`, shape (cells,).
-        n: Number of repeats of each.
+        n: Number of repeats of each cell.
         half_width: Requested half-width, in the unit of the value.
         kind: Kind of the quantity.
         unit: Unit of the quantity.
@@ -162,7 +162,7 @@ def additional_repeats(
 
 
 def _inverse_trials(share: NDArray[np.float64], half: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return quantile²/trials of a score interval with a half-width, which is always below 1/2."""
+    """Return quantile²/trials of a score interval with the half-width `half`, which must be below 1/2."""
     spread, square = share * (1 - share), half**2
     a, b = 0.25 - square, spread - 2 * square
     return np.where(half < 0.5, (np.sqrt(b * b + 4 * a * square) - b) / (2 * a), np.inf)
@@ -176,6 +176,6 @@ def _with_student(
     goal = student(np.maximum(n - 1, 1)) ** 2 / n / ratio * (1 + 1e-12)
     for _ in range(_BISECTIONS):
         middle = np.floor((low + high) / 2)
-        fits = student(np.maximum(middle - 1, 1)) ** 2 / middle <= goal
-        low, high = np.where(fits, low, middle + 1), np.where(fits, middle, high)
+        is_enough = student(np.maximum(middle - 1, 1)) ** 2 / middle <= goal
+        low, high = np.where(is_enough, low, middle + 1), np.where(is_enough, middle, high)
     return high

@@ -1,4 +1,4 @@
-"""Differences of two conditions: their intervals, p-values and effect sizes."""
+"""Differences between two conditions: intervals, p-values and effect sizes."""
 
 import math
 
@@ -14,8 +14,8 @@ def between(a: Interval, b: Interval) -> Interval:
 
     The distances from the estimates to their bounds are added as squares, separately for each side. For Wilson
     intervals this is Newcombe's tenth method (1998, Stat. Med. 17:873); Zou and Donner (2008, Stat. Med. 27:1693)
-    show that it is valid for any estimates with valid intervals. A skewed interval gives a skewed difference, and the
-    coverage stays correct if nothing was lost.
+    show that it is valid for all estimates with valid intervals. The asymmetry of the intervals is preserved, and the
+    coverage is correct even without losses.
     """
     difference = b.value - a.value
     return Interval(
@@ -26,10 +26,10 @@ def between(a: Interval, b: Interval) -> Interval:
 
 
 def p_value(difference: Interval) -> float:
-    """Return the two-sided p-value of a difference, which is below 0.05 if 0 is outside of its interval.
+    """Return the two-sided p-value of a difference, which is below 0.05 if 0 is outside of the interval.
 
-    The half of the 95 % interval on the side of 0 is interpreted as 1.96 standard errors (Altman and Bland 2011, BMJ
-    343:d2304).
+    The length of the 95 % interval on the side of 0 is interpreted as 1.96 standard errors (Altman and Bland 2011,
+    BMJ 343:d2304).
     """
     half_width = difference.value - difference.low if difference.value > 0 else difference.high - difference.value
     if difference.value == 0 or half_width <= 0:
@@ -40,8 +40,8 @@ def p_value(difference: Interval) -> float:
 def holm(p_values: ArrayLike) -> tuple[float, ...]:
     """Return p-values corrected for their number, in the same order (Holm 1979, Scand. J. Stat. 6:65).
 
-    If values below 0.05 are reported as differences, at most 5 % of the comparisons of equal runs have any false
-    report, for any dependence between the single differences.
+    If values below 0.05 are reported as differences, at most 5 % of the comparisons of equal runs contain a false
+    report, whatever the dependence between the differences is.
     """
     p = np.asarray(p_values, dtype=np.float64)
     order = np.argsort(p, kind="stable")
@@ -54,7 +54,8 @@ def holm(p_values: ArrayLike) -> tuple[float, ...]:
 def cliffs_delta(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     """Return the share of pairs in which the value of `b` is larger, minus the share in which it is smaller.
 
-    -1 and 1: the samples do not overlap; 0: both are larger equally often (Cliff 1993, Psychol. Bull. 114:494).
+    The result is -1 or 1 if the samples do not overlap, and 0 if both are larger equally often (Cliff 1993, Psychol.
+    Bull. 114:494).
 
     Args:
         a: Shape (n,), n > 0.

@@ -1,7 +1,8 @@
 """Statistics over repeats with 95 % intervals: shares, means and medians, and differences of two samples.
 
-Each repeat is one independent sampling unit, whose items may depend on each other. All formulas are in closed form
-and vectorized over cells. There is no resampling, so no result depends on a seed. Coverage: docs/method-intervals.md.
+Repeats are independent sampling units; the items of a repeat may depend on each other. All formulas are in closed
+form and vectorized over cells. There is no resampling, so results do not depend on a seed. docs/method-intervals.md
+has the coverage of the intervals.
 """
 
 import math
@@ -32,7 +33,7 @@ _SERIES: Final = (
 )
 _LAST_TERM: Final = 32 * (_QUANTILE_2 - NORMAL - sum(term / 2**power for power, term in enumerate(_SERIES, 1)))
 MIN_FOR_INDEPENDENCE_TESTS: Final = 10
-"""Minimum number of repeats; with fewer, the p-values cannot be small enough after correction for many tests."""
+"""Minimum number of repeats. With fewer repeats, p-values cannot be small enough after correction for many tests."""
 MIN_FOR_ORDER_STATISTICS: Final = 6  # the range of five values contains the median with a probability of only 93.75 %
 _ROUNDING: Final = 1e-12  # smaller relative deviations are rounding errors of equal shares
 
@@ -55,15 +56,15 @@ class Intervals:
 def wilsons(events: ArrayLike, trials: ArrayLike) -> Intervals:
     """Return the share `events/trials` of each cell with its score interval.
 
-    Its coverage is also correct near 0 and 1, which is typical for packet loss (Wilson 1927, J. Am. Stat. Assoc.
-    22:209). It assumes independent trials; for losses, which occur in bursts, use `shares`.
+    The coverage of the interval is also correct near 0 and 1, values that are typical of packet loss (Wilson 1927,
+    J. Am. Stat. Assoc. 22:209). Independent trials are assumed; for losses, which occur in bursts, use `shares`.
 
     Args:
         events: Number of events, shape (cells,).
         trials: Number of trials, above zero, same shape.
 
     Returns:
-        Shares; without interval if events are more than trials, or negative.
+        Shares; without an interval if there are more events than trials, or if events are negative.
     """
     events, trials = np.asarray(events, dtype=np.float64), np.asarray(trials, dtype=np.float64)
     value, is_share = events / trials, (events >= 0) & (events <= trials)
@@ -81,15 +82,15 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
     the fourth moment of the repeats (Satterthwaite 1946, Biometrics Bull. 2:110), so they are few if one repeat has
     nearly all losses.
 
-    If no repeat lost anything, or all repeats lost everything, the data contain no information about bursts, and each
-    repeat counts as one trial of `wilsons`.
+    If no item was lost, or all items were lost, the data contain no information about bursts, and each repeat is one
+    trial of `wilsons`.
 
     Args:
         lost: Number of lost items of each repeat, shape (cells, n).
         sent: Number of sent items of each repeat, same shape.
 
     Returns:
-        Shares; without interval for n = 1, and if the share is outside 0..1.
+        Shares; without an interval if n is 1 or the share is outside of 0..1.
     """
     lost, sent = np.asarray(lost, dtype=np.float64), np.asarray(sent, dtype=np.float64)
     n, total = lost.shape[1], sent.sum(axis=1)
@@ -110,16 +111,15 @@ def shares(lost: ArrayLike, sent: ArrayLike) -> Intervals:
 
 
 def mean_shares(values: ArrayLike) -> Intervals:
-    """Return the mean of shares of each cell, one share per repeat: `shares` with equal weights.
+    """Return the mean of the shares of each cell, one share per repeat: `shares` with equal weights.
 
-    It is better than `means`, because it accounts for the bounds of a share: even if no repeat has a loss, the upper
-    end is above 0.
+    Unlike `means`, it accounts for the bounds of a share: even if no repeat has a loss, the upper end is above 0.
 
     Args:
         values: Shares, shape (cells, n).
 
     Returns:
-        Means; cells with a share outside 0..1 have the interval of `means`.
+        Means; cells with a share outside of 0..1 have the interval of `means`.
     """
     values = np.asarray(values, dtype=np.float64)
     intervals = shares(values, np.ones_like(values))
@@ -133,15 +133,15 @@ def mean_shares(values: ArrayLike) -> Intervals:
 def means(values: ArrayLike) -> Intervals:
     """Return the mean over repeats of each cell with its interval.
 
-    It is the second-order form of the bootstrap-t interval without resampling: a cubic transformation removes the
-    skewness of the t statistic (Hall 1992, J. R. Stat. Soc. B 54:221). The result has Student's distribution, with
-    degrees of freedom that account for outliers (as in `shares`).
+    The interval is the second-order form of the bootstrap-t interval, without resampling: a cubic transformation
+    removes the skewness of the t statistic (Hall 1992, J. R. Stat. Soc. B 54:221). The transformed statistic has
+    Student's distribution, with degrees of freedom that account for outliers (as in `shares`).
 
     Args:
         values: Shape (cells, n).
 
     Returns:
-        Means; without interval for n = 1.
+        Means; without an interval if n is 1.
     """
     values = np.asarray(values, dtype=np.float64)
     n, value = values.shape[1], values.mean(axis=1)
@@ -166,24 +166,25 @@ def medians(
 ) -> Intervals:
     """Return the median over repeats of each cell with its interval.
 
-    For six or more repeats the ends are order statistics: the innermost two that contain the median with a
-    probability of at least 95 % for any distribution, by a binomial sum (Thompson 1936, Ann. Math. Stat. 7:122). For
-    fewer repeats no two order statistics reach 95 %: the interval is then the union of Student's interval, which
-    assumes a normal distribution, and the range of the repeats, whose coverage for any distribution is `assured`.
+    For six or more repeats, the ends are order statistics: the innermost two that contain the median with a
+    probability of at least 95 % for any distribution, computed with a binomial sum (Thompson 1936, Ann. Math. Stat.
+    7:122). With fewer repeats, no two order statistics reach 95 %. The interval is then the union of Student's
+    interval, which assumes a normal distribution, and the range of the repeats, whose coverage for any distribution
+    is `assured`.
 
-    A right-censored repeat has its lower bound as value, and infinity as `upper`. The lower end is computed from the
-    lower bounds and the upper end from the upper bounds, so the interval contains the interval that would result if
-    all values were known. With fewer than six repeats of which any is censored, the interval is only the range of the
+    The value of a right-censored repeat is its lower bound, and its `upper` is infinity. The lower end is computed
+    from the lower bounds and the upper end from the upper bounds, so the interval contains the interval that would
+    result if all values were known. If one of fewer than six repeats is censored, the interval is the range of the
     repeats.
 
     Args:
         values: Shape (cells, n).
-        least: Smallest possible value: 0 for a time.
+        least: Smallest possible value, for example 0 for a time.
         most: Largest possible value.
         upper: Upper bound of each value, same shape, infinity if unknown; None if it equals `values`.
 
     Returns:
-        Medians; without interval for n = 1, and with infinity for an unknown upper end.
+        Medians; without an interval if n is 1. An unknown upper end is infinity.
     """
     values = np.asarray(values, dtype=np.float64)
     upper_bounds = values if upper is None else np.asarray(upper, dtype=np.float64)
@@ -217,8 +218,8 @@ def assured(n: int) -> float:
 def student(freedom: Floats) -> Floats:
     """Return the 97.5 % quantile of Student's t with `freedom` degrees of freedom, 1 or at least 2, of any shape.
 
-    Fisher and Cornish's expansion, with a fifth term that makes it exact at 2. The relative error is below 2e-4
-    (compared with scipy, which would be a dependency for this function only).
+    This is Fisher and Cornish's expansion with a fifth term, which makes it exact at 2. The relative error is below
+    2e-4 (compared with scipy, which would be a dependency for this function only).
     """
     inverse = 1 / np.asarray(freedom, dtype=np.float64)
     series = NORMAL + inverse * np.polyval((_LAST_TERM, *reversed(_SERIES)), inverse)
@@ -243,7 +244,7 @@ def _squares_and_freedom(deviations: Floats) -> tuple[Floats, Floats]:
 
 @lru_cache(maxsize=1024)
 def _lower_rank(n: int) -> int:
-    """Return the rank, from 1, of the order statistic that is the lower end of a median's interval."""
+    """Return the rank (from 1) of the order statistic that is the lower end of the interval of a median."""
     logs = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, n + 1)))])
     tails = np.cumsum(np.exp(logs[n] - logs - logs[::-1] - n * math.log(2)))  # P(at most k of n below the median)
     return int(np.searchsorted(tails, (1 - CONFIDENCE) / 2, side="right"))

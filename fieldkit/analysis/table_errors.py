@@ -1,4 +1,4 @@
-"""Invalid tables: the first invalid line and its error, impossible values, contradictions between columns."""
+"""Checks of tables: the first invalid line and its error, impossible values, contradictions between columns."""
 
 import csv
 import io
@@ -24,15 +24,15 @@ _SPREADSHEET_REMEDY: Final = (
 
 
 def are_possible(values: Numbers, column: Column) -> bool:
-    """Return True if all values of a column are possible or missing; same rule as `Column.invalid_value_reason`."""
+    """Return True if all values of a column are possible or missing, by the rule of `Column.invalid_value_reason`."""
     present = values[~np.isnan(values)]
     low, high = column.possible if column.type is not bool else (0, 1)
-    fits = (present >= low) & (present <= high)
-    return bool((fits & (present == np.floor(present))).all() if column.type is int else fits.all())
+    is_in_range = (present >= low) & (present <= high)
+    return bool((is_in_range & (present == np.floor(present))).all() if column.type is int else is_in_range.all())
 
 
 def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantity]) -> Quantity | None:
-    """Return a counted quantity whose share contradicts its counts; None if there is no contradiction.
+    """Return a counted quantity whose share contradicts its counts, or None if there is no contradiction.
 
     Args:
         numbers: Columns, or the numbers of one row; NaN if missing. A share is compared only if both counts exist.
@@ -49,11 +49,11 @@ def contradiction(numbers: Mapping[str, ArrayLike], quantities: Iterable[Quantit
 
 
 def first_problem(where: str, content: bytes, declared: Mapping[str, Column]) -> FieldkitError | None:
-    """Return the error of the first invalid line; None if all lines are valid.
+    """Return the error of the first invalid line, or None if all lines are valid.
 
     Args:
         where: The file, for messages.
-        content: Its bytes.
+        content: Content of the file.
         declared: The columns that must be valid.
     """
     try:
@@ -106,9 +106,9 @@ def _quoted_cell(text: str) -> str:
 
 
 def _newer_schema_error(where: str, version: float) -> FieldkitError:
-    """Return the error of a table that a newer fieldkit wrote."""
+    """Return the error of a table that a newer version of fieldkit wrote."""
     return ConfigurationError(
-        f"written by a newer fieldkit: its schema is {version:.0f}, this version reads up to {SCHEMA_VERSION}",
+        f"a newer fieldkit wrote it: its schema version is {version:.0f}, but this one reads up to {SCHEMA_VERSION}",
         where=where,
         remedy="upgrade fieldkit",
     )

@@ -1,4 +1,4 @@
-"""Tables of repeats in files: the trial.csv of one trial, or thousands of them, read together."""
+"""Reading of tables of repeats: the trial.csv of one trial or of thousands of trials."""
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +23,7 @@ _SPREADSHEET_MARKS: Final = {
     b"schema_version\t": ("its cells are separated by tabs", "with commas"),
     b"s\x00c\x00h\x00e\x00m\x00a\x00": ("its encoding is UTF-16", "as UTF-8"),
 }
-"""Problem, and how to save the file instead, by the start of a header that a spreadsheet wrote in another format."""
+"""Problem and correct format, by the start of a header that a spreadsheet wrote in another format."""
 _BATCH_BYTES: Final = 1 << 25
 _MAX_HEADER_BYTES: Final = 1 << 20
 
@@ -35,37 +35,38 @@ def read(
     content: Callable[[Path], bytes] = Path.read_bytes,
     indexed: "IndexedRows | None" = None,
 ) -> Repeats:
-    """Return the rows of many tables, in the order of `paths`; columns that a table does not have are missing.
+    """Return the rows of many tables, in the order of `paths`. Columns that a table does not have are missing.
 
-    Tables with the same header are parsed together, some tens of megabytes at a time, because the start of pyarrow's
+    Tables with the same header are parsed together, some tens of megabytes at a time, because starting pyarrow's
     parser takes longer than parsing the 40 rows of a trial.
 
     Args:
-        paths: CSV files with the columns of trial.csv, of any schema version up to the schema version of this
-            fieldkit.
+        paths: CSV files with the columns of trial.csv, of any schema version up to that of this version of fieldkit.
         declared: The columns of trial.csv.
-        columns: Names of the columns to read, None for all; the columns of `IDENTITY` are always read.
+        columns: Names of the columns to read; None for all columns. The columns of `IDENTITY` are always read.
         content: Function that reads the bytes of a table.
-        indexed: Rows of some of the tables, which are used instead.
+        indexed: Rows of some of the tables. They are used instead of the files.
 
     Raises:
-        ConfigurationError: A file cannot be read, is not a table of repeats, or was written by a newer fieldkit.
+        ConfigurationError: A file cannot be read, is not a table of repeats, or a newer version of fieldkit wrote it.
         EvidenceError: A line is invalid.
     """
     requested = None if columns is None else {*columns, *IDENTITY}
-    named = {name: column for name, column in by_name(declared).items() if requested is None or name in requested}
+    columns_by_name = {
+        name: column for name, column in by_name(declared).items() if requested is None or name in requested
+    }
     batches: dict[bytes, _Batch] = {}
     parts: list[Repeats] = []
     order: list[NDArray[np.int64]] = []
 
     def parse_batch(batch: _Batch) -> None:
-        part, counts = batch.parse(named)
+        part, counts = batch.parse(columns_by_name)
         parts.append(part)
         order.append(np.repeat(batch.numbers, counts))
 
     indexed_paths = frozenset[Path]()
     paths = list(paths)
-    if indexed is not None and (from_index := _read_indexed(indexed, paths, named)) is not None:
+    if indexed is not None and (from_index := _read_indexed(indexed, paths, columns_by_name)) is not None:
         indexed_paths = indexed.tables
         parts.append(from_index[0])
         order.append(from_index[1])
@@ -73,11 +74,11 @@ def read(
         if path in indexed_paths:
             continue
         if path.is_dir():
-            dataset = _read_dataset(path, named)
+            dataset = _read_dataset(path, columns_by_name)
             parts.append(dataset)
             order.append(np.full(len(dataset), number))
             continue
-        if content == Path.read_bytes and (large := _read_large(path, named)) is not None:
+        if content == Path.read_bytes and (large := _read_large(path, columns_by_name)) is not None:
             parts.append(large)
             order.append(np.full(len(large), number))
             continue
@@ -90,22 +91,22 @@ def read(
             parse_batch(batches.pop(header))
     for batch in batches.values():
         parse_batch(batch)
-    rows = _concatenated(parts or [parse_rows((), b"", named)])
+    rows = _concatenated(parts or [parse_rows((), b"", columns_by_name)])
     numbers = np.concatenate(order) if order else np.empty(0, np.int64)
     return rows if (np.diff(numbers) >= 0).all() else rows.where(np.argsort(numbers, kind="stable"))
 
 
 class IndexedRows(Protocol):
-    """Rows of tables that were parsed and checked before."""
+    """Rows of tables that have already been parsed and checked."""
 
     @property
     def tables(self) -> frozenset[Path]:
-        """The tables."""
+        """The tables whose rows are available."""
 
     def read(
         self, tables: Sequence[Path], declared: Mapping[str, Column]
     ) -> tuple[dict[str, parsing.Numbers], dict[str, parsing.Texts], list[int]] | None:
-        """Return columns as `parsing.columns`, and the number of rows of each table; None if they cannot be used."""
+        """Return columns as `parsing.columns`, and the number of rows of each table; None if they are not usable."""
 
 
 def _read_indexed(
@@ -133,8 +134,8 @@ def typed_tables(
         declared: The columns of all tables; all values of a table must be valid.
 
     Yields:
-        The columns, and the tables in the order of their rows with their numbers of rows. The number is -1 for a
-        table that is invalid, or that must be read line by line.
+        The columns, and the tables with their numbers of rows, in the order of the rows. The number is -1 for a table
+        that is invalid or must be read line by line.
     """
     batches: dict[bytes, _Batch] = {}
     for number, (path, content) in enumerate(tables):
@@ -216,7 +217,7 @@ class _Batch:
     def typed(
         self, declared: Mapping[str, Column]
     ) -> Iterator[tuple[Mapping[str, parsing.ArrowColumn], list[tuple[Path, int]]]]:
-        """Yield the items of `typed_tables`: one for all tables, or one per table if any of them is invalid."""
+        """Yield the items of `typed_tables`: one item for all tables, or one item per table if a table is invalid."""
         present = {name: column for name, column in declared.items() if name in self.names}
         counts = [body.count(b"\n") for body in self.bodies]
         columns = _typed(self.names, b"".join(self.bodies), present, sum(counts))
@@ -239,18 +240,18 @@ class _Batch:
 def _typed(
     names: Sequence[str], body: bytes, declared: Mapping[str, Column], rows: int
 ) -> Mapping[str, parsing.ArrowColumn] | None:
-    """Return the Arrow columns of lines; None if a value is invalid or a line is not a row."""
+    """Return the Arrow columns of lines, or None if a value is invalid or a line is not a row."""
     try:
-        columns, parsed = parsing.csv_columns(names, body, declared)
-        values, texts = parsing.arrow_columns(columns, declared, parsed)
+        columns, row_count = parsing.csv_columns(names, body, declared)
+        values, texts = parsing.arrow_columns(columns, declared, row_count)
     except ValueError:
         return None
-    is_valid = parsed == rows and _is_valid(Repeats(values, texts, tuple(declared.values())), declared)
+    is_valid = row_count == rows and _is_valid(Repeats(values, texts, tuple(declared.values())), declared)
     return columns if is_valid else None
 
 
 def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
-    """Return the rows of a dataset of Parquet files; errors as `datasets.read`, or if a value is not possible."""
+    """Return the rows of a dataset of Parquet files; raises as `datasets.read`, and if a value is not possible."""
     from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
 
     numbers, texts, rows = datasets.read(path, declared)
@@ -261,9 +262,9 @@ def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
 
 
 def _read_large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
-    """Return the rows of a large table, read in blocks; None for a small or an invalid table.
+    """Return the rows of a large table, which is read in blocks, or None for a small or invalid table.
 
-    Raises the errors of `_header` for an invalid header.
+    Raises as `_header` for an invalid header.
     """
     with _readable(path):
         if path.stat().st_size < 2 * _BATCH_BYTES:
@@ -316,7 +317,7 @@ def _split(path: Path, content: Callable[[Path], bytes]) -> tuple[bytes, bytes]:
 
 
 def _check_line_end(path: Path, body: bytes) -> None:
-    """Check that a table's last line has a line feed; the last number of a truncated line can lack digits.
+    """Check that the last line of a table ends with a line feed: the last number of a truncated line can lack digits.
 
     Raises:
         EvidenceError: The line feed is missing.
@@ -338,15 +339,18 @@ def _header(path: Path, header: bytes) -> tuple[str, ...]:
             f"it lacks {', '.join(missing)}" if missing else f"it has more than one column {', '.join(duplicates)}"
         )
         remedy = "name the folder of a trial or its trial.csv; its columns: fieldkit columns"
-        for mark, (problem, instead) in _SPREADSHEET_MARKS.items():
+        for mark, (problem, correct_format) in _SPREADSHEET_MARKS.items():
             if missing and mark in header.replace(b'"', b""):
-                reason, remedy = problem, f"save it again {instead}, or name the trial.csv in the trial's folder"
+                reason, remedy = (
+                    problem,
+                    f"save it again {correct_format}, or name the trial.csv in the trial's folder",
+                )
         raise ConfigurationError(f"this is not a table of repeats: {reason}", where=str(path), remedy=remedy)
     return names
 
 
 def _concatenated(parts: Sequence[Repeats]) -> Repeats:
-    """Return the rows of all parts; each column of the parts is freed after it was joined, to save memory."""
+    """Return the rows of all parts. To save memory, the columns of the parts are freed after they were joined."""
     numbers, texts = ([dict(getattr(part, kind)) for part in parts] for kind in ("numbers", "texts"))
     names, words, columns = list(numbers[0]), list(texts[0]), parts[0].columns
     return Repeats(

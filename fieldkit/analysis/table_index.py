@@ -1,12 +1,12 @@
-"""An index of many tables: their rows, parsed and typed, in one file of the user's cache.
+"""An index of many tables: a file in the user's cache with their parsed rows.
 
-The tables take precedence over the index: an entry is used only if device, inode, size, modification time and change
-time of the table and of the `trial.yaml` next to it are the same as when these files were read. A program can restore
-a modification time, but not the change time. A file that changed less than `SETTLED_S` before it was read gets no
-entry, because a later change within the resolution of the time stamps would not be detected.
+An entry is used only if the table and the `trial.yaml` next to it have not changed since they were read: device,
+inode, size, modification time and change time must be the same. A program can restore a modification time, but not
+the change time. A file that changed less than `SETTLED_S` before it was read has no entry, because a later change
+within the resolution of the time stamps would not be detected.
 
 The file consists of a Parquet file, a JSON description of the tables, the length of the description, a digest
-(BLAKE2b) of all of these, and `MAGIC`. A file that is damaged or belongs to another user is ignored.
+(BLAKE2b) of these parts, and `MAGIC`. A file that is damaged or belongs to another user is ignored.
 """
 
 import hashlib
@@ -32,15 +32,15 @@ from fieldkit.core.columns import Column
 
 MAGIC: Final = b"fkindex1"
 SETTLED_S: Final = 2.0
-"""The coarsest resolution of time stamps (FAT)."""
+"""Coarsest resolution of time stamps (FAT), in seconds."""
 MAX_FILES: Final = 20
-"""Number of indexes that are kept."""
+"""Maximum number of indexes in the cache."""
 _DIGEST_BYTES: Final = 32
 _LENGTH_BYTES: Final = 8
 _SUFFIX: Final = ".index"
 _TEMPORARY_SUFFIX: Final = ".new"
-_LEFT_OVER_S: Final = 86_400
-"""Age of a temporary file that a killed process left behind."""
+_MAX_TEMPORARY_AGE_S: Final = 86_400
+"""Older temporary files are removed, because the process that created them was killed."""
 
 
 class FileStamp(NamedTuple):
@@ -67,7 +67,7 @@ TableStamp = tuple[FileStamp, FileStamp | None]
 
 
 def stamp(table: Path, plan: Path) -> TableStamp | None:
-    """Return the stamps of a table and its plan; None if either is not a regular file, which is not indexed."""
+    """Return the stamps of a table and its plan, or None if one of them is not a regular file: it is not indexed."""
     try:
         table_status = table.stat()
     except OSError:
@@ -88,9 +88,9 @@ class TableFacts:
     """The properties of a table that are needed before its rows.
 
     Attributes:
-        names: Names of its columns.
-        declarations: The columns that its plan declares, as JSON.
-        expected: Expectations in its plan.
+        names: Names of the table's columns.
+        declarations: Columns that the table's plan declares, as JSON.
+        expected: Expectations in the table's plan.
     """
 
     names: tuple[str, ...]
@@ -103,11 +103,12 @@ class Entry:
     """A table in an index.
 
     Attributes:
-        path: Its absolute path when it was read.
-        stamp: Its stamps.
-        facts: Its properties.
-        start: Index of its first row.
-        rows: Number of its rows; negative if a value is invalid, so that the table is always read itself.
+        path: Absolute path of the table when it was read.
+        stamp: Stamps of the table.
+        facts: Properties of the table.
+        start: Index of the table's first row.
+        rows: Number of the table's rows; negative if a value is invalid, so that the table must be read from its
+            file.
     """
 
     path: str
@@ -146,14 +147,14 @@ class TableIndex:
         file = pa.parquet.ParquetFile(pa.BufferReader(self.content))
         present = [name for name in declared if name in self.types]
         table = file.read(columns=present, use_threads=True)
-        by_name = {name: table.column(name).cast(arrow_type(declared[name])) for name in present}
-        numbers, texts = arrow_columns(by_name, declared, len(table))
-        chosen = _ranges(entries)
-        if len(chosen) == len(table) and (chosen == np.arange(len(table))).all():
+        columns_by_name = {name: table.column(name).cast(arrow_type(declared[name])) for name in present}
+        numbers, texts = arrow_columns(columns_by_name, declared, len(table))
+        selection = _ranges(entries)
+        if len(selection) == len(table) and (selection == np.arange(len(table))).all():
             return numbers, texts
         return (
-            {name: column[chosen] for name, column in numbers.items()},
-            {name: column[chosen] for name, column in texts.items()},
+            {name: column[selection] for name, column in numbers.items()},
+            {name: column[selection] for name, column in texts.items()},
         )
 
 
@@ -182,16 +183,16 @@ def cache_folder() -> Path:
 
 
 def index_path(tables: Sequence[str]) -> Path:
-    """Return the index file of tables with these absolute paths: one per folder that they have in common."""
+    """Return the index file of tables with these absolute paths. Each common parent folder has one index file."""
     common = os.path.commonpath(tables)
     return cache_folder() / f"{hashlib.blake2b(os.fsencode(common), digest_size=16).hexdigest()}{_SUFFIX}"
 
 
 def load(path: Path) -> TableIndex:
-    """Return the index in a file; an empty one if there is no file, or if it is damaged or of another version.
+    """Return the index in a file. The index is empty if the file is missing, damaged or of another version.
 
     Raises:
-        OSError: The file cannot be read, or it or its folder can be written by another user.
+        OSError: The file cannot be read, or another user can write the file or its folder.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -245,7 +246,7 @@ def _description(entries: Iterable[Entry], types: Mapping[str, str]) -> bytes:
 
 
 class IndexWriter:
-    """Writes an index in a temporary file, which replaces the old index at the end.
+    """Writes an index to a temporary file, which replaces the old index at the end.
 
     Args:
         file: The temporary file.
@@ -260,11 +261,11 @@ class IndexWriter:
         self._rows = 0
 
     def add(self, columns: Mapping[str, pa.ChunkedArray], tables: Iterable[Entry]) -> None:
-        """Add the rows of some tables; columns that they do not have are missing.
+        """Add the rows of some tables. Columns that they do not have are missing.
 
         Args:
-            columns: Columns of Arrow, of the types of `arrow_type`.
-            tables: The tables in the order of their rows; their `start` is replaced.
+            columns: Arrow columns with the types of `arrow_type`.
+            tables: The tables in the order of their rows. Their `start` is replaced.
         """
         total = 0
         for entry in tables:
@@ -299,7 +300,7 @@ class IndexWriter:
 
 
 def _column(column: pa.ChunkedArray | None, kind: pa.DataType, rows: int) -> pa.ChunkedArray | pa.Array:
-    """Return a column, or a column in which all values are missing; a missing text is empty."""
+    """Return the column, or a column of missing values if it is None. A missing text is empty."""
     if column is not None:
         return column
     if pa.types.is_dictionary(kind):
@@ -312,7 +313,7 @@ def replacing(path: Path, types: Mapping[str, str]) -> Iterator[IndexWriter]:
     """Replace an index file atomically at the end of the body.
 
     Raises:
-        OSError: It cannot be written; an existing index is unchanged.
+        OSError: The file cannot be written. An existing index is unchanged.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     _require_private(path.parent.stat(), path.parent)
@@ -334,9 +335,11 @@ def replacing(path: Path, types: Mapping[str, str]) -> Iterator[IndexWriter]:
 def _remove_old(folder: Path) -> None:
     """Remove the oldest indexes beyond `MAX_FILES`, and temporary files of processes that were killed."""
     with suppress(OSError):  # another process has removed it
-        by_age = sorted(folder.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
-        left_over = [
-            path for path in folder.glob(f"*{_TEMPORARY_SUFFIX}") if path.stat().st_mtime < time.time() - _LEFT_OVER_S
+        newest_first = sorted(folder.glob(f"*{_SUFFIX}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+        old_temporary_files = [
+            path
+            for path in folder.glob(f"*{_TEMPORARY_SUFFIX}")
+            if path.stat().st_mtime < time.time() - _MAX_TEMPORARY_AGE_S
         ]
-        for path in (*by_age[MAX_FILES:], *left_over):
+        for path in (*newest_first[MAX_FILES:], *old_temporary_files):
             path.unlink()

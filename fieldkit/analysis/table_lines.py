@@ -1,4 +1,4 @@
-"""Lines of tables: selection of quantities, their labels, and formatting of a cell's figure."""
+"""Lines of tables: selection of quantities, labels, and formatting of the figures of cells."""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from fieldkit.analysis.quantities import Quantity, in_order
 from fieldkit.core.columns import plain_name, step_prefixed
 
 _RADIO: Final = ("ip_loss", "tcp_byte_loss")
-"""Loss on the radio by protocol: IP packets of UDP; bytes of TCP, which TCP retransmitted."""
+"""Columns of the loss on the radio: IP packets for UDP, and bytes for TCP, which TCP retransmits."""
 
 _OPERATOR: Final = (
     "file_loss",
@@ -39,7 +39,7 @@ _SENT: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "iperf3 datagrams sent": ("iperf3_loss",),
     }
 )
-"""Names of losses by the label of a count of sent items. The count is `trials` of the first loss that a cell has."""
+"""Names of losses, by the label of the number of sent items. This number is `trials` of the first loss in a cell."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class TableLine:
 
     Attributes:
         label: Label of the line.
-        quantities: Quantities; the first one that a cell has is shown.
-        payload_bytes: ICMP payload sizes of the cells in this line; None for all cells.
+        quantities: Quantities of the line; the first quantity that a cell has is shown.
+        payload_bytes: ICMP payload sizes of the cells in this line; None if the line includes all cells.
     """
 
     label: str
@@ -57,7 +57,7 @@ class TableLine:
     payload_bytes: tuple[int, ...] | None = None
 
     def estimate(self, cell: Cell) -> Estimate | None:
-        """Return a cell's estimate in this line; None if it has none."""
+        """Return the estimate of a cell in this line, or None if the cell has no estimate."""
         if not self._includes(cell):
             return None
         names = (quantity.name for quantity in self.quantities)
@@ -81,7 +81,7 @@ class TableLine:
         return wording.scale_of(self.quantities[0], [estimate.value for estimate in estimates])
 
     def number(self, cell: Cell, scale: wording.Scale) -> str:
-        """Return a cell's figure with its interval, without unit: `3.33 [1.10, 6.70] (4 of 5)`."""
+        """Return a cell's figure with its interval, without a unit, such as `3.33 [1.10, 6.70] (4 of 5)`."""
         estimate = self.estimate(cell)
         if estimate is None:
             return self._no_value(cell)
@@ -102,20 +102,20 @@ class TableLine:
 
 
 def part_of(n: int, cell: Cell) -> str:
-    """Return `4 of 5` if only some of a cell's valid repeats have a value; empty if all have."""
+    """Return a text such as `4 of 5` if only some of a cell's valid repeats have a value, otherwise an empty text."""
     return f"{n} of {cell.n_valid}" if n < cell.n_valid else ""
 
 
 def lines(cells: Sequence[Cell], quantities: Iterable[Quantity] | None = None) -> list[TableLine]:
-    """Return a line per quantity that any cell has, or measured without a value, in order.
+    """Return a line for each quantity that was measured in a cell, even if it has no value, in order.
 
-    An RTT has a line per payload size.
+    An RTT has a line for each payload size.
 
     Args:
         cells: The cells of the table.
         quantities: The quantities to show; None for all.
     """
-    # A dict keeps the order of columns for quantities of equal rank; the order of a set changes from run to run.
+    # A dict preserves the order of columns for quantities of equal rank. The order of a set differs from run to run.
     available = dict.fromkeys(estimate.quantity for cell in cells for estimate in cell.estimates.values())
     available |= dict.fromkeys(quantity for cell in cells for quantity in cell.quantities_without_value)
     shown = (
@@ -138,13 +138,13 @@ def _quantity_lines(quantity: Quantity, cells: Sequence[Cell]) -> Iterator[Table
 
 
 def _payload_label(quantity: Quantity, sizes: Sequence[int]) -> str:
-    """Return the label of round-trip times for these payload sizes: `RTT, 8192-byte ping, median`."""
+    """Return the label of round-trip times for these payload sizes, such as `RTT, 8192-byte ping, median`."""
     size = f"{sizes[0]}" if len(sizes) == 1 else f"{sizes[0]}- to {sizes[-1]}" if sizes else "unknown"
     return wording.label(replace(quantity, label=f"{quantity.label}, {size}-byte ping"))
 
 
 def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> list[TableLine]:
-    """Return the lines for an operator during a trial, in order; all lines if none of these exists.
+    """Return the lines for an operator during a trial, in order, or all lines if there are no such lines.
 
     These are losses, delays, throughput and signal; quantities with an expectation; and quantities that the lab added
     to a procedure.
@@ -154,9 +154,9 @@ def operator_lines(cells: Sequence[Cell], expected: Collection[str] = ()) -> lis
         expected: Names of quantities with an expectation.
     """
     all_lines = lines(cells)
-    chosen = [line for line in all_lines if _is_for_operator(line.quantities[0], expected)]
-    chosen.sort(key=lambda line: _operator_rank(line.quantities[0]))
-    return chosen or all_lines
+    operator_lines = [line for line in all_lines if _is_for_operator(line.quantities[0], expected)]
+    operator_lines.sort(key=lambda line: _operator_rank(line.quantities[0]))
+    return operator_lines or all_lines
 
 
 def _is_for_operator(quantity: Quantity, expected: Collection[str]) -> bool:
@@ -169,17 +169,17 @@ def _operator_rank(quantity: Quantity) -> int:
     return _OPERATOR.index(name) if name in _OPERATOR else len(_OPERATOR)
 
 
-def with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> list[TableLine]:
-    """Return the lines, with the radio losses of UDP and of TCP merged into one line per step if no cell has both."""
-    return list(_with_radio_loss(chosen, cells))
+def with_radio_loss(lines: Sequence[TableLine], cells: Sequence[Cell]) -> list[TableLine]:
+    """Return the lines, with one line per step for the radio losses of UDP and TCP if no cell has both losses."""
+    return list(_with_radio_loss(lines, cells))
 
 
-def _with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> Iterator[TableLine]:
+def _with_radio_loss(lines: Sequence[TableLine], cells: Sequence[Cell]) -> Iterator[TableLine]:
     radio: dict[str, list[TableLine]] = {}
-    for line in chosen:
+    for line in lines:
         if plain_name(line.quantities[0].name) in _RADIO:
             radio.setdefault(line.quantities[0].step, []).append(line)
-    for line in chosen:
+    for line in lines:
         step = line.quantities[0].step
         losses = radio.get(step, [])
         can_merge = all(sum(loss.estimate(cell) is not None for loss in losses) < 2 for cell in cells)
@@ -190,7 +190,7 @@ def _with_radio_loss(chosen: Sequence[TableLine], cells: Sequence[Cell]) -> Iter
 
 
 def sent_counts(cells: Sequence[Cell]) -> dict[str, list[str]]:
-    """Return the number of items that the valid repeats of each cell sent, by label; an empty text if unknown."""
+    """Return the number of items that the valid repeats of each cell sent, by label. An unknown number is empty."""
     steps = dict.fromkeys(estimate.quantity.step for cell in cells for estimate in cell.estimates.values())
     counts_by_label: dict[str, list[str]] = {}
     for step in steps:
@@ -202,11 +202,11 @@ def sent_counts(cells: Sequence[Cell]) -> dict[str, list[str]]:
 
 
 def _trial_count(cell: Cell, names: Sequence[str]) -> str:
-    """Return `trials` of the first of these counted quantities that a cell has."""
+    """Return `trials` of the first of these counted quantities in a cell; empty without one."""
     trials = (cell.estimates[name].trials for name in names if name in cell.estimates)
     return next((f"{count}" for count in trials if count is not None), "")
 
 
 def _with_step(step: str, label: str) -> str:
-    """Return a label with the name of its step as prefix, as in `columns.with_step_name`."""
+    """Return a label with the name of its step as a prefix, as in `columns.with_step_name`."""
     return f"{step}: {label}" if step else label

@@ -31,7 +31,7 @@ class Scale:
     Attributes:
         factor: Factor from the SI unit.
         unit: Unit symbol; empty for counts.
-        decimals: Decimals of numbers below 100; larger numbers have none.
+        decimals: Number of decimals of numbers below 100; larger numbers have no decimals.
     """
 
     factor: float
@@ -50,7 +50,7 @@ class Scale:
         return f"{self.number(value)} {self.unit}".rstrip()
 
     def head(self, label: str) -> str:
-        """Return the head of a column of numbers: `RTT, median (ms)`."""
+        """Return the head of a column of numbers, such as `RTT, median (ms)`."""
         return f"{label} ({self.unit})" if self.unit else label
 
     def interval(self, low: float | None, high: float | None) -> str:
@@ -61,18 +61,19 @@ class Scale:
 
 
 def interval(scale: Scale, estimate: Estimate) -> str:
-    """Return the interval of an estimate with the marks `*` and `!` (see `cautions`); empty if it has no interval."""
+    """Return the interval of an estimate with the marks `*` and `!` (see `cautions`); empty without an interval."""
     text = scale.interval(estimate.low, estimate.high)
     return text and text + ("*" if assumes_normal(estimate) else "") + ("!" if is_dependent(estimate) else "")
 
 
 def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
-    """Return the value of an estimate without its unit, as `>= 2.30` if it is a lower bound.
+    """Return the value of an estimate without its unit; a lower bound is written as `>= 2.30`.
 
     Args:
         scale: Scale of the number.
         estimate: The estimate.
-        other: Its mean or 95th percentile, to be used instead; a lower bound if any repeat is censored.
+        other: Mean or 95th percentile of the estimate, which is used instead of its value. It is a lower bound if a
+            repeat is censored.
     """
     if other is not None:
         return f"{at_least(estimate.n_censored > 0)}{scale.number(other)}"
@@ -80,7 +81,7 @@ def number(scale: Scale, estimate: Estimate, other: float | None = None) -> str:
 
 
 def amount(scale: Scale, estimate: Estimate) -> str:
-    """Return the value of an estimate with its unit, as `>= 2.30 s` if it is a lower bound."""
+    """Return the value of an estimate with its unit; a lower bound is written as `>= 2.30 s`."""
     return f"{at_least(estimate.is_lower_bound)}{scale.amount(estimate.value)}"
 
 
@@ -90,7 +91,7 @@ def at_least(is_bound: bool) -> str:
 
 
 def incomplete(estimate: Estimate) -> str:
-    """Return the number of repeats with a value, `7 of 10`, and of censored repeats; empty if all have a value."""
+    """Return a text such as `7 of 10, 2 of 7 not ended` if repeats lack a value or are censored; otherwise empty."""
     parts = []
     if estimate.missing:
         parts.append(f"{estimate.n} of {estimate.n_valid}")
@@ -100,7 +101,7 @@ def incomplete(estimate: Estimate) -> str:
 
 
 def with_interval(figure: str, scale: Scale, estimate: Estimate, between: str = " ") -> str:
-    """Return a figure with its interval, and with the number of repeats unless all have a value.
+    """Return a figure with its interval and, if repeats lack a value, the number of repeats.
 
     Args:
         figure: Result of `number` or `amount`.
@@ -108,8 +109,8 @@ def with_interval(figure: str, scale: Scale, estimate: Estimate, between: str = 
         estimate: The estimate.
         between: Separator of the parts.
     """
-    part = incomplete(estimate)
-    return between.join(filter(None, (figure, interval(scale, estimate), f"({part})" if part else "")))
+    note = incomplete(estimate)
+    return between.join(filter(None, (figure, interval(scale, estimate), f"({note})" if note else "")))
 
 
 def assumes_normal(estimate: Estimate) -> bool:
@@ -123,7 +124,7 @@ def is_dependent(estimate: Estimate) -> bool:
 
 
 def cautions(cells: Sequence[Cell], names: Collection[str] | None = None) -> Iterator[str]:
-    """Yield the explanation of each mark of intervals, with advice.
+    """Yield an explanation of each mark of intervals, with advice.
 
     Args:
         cells: The cells that are shown.
@@ -164,7 +165,7 @@ def scale(quantity: Quantity, cells: Sequence[Cell]) -> Scale:
 
 
 def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
-    """Return the common scale for values of a quantity; shares are in per cent."""
+    """Return a common scale for values of a quantity. Shares are in per cent."""
     largest = max(map(abs, values), default=0.0)
     if quantity.unit == "bit/s":
         return Scale(1e-6, "Mbit/s") if largest >= _MIN_IN_MBIT_BIT_S else Scale(1e-3, "kbit/s")
@@ -178,7 +179,7 @@ def scale_of(quantity: Quantity, values: Sequence[float]) -> Scale:
 
 
 def time_scale(time_s: float) -> Scale:
-    """Return the scale for times of this magnitude: milliseconds, or seconds from 10 s."""
+    """Return the scale for times of this magnitude: seconds from 10 s on, otherwise milliseconds."""
     return Scale(1e3, "ms") if time_s < _MIN_IN_SECONDS_S else Scale(1.0, "s")
 
 
@@ -188,12 +189,12 @@ def label(quantity: Quantity) -> str:
 
 
 def with_estimates(cells: Sequence[Cell], quantities: Sequence[Quantity]) -> list[Quantity]:
-    """Return the quantities that any of the cells has."""
+    """Return the quantities that are in at least one of the cells."""
     return [quantity for quantity in quantities if any(quantity.name in cell.estimates for cell in cells)]
 
 
 def measured(cells: Sequence[Cell]) -> tuple[Quantity, ...]:
-    """Return the quantities that any of the cells has, in order."""
+    """Return the quantities that are in at least one of the cells, in order."""
     return in_order(estimate.quantity for cell in cells for estimate in cell.estimates.values())
 
 
@@ -205,8 +206,8 @@ def key(cell: Cell, name: str) -> str:
 def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[str], list[str]]:
     """Return the columns in which the cells differ, and the columns in which all cells are equal.
 
-    Redundant columns are omitted: the distance in metres if `by` has the operator's text, and the procedure if it has
-    the same name as the scenario in all cells.
+    Redundant columns are omitted: the distance in metres if `by` contains the operator's text, and the procedure if
+    its name equals the scenario in all cells.
     """
     redundant = {"distance_m"} if "distance" in by else set()
     if {"procedure", "scenario"} <= set(by) and all(cell.key["procedure"] == cell.key["scenario"] for cell in cells):
@@ -216,17 +217,17 @@ def varying_and_common(by: Sequence[str], cells: Sequence[Cell]) -> tuple[list[s
 
 
 def counts(cell: Cell) -> str:
-    """Return the number of attempts of a cell by final status: `20 valid, 1 void`."""
+    """Return the number of attempts of a cell by final status, such as `20 valid, 1 void`."""
     return status_counts({Status.VALID: cell.n_valid, Status.VOID: cell.n_void, Status.FAILED: cell.n_failed})
 
 
 def word_labels(cells: Sequence[Cell]) -> dict[str, str]:
-    """Return the labels of the word columns that any of the cells has, by name and in order."""
+    """Return the labels of the word columns in the cells, by name and in order."""
     return {name: tally.label for cell in cells for name, tally in cell.tallies.items()}
 
 
 def tally(cell: Cell, name: str, between: str = ", ") -> str:
-    """Return the number of valid repeats of a cell for each word of a column: `wet 12, dry 7, 1 without`."""
+    """Return the number of valid repeats for each word of a column, such as `wet 12, dry 7, 1 without`."""
     words = cell.tallies.get(name)
     if words is None:
         return ""
@@ -235,12 +236,12 @@ def tally(cell: Cell, name: str, between: str = ", ") -> str:
 
 
 def tally_text(words: Tally) -> str:
-    """Return the number of repeats for each word: `wet 12, dry 7`."""
+    """Return the number of repeats for each word, such as `wet 12, dry 7`."""
     return ", ".join(_word_counts(words))
 
 
 def _word_counts(words: Tally) -> Iterator[str]:
-    """Yield the most frequent words with their counts, and the number and count of all others."""
+    """Yield the most frequent words with their counts, then the number of other words with their total count."""
     listed = list(words.counts.items())
     n_shown = _MAX_WORDS if len(listed) > _MAX_WORDS + 1 else len(listed)
     for word, count in listed[:n_shown]:
@@ -251,5 +252,5 @@ def _word_counts(words: Tally) -> Iterator[str]:
 
 
 def status_counts(numbers: Mapping[str, int]) -> str:
-    """Return the numbers of attempts by final status: `20 valid, 1 void`."""
+    """Return the numbers of attempts by final status, such as `20 valid, 1 void`."""
     return ", ".join(f"{numbers[status]} {status}" for status in ENDED if numbers.get(status)) or "none"

@@ -124,7 +124,7 @@ class Trials:
     @cached_property
     def repeats(self) -> Table:
         """A row per attempt at a repeat, including void and failed ones, as in `fieldkit export --format parquet`."""
-        return table.of_repeats(self._attempts)
+        return table.repeats_table(self._attempts)
 
     def cells(self, by: str | Iterable[str] = DEFAULT_BY, quantities: str | Iterable[str] | None = None) -> Table:
         """Return a row per condition and quantity with value and 95 % interval, as printed by `fieldkit aggregate`.
@@ -136,12 +136,12 @@ class Trials:
         Raises:
             ConfigurationError: There is no such column, or it cannot be aggregated.
         """
-        chosen, words = self._sources.select(_names(quantities or ()), option="quantities")
+        selected_quantities, words = self._sources.select(_names(quantities or ()), option="quantities")
         keys = self._sources.condition(",".join(_names(by)), option="by")
         self._warn_of_mixtures(keys)
-        declared = {column.name: column for column in (*self._attempts.columns, _SOURCE)}
-        cells = aggregate(self._attempts, keys, quantities=chosen, words=words)
-        return table.of_cells([declared[name] for name in keys], cells)
+        columns_by_name = {column.name: column for column in (*self._attempts.columns, _SOURCE)}
+        cells = aggregate(self._attempts, keys, quantities=selected_quantities, words=words)
+        return table.cells_table([columns_by_name[name] for name in keys], cells)
 
     def cell(self, **condition: str | float) -> TrialCell:
         """Return the figures of the only cell that matches a condition: `trials.cell(protocol="udp").file_loss.high`.
@@ -183,13 +183,13 @@ class Trials:
             EvidenceError: The attempt's evidence is missing, changed or insufficient.
         """
         row = self._attempts.row(repeat)
-        evidence, at = self._evidence_of(row)
-        attempt, plan = evidence.attempt(at), evidence.plan(at)
+        evidence, evidence_row = self._evidence_of(row)
+        attempt, plan = evidence.attempt(evidence_row), evidence.plan(evidence_row)
         source = self._attempts.texts[SOURCE][row]
         if attempt is None or plan is None:
             remedy = "load the folder of a trial with unchanged raw evidence"
             raise EvidenceError(
-                "; ".join((f"the evidence of {repeat} is not available", *evidence.unread)),
+                "; ".join((f"the evidence of {repeat} is not available", *evidence.limitations)),
                 where=source,
                 remedy=remedy,
             )
@@ -198,15 +198,15 @@ class Trials:
             for transfer in planned_evidence.transfers(plan, Protocol(self._attempts.texts["protocol"][row]))
         }
         if step is not None and step not in transfers:
-            named = ", ".join(map(repr, transfers)) or "none"
+            names_text = ", ".join(map(repr, transfers)) or "none"
             raise ConfigurationError(
                 f"no transfer of {plan.procedure.name} is named {step!r}",
                 where=source,
-                remedy=did_you_mean(step, transfers, f"its transfers: {named}"),
+                remedy=did_you_mean(step, transfers, f"its transfers: {names_text}"),
             )
-        selected = transfers if step is None else {step: transfers[step]}
-        return table.of_packets(
-            {name: fates.read_sent_packets(attempt, transfer) for name, transfer in selected.items()}
+        selected_transfers = transfers if step is None else {step: transfers[step]}
+        return table.packets_table(
+            {name: fates.read_sent_packets(attempt, transfer) for name, transfer in selected_transfers.items()}
         )
 
     def __len__(self) -> int:
@@ -241,11 +241,11 @@ def _note(sentence: str, stacklevel: int = 2) -> None:
 def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", use_index: bool = True) -> Trials:
     """Return the trials at some paths.
 
-    Notes of `fieldkit aggregate`, for example on a trial that is left out, are issued as `UserWarning`.
+    Notes of `fieldkit aggregate`, for example about an omitted trial, are issued as `UserWarning`.
 
     Args:
         paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
-        rebuild: Whether to measure the raw evidence again instead of reading trial.csv; nothing is written.
+        rebuild: True to compute values from the raw evidence instead of reading trial.csv; nothing is written.
         where: Condition of the attempts to use, `distance_m < 20 and topology == "master"`; empty for all.
         use_index: Whether to read many tables from an index in the user's cache; the result is the same.
 
@@ -256,7 +256,7 @@ def load(*paths: str | PathLike[str], rebuild: bool = False, where: str = "", us
     """
     if not paths:
         raise ConfigurationError("no path is given", remedy='write for example fieldkit.load("trials")')
-    # Processes that read plans would import the main module of a script, which may not be prepared for it.
+    # Worker processes would import the main module of a script, and run it again if it has no `__main__` guard.
     workers = sources.ALL_PROCESSORS if rebuild else Workers(jobs=1)
     trial_sources = sources.find(
         [Path(path) for path in paths], _note, rebuild=rebuild, workers=workers, use_index=use_index

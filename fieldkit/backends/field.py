@@ -39,7 +39,10 @@ class FieldBackend:
     lab_bytes: Final = 0
 
     def __init__(
-        self, site: Site | None, document: Document | None, ask: passwords.Ask = passwords.at_terminal
+        self,
+        site: Site | None,
+        document: Document | None,
+        ask: passwords.PasswordSource = passwords.read_from_terminal,
     ) -> None:
         if site is None or document is None:
             raise ConfigurationError(
@@ -72,10 +75,13 @@ class FieldBackend:
                     where=self._document.where(("robots", robot.name)),
                     remedy="add address: to it",
                 )
-            others = [other.name for other in cast.values() if other.address == robot.address and other is not robot]
-            if others:
+            same_address_names = [
+                other.name for other in cast.values() if other.address == robot.address and other is not robot
+            ]
+            if same_address_names:
                 raise ConfigurationError(
-                    f"robots {robot.name!r} and {others[0]!r} have the same address on the radio, {robot.address}",
+                    f"robots {robot.name!r} and {same_address_names[0]!r} have the same address on the radio, "
+                    f"{robot.address}",
                     where=self._document.where(("robots", robot.name)),
                     remedy="correct address: of one of them",
                 )
@@ -125,7 +131,7 @@ class FieldBackend:
             self._passwords[name],
             patience_s=self._site.patience,
             notice=lambda text: sink(Note(text)),
-            on_air=self._site.control is Control.RADIO,
+            crosses_radio=self._site.control is Control.RADIO,
         )
 
 
@@ -230,14 +236,14 @@ class FieldTestbed:
         except Exception as error:
             try:
                 self._bring_back(name)
-            except ConfigurationError as unanswered:
-                unanswered.what += f"; before, the move failed: {describe_exception(error)}"
+            except ConfigurationError as operator_error:
+                operator_error.what += f"; before, the move failed: {describe_exception(error)}"
                 raise
             raise
         self._bring_back(name)
 
     def bring_back(self, role: Role, *, has_returned: bool) -> None:
-        """Ask the operator to bring a robot back that did not drive back; see `Testbed.bring_back`."""
+        """Ask the operator to bring back a robot that did not drive back; see `Testbed.bring_back`."""
         if not has_returned:
             self._bring_back(self._cast[role].name)
 

@@ -46,12 +46,14 @@ class SshAccess(Protocol):
         ...
 
 
-def find_password(name: str, access: SshAccess, ask: passwords.Ask = passwords.at_terminal) -> str | None:
+def find_password(
+    name: str, access: SshAccess, ask: passwords.PasswordSource = passwords.read_from_terminal
+) -> str | None:
     """Return the password of a robot from its source; None if it needs no password. Raises as `passwords`."""
     source = access.password
     if source is None:
         return None
-    read_password = ask if source == "ask" else passwords.in_keyring
+    read_password = ask if source == "ask" else passwords.read_from_keyring
     return read_password(access.user or "", access.host or "", name)
 
 
@@ -62,7 +64,7 @@ def open_shell(
     *,
     patience_s: float = PATIENCE_S,
     notice: Callable[[str], None] = lambda _: None,
-    on_air: bool = False,
+    crosses_radio: bool = False,
 ) -> SshShell:
     """Return the connection to a robot, which is opened at its first use.
 
@@ -72,7 +74,7 @@ def open_shell(
         password: Its password; None if it needs no password.
         patience_s: As for `SshShell`.
         notice: Called with a line of text when the connection is lost or restored.
-        on_air: Whether the connection crosses the radio under test.
+        crosses_radio: Whether the connection crosses the radio under test.
 
     Raises:
         ConfigurationError: The private key cannot be used, or the host key is not valid.
@@ -89,5 +91,5 @@ def open_shell(
         port=access.port,
         patience_s=patience_s,
         notice=notice,
-        on_air=on_air,
+        crosses_radio=crosses_radio,
     )

@@ -86,22 +86,24 @@ def _links_of(
     name: str, profile: RobotProfile, addresses: Mapping[str, str], document: Document | None
 ) -> dict[str, RobotLink]:
     where = document.where(("robots", name)) if document else ""
-    further = profile.further_links
+    further_links = profile.further_links
     for link in addresses:
-        if link not in further:
+        if link not in further_links:
             raise ConfigurationError(
                 f"{name} has an address on the link {link!r}, which its profile {profile.name} does not have",
                 where=where,
-                remedy=did_you_mean(link, further, f"further links of the profile: {', '.join(further) or 'none'}"),
+                remedy=did_you_mean(
+                    link, further_links, f"further links of the profile: {', '.join(further_links) or 'none'}"
+                ),
             )
-    missing = [link for link in further if link not in addresses]
+    missing = [link for link in further_links if link not in addresses]
     if missing:
         raise ConfigurationError(
             f"{name} has no address on the link {missing[0]!r} of its profile {profile.name}",
             where=where,
             remedy=f"add links: {{{missing[0]}: ADDRESS}} to it",
         )
-    return {link: RobotLink(interface=further[link], address=address) for link, address in addresses.items()}
+    return {link: RobotLink(interface=further_links[link], address=address) for link, address in addresses.items()}
 
 
 def _runs_ros1(profile: RobotProfile) -> bool:
@@ -120,12 +122,16 @@ def profiles_of(site: Site, document: Document | None, robots: Iterable[str]) ->
         ConfigurationError: A profile is invalid, does not exist, or is of a robot that no trial can use; the message
             has the line of the site file.
     """
-    loaded: dict[str, RobotProfile] = {}
+    profiles_by_name: dict[str, RobotProfile] = {}
     profiles = {}
     for robot in robots:
         name = site.robots[robot].profile
         with document.locating_errors("robots", robot, "profile") if document else nullcontext():
-            profiles[robot] = loaded[name] if name in loaded else loaded.setdefault(name, load_profile(name))
+            profiles[robot] = (
+                profiles_by_name[name]
+                if name in profiles_by_name
+                else profiles_by_name.setdefault(name, load_profile(name))
+            )
             if reason := profiles[robot].unsupported:
                 remedy = "give this robot another profile, or remove it from the site file"
                 raise ConfigurationError(f"no trial can use the profile {name}: {reason}", remedy=remedy)

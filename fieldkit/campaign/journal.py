@@ -43,7 +43,7 @@ class CampaignEntry:
         took_s: Duration of placing the robots, in seconds.
         valid: Number of valid repeats.
         failed: Number of failed repeats.
-        unmet: Number of expectations that its figures do not prove.
+        unmet: Number of expectations that are not shown to hold.
     """
 
     utc_ns: int
@@ -101,25 +101,25 @@ class CampaignJournal:
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)
 
-    def ended(self) -> dict[str, CampaignEntry]:
-        """Return the last entry of each trial that has ended; a trial that was started again is omitted."""
-        ended: dict[str, CampaignEntry] = {}
+    def end_entries(self) -> dict[str, CampaignEntry]:
+        """Return the last entry of each trial that has ended, by name; trials that were started again are omitted."""
+        end_entries: dict[str, CampaignEntry] = {}
         for entry in self._entries:
             if entry.progress is TrialProgress.ENDED:
-                ended[entry.planned] = entry
+                end_entries[entry.planned] = entry
             elif entry.progress is TrialProgress.STARTED:
-                ended.pop(entry.planned, None)
-        return ended
+                end_entries.pop(entry.planned, None)
+        return end_entries
 
-    def interrupted(self, planned: PlannedTrial) -> Path | None:
+    def interrupted_folder(self, planned: PlannedTrial) -> Path | None:
         """Return the folder of a trial that started and has not ended, or None if there is nothing to resume."""
         entries = (entry for entry in self._entries if entry.planned == str(planned))
-        started = [entry.trial for entry in entries if entry.progress is TrialProgress.STARTED]
-        folder = self.folder / started[-1] if started else None
+        folder_names = [entry.trial for entry in entries if entry.progress is TrialProgress.STARTED]
+        folder = self.folder / folder_names[-1] if folder_names else None
         return folder if folder and (folder / PLAN_FILE).is_file() else None
 
     def placing_s(self, assumed_s: float) -> float:
-        """Return the mean duration of placing robots so far; `assumed_s` before the first time."""
+        """Return the mean duration of placing robots, or `assumed_s` if robots were never placed."""
         return fmean(
             [entry.took_s for entry in self._entries if entry.progress is TrialProgress.PLACED] or [assumed_s]
         )

@@ -45,7 +45,7 @@ Order = tuple[PlannedTrial, ...]
 DEFAULT_WALK: Final = 3.0
 """Default limit on the path, as a multiple of the shortest path."""
 
-_WALKERS: Final = {Topology.MASTER: 2, Topology.MASTERLESS: 1}
+_CARRIED_ROBOTS: Final = {Topology.MASTER: 2, Topology.MASTERLESS: 1}
 _SWAPS_PER_TRIAL: Final = 50
 _ROUNDING_M: Final = 1e-6
 
@@ -60,7 +60,7 @@ def walk_m(trials: Iterable[PlannedTrial]) -> float:
     for topology, block in groupby(trials, key=lambda trial: trial.topology):
         position_m = 0.0
         for trial in block:
-            total_m += _WALKERS[topology] * abs(trial.distance.metres - position_m)
+            total_m += _CARRIED_ROBOTS[topology] * abs(trial.distance.metres - position_m)
             position_m = trial.distance.metres
     return total_m
 
@@ -73,7 +73,7 @@ def shortest(trials: Sequence[PlannedTrial]) -> Order:
     return tuple(chain.from_iterable(min(_sweeps(block), key=walk_m) for block in _blocks(trials)))
 
 
-def shuffled(trials: Sequence[PlannedTrial], *, seed: int, limit_m: float) -> Order:
+def shuffle(trials: Sequence[PlannedTrial], *, seed: int, limit_m: float) -> Order:
     """Return a random order whose path is at most `limit_m`.
 
     This is a random walk over the orders within the limit: two blocks or trials are swapped at random, and the swap
@@ -86,15 +86,15 @@ def shuffled(trials: Sequence[PlannedTrial], *, seed: int, limit_m: float) -> Or
         limit_m: At least the path of `shortest`.
     """
     rng = random.Random(seed)  # noqa: S311 (not for cryptography)
-    order = shortest(sorted(trials, key=_blocks_of))
+    order = shortest(sorted(trials, key=_block_keys))
     for _ in range(_SWAPS_PER_TRIAL * len(order)):
-        other = _swapped(order, rng)
-        if walk_m(other) <= limit_m + _ROUNDING_M:
-            order = other
+        candidate = _swap_blocks(order, rng)
+        if walk_m(candidate) <= limit_m + _ROUNDING_M:
+            order = candidate
     return order
 
 
-def _blocks_of(trial: PlannedTrial) -> tuple[str | float, ...]:
+def _block_keys(trial: PlannedTrial) -> tuple[str | float, ...]:
     """Return the keys of the blocks that contain a trial, from the outermost to the trial itself."""
     return trial.topology, trial.scenario, trial.distance.metres, trial.procedure
 
@@ -116,11 +116,11 @@ def _sweeps(block: list[PlannedTrial]) -> Iterator[list[PlannedTrial]]:
             ]
 
 
-def _swapped(order: Order, rng: random.Random) -> Order:
-    """Return the order after a swap of two random blocks of the same larger block; both may be the same block."""
-    depth = 1 + _random_index(len(_blocks_of(order[0])), rng)
-    blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _blocks_of(trial)[:depth])]
-    parents = [_blocks_of(block[0])[: depth - 1] for block in blocks]
+def _swap_blocks(order: Order, rng: random.Random) -> Order:
+    """Return the order after a swap of two random blocks in the same larger block, which may be the same one."""
+    depth = 1 + _random_index(len(_block_keys(order[0])), rng)
+    blocks = [tuple(block) for _, block in groupby(order, key=lambda trial: _block_keys(trial)[:depth])]
+    parents = [_block_keys(block[0])[: depth - 1] for block in blocks]
     first = _random_index(len(blocks), rng)
     siblings = [index for index, parent in enumerate(parents) if parent == parents[first]]
     second = siblings[_random_index(len(siblings), rng)]

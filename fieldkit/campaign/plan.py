@@ -74,7 +74,7 @@ class CampaignFile(Strict):
         seed: Seed of the order and of all randomness in the trials, from 0.
         walk: Maximum distance over which the robots are carried in total, `300m`; without it, three times the
             shortest path.
-        left_out: List of exclusions: trials that match every key of an entry are left out.
+        left_out: List of exclusions: trials that match every key of an entry are excluded.
         expect: [Expectations](values.md#expectations) of every trial that measures the figure, in addition to the
             expectations of its procedure.
     """
@@ -138,7 +138,7 @@ def trials_of(
     """Return the trials of a campaign in the order of its file.
 
     Raises:
-        ConfigurationError: An entry under `except` leaves out nothing, or nothing is left.
+        ConfigurationError: An entry under `except` excludes no trial, or all trials are excluded.
     """
     combinations = [
         PlannedTrial(procedure.name, procedure.scenario, topology, distance)
@@ -153,12 +153,12 @@ def trials_of(
                 where=document.where(("except", index)),
                 remedy="use values of procedures, topologies and distances",
             )
-    kept = tuple(trial for trial in combinations if not _is_excluded(trial, campaign.left_out))
-    if not kept:
+    included = tuple(trial for trial in combinations if not _is_excluded(trial, campaign.left_out))
+    if not included:
         raise ConfigurationError(
             "except leaves out every trial", where=document.where(("except",)), remedy="leave out fewer"
         )
-    return kept
+    return included
 
 
 def _is_excluded(trial: PlannedTrial, exclusions: Iterable[Exclusion]) -> bool:
@@ -186,8 +186,8 @@ class CampaignPlan(Strict):
 
     def trials(self) -> tuple[PlannedTrial, ...]:
         """Return the trials in order."""
-        by_name = {str(trial): trial for trial in trials_of(self.campaign, self.procedures, _empty_document())}
-        return tuple(by_name[name] for name in self.order)
+        trials_by_name = {str(trial): trial for trial in trials_of(self.campaign, self.procedures, _empty_document())}
+        return tuple(trials_by_name[name] for name in self.order)
 
     def procedure(self, trial: PlannedTrial) -> Procedure:
         """Return the procedure of a trial."""
@@ -218,7 +218,7 @@ def make_plan(path: Path, backend: str) -> tuple[CampaignPlan, Document]:
         session=secrets.token_hex(8),
         campaign=campaign,
         procedures=procedures,
-        order=tuple(map(str, order.shuffled(trials, seed=campaign.seed, limit_m=limit_m))),
+        order=tuple(map(str, order.shuffle(trials, seed=campaign.seed, limit_m=limit_m))),
     )
     return plan, document
 
@@ -228,7 +228,7 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
 
     Args:
         folder: The campaign's folder.
-        current_plan: The plan of its file now.
+        current_plan: The plan of the present file.
         document: The document of the file.
 
     Raises:
@@ -237,12 +237,12 @@ def started_plan(folder: Path, current_plan: CampaignPlan, document: Document) -
     if not (folder / CAMPAIGN_FILE).is_file():
         return None
     plan = schema.load(folder / CAMPAIGN_FILE, CampaignPlan)
-    frozen, current = _keys(plan), _keys(current_plan)
-    changed = [key for key in current if current[key] != frozen[key]]
-    if changed:
+    frozen_values, current_values = _keys(plan), _keys(current_plan)
+    changed_keys = [key for key in current_values if current_values[key] != frozen_values[key]]
+    if changed_keys:
         raise ConfigurationError(
-            f"changed since the campaign started: {', '.join(changed)}",
-            where=document.where((changed[0],)),
+            f"changed since the campaign started: {', '.join(changed_keys)}",
+            where=document.where((changed_keys[0],)),
             remedy=f"undo that ({folder / CAMPAIGN_FILE} has the old values), or start another campaign: change name",
         )
     return plan
@@ -284,7 +284,7 @@ def _unmeasured_trials(folder: Path, sources: Collection[str]) -> Iterator[str]:
         for source in sources
         if Path(source).absolute().parent == folder.absolute() and (Path(source) / PLAN_FILE).is_file()
     ]
-    measured = {(plan.procedure.name, plan.topology, plan.distance_m) for plan in plans}
+    measured_conditions = {(plan.procedure.name, plan.topology, plan.distance_m) for plan in plans}
     for trial in schema.load(folder / CAMPAIGN_FILE, CampaignPlan).trials():
-        if (trial.procedure, trial.topology, trial.distance.metres) not in measured:
+        if (trial.procedure, trial.topology, trial.distance.metres) not in measured_conditions:
             yield str(trial)

@@ -41,7 +41,7 @@ class CampaignOutcome:
     Attributes:
         remaining: Trials that have not ended.
         failed: Number of failed repeats in the trials that have ended.
-        unmet: Number of expectations that their figures do not prove.
+        unmet: Number of expectations that are not shown to hold.
         folders: Folders of the trials that have ended.
     """
 
@@ -96,11 +96,13 @@ class CampaignRun:
                 left_most_s=duration.most_s,
             )
         )
-        shortened = (
+        adjustment_lines = (
             line for trial in remaining for line in self._plan.procedure(trial).adjustments(self._plans[trial].cast)
         )
-        undecided = (line for trial in remaining for line in shortfalls.undecidable_expectations(self._plans[trial]))
-        for line in dict.fromkeys((*shortened, *undecided)):
+        shortfall_lines = (
+            line for trial in remaining for line in shortfalls.undecidable_expectations(self._plans[trial])
+        )
+        for line in dict.fromkeys((*adjustment_lines, *shortfall_lines)):
             self._sink(Note(line))
 
     def run(self, operator: Operator, stop: Stop) -> CampaignOutcome:
@@ -127,9 +129,9 @@ class CampaignRun:
             finally:
                 done = len(self._trials) - len(self._remaining_trials())
                 self._sink(CampaignEnded(str(self._journal.folder), done, len(self._trials)))
-        ended = self._journal.ended().values()
-        failed, unmet = (sum(getattr(entry, field) for entry in ended) for field in ("failed", "unmet"))
-        folders = tuple(self._journal.folder / entry.trial for entry in ended)
+        end_entries = self._journal.end_entries().values()
+        failed, unmet = (sum(getattr(entry, field) for entry in end_entries) for field in ("failed", "unmet"))
+        folders = tuple(self._journal.folder / entry.trial for entry in end_entries)
         return CampaignOutcome(self._remaining_trials(), failed, unmet, folders)
 
     def _run_trials(self, trials: Sequence[PlannedTrial], operator: Operator, stop: Stop) -> None:
@@ -141,7 +143,7 @@ class CampaignRun:
                 self._backend,
                 cast,
                 session=self._plan.session,
-                what=f"campaign {self._plan.campaign.name}",
+                purpose=f"campaign {self._plan.campaign.name}",
                 seed=self._plan.campaign.seed,
                 sink=self._sink,
                 operator=operator,
@@ -158,7 +160,7 @@ class CampaignRun:
     def _run(self, trial: PlannedTrial, cast: Cast, testbed: Testbed, stop: Stop) -> None:
         total = len(self._trials)
         self._sink(CampaignTrial(str(trial), total - len(self._remaining_trials()) + 1, total))
-        folder = self._journal.interrupted(trial)
+        folder = self._journal.interrupted_folder(trial)
         if folder is None:
             plan = self._trial_plan(trial, cast)
             self._journal.add(trial, TrialProgress.STARTED, trial=plan.trial)
@@ -183,19 +185,21 @@ class CampaignRun:
         self._sink(CampaignWent(str(trial), total - len(remaining), total, duration.likely_s, duration.most_s))
 
     def _restart_failed(self) -> None:
-        """Record a new start of the trials with failed repeats, if these are repeated."""
-        ended = self._journal.ended()
+        """Record a new start of each trial whose failed repeats must be repeated."""
+        end_entries = self._journal.end_entries()
         for trial in self._remaining_trials():
-            if entry := ended.get(str(trial)):
+            if entry := end_entries.get(str(trial)):
                 self._journal.add(trial, TrialProgress.STARTED, trial=entry.trial)
         self._includes_failed = False
 
     def _remaining_trials(self) -> tuple[PlannedTrial, ...]:
         """Return the trials that have not ended. Before `_restart_failed`, this includes ended trials to repeat."""
-        ended = {
-            name for name, entry in self._journal.ended().items() if not (self._includes_failed and entry.failed)
+        ended_names = {
+            name
+            for name, entry in self._journal.end_entries().items()
+            if not (self._includes_failed and entry.failed)
         }
-        return tuple(trial for trial in self._trials if str(trial) not in ended)
+        return tuple(trial for trial in self._trials if str(trial) not in ended_names)
 
     def _needed_and_free_bytes(self, trials: Sequence[PlannedTrial]) -> tuple[int, int]:
         """Return the bytes that trials need, and the bytes that are free in the campaign's folder."""
@@ -214,23 +218,25 @@ class CampaignRun:
         """Return the estimated duration of trials, based on the finished ones."""
         placing_s = self._journal.placing_s(PLACING_S if self._backend.by_hand else 0.0)
         placement = TimeEstimate(placing_s, placing_s)
-        finished = self._finished_repeats()
+        finished_repeats = self._finished_repeats()
         return estimates.total(
-            part for trial in trials for part in (placement, estimates.estimate_trial(self._plans[trial], finished))
+            part
+            for trial in trials
+            for part in (placement, estimates.estimate_trial(self._plans[trial], finished_repeats))
         )
 
     def _finished_repeats(self) -> list[FinishedRepeat]:
         """Return the finished repeats of trials that have ended; trials with unreadable journals are ignored."""
-        finished: list[FinishedRepeat] = []
-        for name, entry in self._journal.ended().items():
+        finished_repeats: list[FinishedRepeat] = []
+        for name, entry in self._journal.end_entries().items():
             plan = next((self._plans[trial] for trial in self._trials if str(trial) == name), None)
             with suppress(EvidenceError):
-                finished += (
+                finished_repeats += (
                     []
                     if plan is None
                     else estimates.finished_repeats(plan, journal.read(self._journal.folder / entry.trial))
                 )
-        return finished
+        return finished_repeats
 
     def _trial_plan(self, trial: PlannedTrial, cast: Cast) -> Plan:
         campaign = self._plan.campaign

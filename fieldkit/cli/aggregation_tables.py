@@ -68,7 +68,7 @@ def show(arguments: argparse.Namespace) -> int:
     text_columns = list(data.words.values()) if words is None else words
     widths = dict(_width(text, quantities) for text in arguments.width)
     _require_units(widths, quantities)
-    needed_names = {name for quantity in quantities for name in quantity.needed} | {
+    needed_names = {name for quantity in quantities for name in quantity.needed_columns} | {
         quantity.name for quantity in text_columns
     }
     mixture_names = {column.name for column in data.columns if plain_name(column.name) in MIXTURE_COLUMNS}

@@ -11,7 +11,7 @@ from fieldkit.core.model import MAX_REPEATS, Protocol, Topology
 from fieldkit.core.text import sanitized
 
 TABLES: Final = ("table", "csv", "json", "markdown")
-PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials somewhere below"
+PATH_HELP: Final = "folder of a trial, CSV file with the columns of trial.csv, or folder with trials at any depth"
 CONDITION: Final = "procedure,scenario,topology,backend,distance,distance_m,protocol"
 """Equal to `analysis.quantities.DEFAULT_BY`; a test compares them."""
 
@@ -37,7 +37,7 @@ def add_site(parser: Parser) -> None:
 def add_operator(parser: Parser) -> None:
     """Add the options for questions to the operator, and one for each permission."""
     answers = parser.add_mutually_exclusive_group()
-    answers.add_argument("--yes", action="store_true", help="ask nothing: the robots are at their positions")
+    answers.add_argument("--yes", action="store_true", help="request nothing: the robots are at their positions")
     answers.add_argument("--answers", metavar="FILE", help="answers, a line per request; -: read from standard input")
     for name, permission in permissions.installed().items():
         parser.add_argument(permissions.option(name), action="store_true", help=permission.help_line)
@@ -49,7 +49,7 @@ def add_junit(parser: Parser) -> None:
         "--junit",
         type=file_to_write,
         metavar="FILE",
-        help="write repeats and expectations as JUnit XML for CI servers, too",
+        help="also write repeats and expectations as JUnit XML for CI servers",
     )
 
 
@@ -68,15 +68,13 @@ def add_json(parser: Parser) -> None:
 
 def add_all(parser: Parser) -> None:
     """Add the option that shows every quantity."""
-    parser.add_argument(
-        "--all", action="store_true", help="show every quantity in the table, not only those for an operator"
-    )
+    parser.add_argument("--all", action="store_true", help="show every quantity in the table, not only the main ones")
 
 
-def add_out(parser: Parser, what: str) -> None:
+def add_out(parser: Parser, contents: str) -> None:
     """Add the option for the folder of results."""
     parser.add_argument(
-        "--out", type=Path, metavar="FOLDER", default=Path("trials"), help=f"where {what} (default: trials/)"
+        "--out", type=Path, metavar="FOLDER", default=Path("trials"), help=f"folder for {contents} (default: trials/)"
     )
 
 
@@ -123,7 +121,7 @@ def add_where(parser: Parser) -> None:
 def add_rebuild(parser: Parser) -> None:
     """Add `--rebuild` and `--no-index`."""
     parser.add_argument(
-        "--rebuild", action="store_true", help="measure the raw evidence again instead of reading trial.csv"
+        "--rebuild", action="store_true", help="compute values from the raw evidence instead of reading trial.csv"
     )
     parser.add_argument(
         "--no-index",

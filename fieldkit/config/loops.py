@@ -83,14 +83,14 @@ class _Expander:
             key_path = (*location, index)
             if isinstance(item, dict) and LOOP in item:
                 if len(item) > 1:
-                    raise self._problem(
+                    raise self._error(
                         "for: must be the only key of its entry", key_path, "start another entry with - for:"
                     )
                 self._append_loop(result, item[LOOP], (*key_path, LOOP), new_location, values)
                 continue
             self._step_count += 1
             if self._step_count > MAX_STEPS:
-                raise self._problem(
+                raise self._error(
                     f"there are more than {MAX_STEPS} steps after for: is expanded", key_path, "give fewer values"
                 )
             result.append(self._copy(item, key_path, (*new_location, len(result)), values))
@@ -106,42 +106,42 @@ class _Expander:
         if not isinstance(loop, dict) or set(loop) != set(_KEYS):
             unknown = [key for key in loop if key not in _KEYS] if isinstance(loop, dict) else []
             what = f"unknown key {unknown[0]} in for:" if unknown else "for: needs each: and during:"
-            raise self._problem(what, (*location, *unknown[:1]), "for: {each: {bytes: [502, 1400]}, during: [...]}")
+            raise self._error(what, (*location, *unknown[:1]), "for: {each: {bytes: [502, 1400]}, during: [...]}")
         if not isinstance(loop["during"], list) or not loop["during"]:
-            raise self._problem(
+            raise self._error(
                 "during: of for: is not a list of steps", (*location, "during"), "write the steps to repeat"
             )
-        variables = self._variables(loop["each"], (*location, "each"), values)
+        variables = self._read_variables(loop["each"], (*location, "each"), values)
         if (count := math.prod(map(len, variables.values()))) > MAX_STEPS:
-            raise self._problem(
+            raise self._error(
                 f"for: has {count} combinations, more than {MAX_STEPS}", (*location, "each"), "give fewer values"
             )
         for combination in itertools.product(*variables.values()):
             inner_values = {**values, **dict(zip(variables, combination, strict=True))}
             self._append(result, loop["during"], (*location, "during"), new_location, inner_values)
 
-    def _variables(self, each: Any, location: Location, outer: Values) -> dict[str, list[Scalar]]:  # noqa: ANN401 (any YAML)
+    def _read_variables(self, each: Any, location: Location, outer: Values) -> dict[str, list[Scalar]]:  # noqa: ANN401 (any YAML)
         """Return the values of each variable of a loop."""
         if not isinstance(each, dict) or not each:
-            raise self._problem("each: of for: has no variable", location, "each: {bytes: [502, 1400]}")
+            raise self._error("each: of for: has no variable", location, "each: {bytes: [502, 1400]}")
         values_by_name: dict[str, list[Scalar]] = {}
         for name, value_list in each.items():
             key_path = (*location, name)
             if not _VARIABLE.fullmatch(name):
-                raise self._problem(
+                raise self._error(
                     f"{name!r} is not a valid variable", key_path, "use lower-case letters, digits and _"
                 )
             if name in outer:
-                raise self._problem(f"{name} is a variable of an enclosing for:", key_path, "give it another name")
+                raise self._error(f"{name} is a variable of an enclosing for:", key_path, "give it another name")
             if not isinstance(value_list, list) or not value_list:
-                raise self._problem(f"the values of {name} are not a list", key_path, f"{name}: [1, 2]")
+                raise self._error(f"the values of {name} are not a list", key_path, f"{name}: [1, 2]")
             values_by_name[name] = [
                 self._copy(item, (*key_path, index), (*key_path, index), outer)
                 for index, item in enumerate(value_list)
             ]
             for index, value in enumerate(values_by_name[name]):
                 if not isinstance(value, Scalar):
-                    raise self._problem(
+                    raise self._error(
                         f"a value of {name} is not a text or a number", (*key_path, index), f"{name}: [1, 2]"
                     )
         return values_by_name
@@ -153,7 +153,7 @@ class _Expander:
             case dict():
                 if unquoted := [key for key, item in value.items() if item is None and key in values]:
                     what = f"without quotes YAML reads {{{unquoted[0]}}} as a mapping"
-                    raise self._problem(what, location, f'put it in quotes: "{{{unquoted[0]}}}"')
+                    raise self._error(what, location, f'put it in quotes: "{{{unquoted[0]}}}"')
                 return {
                     key: (self.expand_steps if key == "during" and isinstance(item, list) else self._copy)(
                         item, (*location, key), (*new_location, key), values
@@ -166,7 +166,7 @@ class _Expander:
                     for index, item in enumerate(value)
                 ]
             case str() if values:
-                return self._substituted(value, location, values)
+                return self._substitute(value, location, values)
         return value
 
     def _copy_line(self, location: Location, new_location: Location) -> None:
@@ -174,23 +174,23 @@ class _Expander:
         if location in self._document.lines:
             self.lines[new_location] = self._document.lines[location]
 
-    def _substituted(self, text: str, location: Location, values: Values) -> Scalar:
+    def _substitute(self, text: str, location: Location, values: Values) -> Scalar:
         """Return a text with variables substituted. A text that consists only of one variable becomes its value."""
 
-        def value_of(match: re.Match[str]) -> Scalar:
+        def matched_value(match: re.Match[str]) -> Scalar:
             if (name := match["name"]) is None:
                 return match[0][0]
             if name not in values:
                 suggestion = did_you_mean(name, values, f"the variables are: {', '.join(values)}")
                 remedy = f"write {{{{{name}}}}} for the text {{{name}}}, or use a variable"
-                raise self._problem(f"there is no variable {name}; {suggestion}", location, remedy)
+                raise self._error(f"there is no variable {name}; {suggestion}", location, remedy)
             return values[name]
 
         if (only_variable := _BRACES.fullmatch(text)) is not None:
-            return value_of(only_variable)
-        return _BRACES.sub(lambda match: _yaml_text(value_of(match)), text)
+            return matched_value(only_variable)
+        return _BRACES.sub(lambda match: _yaml_text(matched_value(match)), text)
 
-    def _problem(self, what: str, location: Location, remedy: str) -> ConfigurationError:
+    def _error(self, what: str, location: Location, remedy: str) -> ConfigurationError:
         return ConfigurationError(what, where=self._document.where(location), remedy=remedy)
 
 

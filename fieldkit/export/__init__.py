@@ -1,1 +1,1 @@
-"""Export of trials for other programs: tables for pandas and R, timelines for Foxglove, JUnit XML."""
+"""Export of trials to other programs: tables for pandas and R, timelines for Foxglove, JUnit XML."""

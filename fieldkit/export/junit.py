@@ -1,6 +1,6 @@
-"""Trials as JUnit XML for CI servers: a suite per trial, a case per repeat and per expectation.
+"""Trials as JUnit XML for CI servers: a suite for each trial, a case for each repeat and each expectation.
 
-The format is the xunit schema of Jenkins, which GitLab, GitHub Actions and others read.
+The format is the xunit schema of Jenkins, which GitLab, GitHub Actions and other servers read.
 """
 
 from collections import defaultdict
@@ -23,11 +23,11 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.stored import plans
 
 _SEPARATOR: Final = "."
-"""Separator of class names, by which servers group cases."""
+"""Separator in class names. Servers group cases by class names."""
 
 
 def write(path: Path, folders: Iterable[Path]) -> None:
-    """Write trials into a file; an existing file is replaced.
+    """Write trials to a file. An existing file is replaced.
 
     Args:
         path: The file.
@@ -42,11 +42,11 @@ def write(path: Path, folders: Iterable[Path]) -> None:
 
 
 def text(folders: Iterable[Path]) -> bytes:
-    """Return trials as XML; errors as for `write`."""
+    """Return trials as XML; raises as `write`."""
     top = ET.Element("testsuites", name="fieldkit")
-    # A list, because `extend` converts an exception of an iterator into a TypeError.
+    # This is a list, because `extend` converts an exception of an iterator to a TypeError.
     top.extend([_suite(folder) for folder in folders])
-    for element in top.iter():  # all texts and attributes, from any source
+    for element in top.iter():  # sanitizes all texts and attributes, which can have any source
         element.text = element.text and sanitized(element.text)
         element.attrib.update({name: sanitized(value) for name, value in element.attrib.items()})
     ET.indent(top)
@@ -67,31 +67,31 @@ def _suite(folder: Path) -> ET.Element:
 
 
 def _repeat_cases(plan: Plan, entries: Iterable[JournalEntry]) -> Iterator[ET.Element]:
-    """Yield a case per planned repeat, in order; a repeat that has not ended is skipped."""
-    of_repeat = defaultdict[RepeatId, list[JournalEntry]](list)
+    """Yield a case for each planned repeat, in order. The case of a repeat that has not ended is skipped."""
+    entries_by_repeat = defaultdict[RepeatId, list[JournalEntry]](list)
     for entry in entries:
-        of_repeat[entry.repeat].append(entry)
+        entries_by_repeat[entry.repeat].append(entry)
     for repeat in plan.repeats_in_order():
-        took_s, reasons = 0.0, list[str]()
-        started_ns, last = 0, Status.PLANNED
-        for entry in of_repeat[repeat]:
+        duration_s, reasons = 0.0, list[str]()
+        started_ns, last_status = 0, Status.PLANNED
+        for entry in entries_by_repeat[repeat]:
             started_ns = entry.utc_ns if entry.status is Status.RUNNING else started_ns
             if entry.status in ENDED:
-                took_s += max(entry.utc_ns - started_ns, 0) / 1e9
+                duration_s += max(entry.utc_ns - started_ns, 0) / 1e9
                 reasons += [f"attempt {entry.attempt} {entry.status}: {entry.reason}"] if entry.reason else []
-            last = entry.status
-        case = ET.Element("testcase", name=str(repeat), time=f"{took_s:.3f}")
-        if last is Status.FAILED:
+            last_status = entry.status
+        case = ET.Element("testcase", name=str(repeat), time=f"{duration_s:.3f}")
+        if last_status is Status.FAILED:
             _add(case, "failure", reasons[-1] if reasons else "")
-        elif last is not Status.VALID:
-            _add(case, "skipped", "it has not ended; fieldkit resume continues the trial")
+        elif last_status is not Status.VALID:
+            _add(case, "skipped", "the repeat has not ended; fieldkit resume continues the trial")
         if reasons:
             ET.SubElement(case, "system-out").text = "\n".join(reasons)
         yield case
 
 
 def _judgements(folder: Path, plan: Plan) -> tuple[Judgement, ...]:
-    """Judge the expectations of a trial; all are undecided before its first attempt has ended."""
+    """Return the judgements of a trial's expectations. All are undecided before the first attempt has ended."""
     if not plan.procedure.expect:
         return ()
     table = folder / store.TRIAL_CSV

@@ -1,4 +1,4 @@
-"""Writer of JSON messages to an MCAP file; the only module of fieldkit that writes MCAP.
+"""Writer of JSON messages to an MCAP file.
 
 File format: https://mcap.dev/spec. JSON for Foxglove: https://docs.foxglove.dev, custom schema encodings.
 """
@@ -23,10 +23,10 @@ class Channel:
     """A channel of the file.
 
     Attributes:
-        name: Its name.
-        schema: JSON Schema of its messages; its title is the name of the schema.
-        clock: The clock of its times.
-        meaning: Description of its messages.
+        name: Name of the channel.
+        schema: JSON Schema of the messages; its title is the name of the schema.
+        clock: Clock of the messages' times.
+        meaning: Description of the messages.
     """
 
     name: str
@@ -40,9 +40,9 @@ class Message:
     """A message.
 
     Attributes:
-        channel: Its channel.
-        time_ns: Its time in nanoseconds since 1970 UTC, by the channel's clock.
-        content: Its values; they conform to the channel's schema.
+        channel: Channel of the message.
+        time_ns: Time of the message by the channel's clock, in nanoseconds since 1970 UTC.
+        content: Values of the message, which conform to the channel's schema.
     """
 
     channel: Channel
@@ -51,12 +51,12 @@ class Message:
 
 
 def write(file: BinaryIO, about: Mapping[str, str], messages: Iterable[Message]) -> None:
-    """Write messages in chunks; equal messages give equal bytes.
+    """Write messages in chunks. The same messages give the same bytes.
 
     Args:
         file: The output file.
         about: Metadata of the file.
-        messages: Messages in the order of their times, as far as their clocks agree.
+        messages: Messages in the order of their times. Differences between their clocks are ignored.
 
     Raises:
         OSError: The file cannot be written.
@@ -76,7 +76,7 @@ def write(file: BinaryIO, about: Mapping[str, str], messages: Iterable[Message])
 
 
 class _Channels:
-    """The channels of a file by name, and its schemas by title, each registered once."""
+    """The channels of a file by name, and its schemas by title. Each of them is registered once."""
 
     def __init__(self, writer: Writer) -> None:
         self._writer = writer

@@ -1,6 +1,6 @@
-"""MCAP messages from the robots' recordings of one attempt; each robot's times are by its clock.
+"""MCAP messages from the robots' recordings of one attempt. Times are by the clock of the recording robot.
 
-The packets of a capture are messages, each with its fate if it is known.
+Each packet of a capture is a message, which contains the packet's fate if it is known.
 """
 
 import heapq
@@ -33,11 +33,15 @@ from fieldkit.trial import planned_evidence
 from fieldkit.trial.journal import Attempt
 from fieldkit.trial.plan import Plan
 
-NOT_KNOWN: Final = -1
+UNKNOWN_FATE: Final = -1
 _SLICE: Final = 1 << 14
 """Number of packets that are converted to Python objects at a time."""
 
-_LOST: Final[tuple[dict[str, bool], ...]] = ({"lost": False}, {"lost": True}, {})  # index -1 (NOT_KNOWN) is the last
+_LOST: Final[tuple[dict[str, bool], ...]] = (
+    {"lost": False},
+    {"lost": True},
+    {},
+)  # index -1 (UNKNOWN_FATE) is the last
 _COPY: Final[tuple[dict[str, bool], ...]] = ({"copy": False}, {"copy": True}, {})
 
 
@@ -47,8 +51,9 @@ class MarkedPackets:
 
     Attributes:
         packets: The packets in the order of the file.
-        lost: 1 if a packet that this robot sent was lost, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
-        copy: 1 if a packet that it received is a duplicate, 0 if not, `NOT_KNOWN` otherwise. Shape (n,).
+        lost: 1 for a sent packet that was lost, 0 for one that arrived, otherwise `UNKNOWN_FATE`. Shape (n,).
+        copy: 1 for a received packet that is a duplicate, 0 for other received packets, otherwise `UNKNOWN_FATE`.
+            Shape (n,).
     """
 
     packets: Packets
@@ -57,7 +62,7 @@ class MarkedPackets:
 
 
 def packet_messages(channel: Channel, repeat: str, captured: MarkedPackets) -> Iterator[Message]:
-    """Yield a message per packet whose time is known, in the order of time.
+    """Yield a message for each packet with a known time, in the order of time.
 
     Args:
         channel: The channel.
@@ -68,9 +73,9 @@ def packet_messages(channel: Channel, repeat: str, captured: MarkedPackets) -> I
     order = np.argsort(time_ns, kind="stable")
     order = order[time_ns[order] != NO_TIME]
     for start in range(0, len(order), _SLICE):
-        chosen = order[start : start + _SLICE]
-        packets = captured.packets.where(chosen)
-        fates = (captured.lost[chosen].tolist(), captured.copy[chosen].tolist())
+        indices = order[start : start + _SLICE]
+        packets = captured.packets.where(indices)
+        fates = (captured.lost[indices].tolist(), captured.copy[indices].tolist())
         for t_ns, fields, lost, copy in zip(packets.time_ns.tolist(), _contents(packets), *fates, strict=True):
             fate = _LOST[lost] | _COPY[copy]
             yield Message(channel, t_ns, {"timestamp": time(t_ns), "repeat": repeat} | fields | fate)
@@ -92,26 +97,26 @@ def _contents(packets: Packets) -> Iterator[dict[str, object]]:
         yield {name: value for name, value in zip(columns, values, strict=True) if value != NO_PORT}
 
 
-# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi without the shortest header.
+# Largest IP payload of a frame that offload did not join: the MTU of Ethernet and Wi-Fi minus the shortest header.
 _LARGEST_PAYLOAD_BYTES: Final = 1480
 
 
 def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer]) -> Mapping[str, MarkedPackets]:
-    """Return the fates of the packets of each capture, as far as they belong to transfers captured at both ends.
+    """Return the packets of each capture. The fates of packets of transfers that both ends captured are known.
 
     Args:
         captures: The captures by file.
-        transfers: The packet filter of each transfer.
+        transfers: The transfers, which identify their packets.
     """
-    marked = {file: _unknown(capture.packets) for file, capture in captures.items()}
-    by_path: dict[tuple[str, str, str, str], list[Transfer]] = {}
+    marked = {file: _with_unknown_fates(capture.packets) for file, capture in captures.items()}
+    transfers_by_path: dict[tuple[str, str, str, str], list[Transfer]] = {}
     for transfer in transfers:
         sender_file, receiver_file = transfer.captures
         if sender_file is not None and receiver_file is not None and {sender_file, receiver_file} <= captures.keys():
-            by_path.setdefault(
+            transfers_by_path.setdefault(
                 (sender_file, receiver_file, transfer.sender_address, transfer.receiver_address), []
             ).append(transfer)
-    for (sender_file, receiver_file, sender, receiver), same_path in by_path.items():
+    for (sender_file, receiver_file, sender, receiver), same_path in transfers_by_path.items():
         matched = _matched(captures[sender_file], captures[receiver_file], same_path)
         if matched is None:
             continue
@@ -124,13 +129,13 @@ def packet_fates(captures: Mapping[str, Capture], transfers: Iterable[Transfer])
     return marked
 
 
-def _unknown(packets: Packets) -> MarkedPackets:
-    lost, copy = np.full((2, len(packets)), NOT_KNOWN, np.int8)
+def _with_unknown_fates(packets: Packets) -> MarkedPackets:
+    lost, copy = np.full((2, len(packets)), UNKNOWN_FATE, np.int8)
     return MarkedPackets(packets, lost, copy)
 
 
 def _matched(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) -> Match | None:
-    """Return the matching packets of two captures, or None if they cannot be matched for all transfers of a path."""
+    """Return the match of the packets of two captures, or None if a transfer of this path makes it impossible."""
     sent, received = sender.packets, receiver.packets
     if sender.damage or receiver.damage:
         return None
@@ -146,21 +151,21 @@ def _matched(sender: Capture, receiver: Capture, same_path: Sequence[Transfer]) 
 
 
 def _is_offloaded(captured: Packets) -> bool:
-    """Return True if a capture has frames of several segments; they differ between the two ends."""
+    """Return True if a capture has frames of several segments, which differ between the two ends."""
     return bool((captured.ip_payload_bytes > _LARGEST_PAYLOAD_BYTES).any())
 
 
 @dataclass(frozen=True, eq=False)
 class AttemptRecord:
-    """The readable recordings of an attempt; missing or unreadable ones are left out.
+    """The readable recordings of an attempt. Missing or unreadable recordings are omitted.
 
     Attributes:
         plan: The trial.
         attempt: The attempt.
-        captures: The captures by file; of a damaged capture the part before the damage.
-        pings: The outputs of ping by file.
-        bags: The recorded bags.
-        links: The samples of the radios' links.
+        captures: Captures by file; a damaged capture contains the packets before the damage.
+        pings: Outputs of ping by file.
+        bags: Contents of the recorded bags by role.
+        links: Samples of the radios' links by role.
     """
 
     plan: Plan
@@ -172,7 +177,7 @@ class AttemptRecord:
 
     @property
     def transfers(self) -> tuple[Transfer, ...]:
-        """The packet filter of each of its transfers."""
+        """The transfers of the attempt."""
         return planned_evidence.transfers(self.plan, self.attempt.repeat.protocol)
 
 
@@ -196,33 +201,33 @@ def read(plan: Plan, attempt: Attempt, evidence: AttemptEvidence) -> AttemptReco
 def omissions(record: AttemptRecord) -> Iterator[Json]:
     """Yield a log message for each part of the evidence that the other messages do not contain."""
 
-    def line(text: str, file: str) -> Json:
+    def log_message(text: str, file: str) -> Json:
         name, t_ns = str(record.attempt.repeat), record.attempt.started_utc_ns
         return schemas.log(t_ns, Level.WARNING, text, name=name, file=f"repeats/{record.attempt.folder}/{file}")
 
     for file, capture in record.captures.items():
         if capture.damage:
-            yield line(capture.damage, file)
+            yield log_message(capture.damage, file)
     for file, pings in record.pings.items():
         if untimed := sum(reply.at_utc_ns is None for reply in pings.replies):
-            yield line(f"{untimed} replies have no time stamp and are left out", file)
+            yield log_message(f"{untimed} replies have no time stamp and are omitted", file)
 
 
 def messages(record: AttemptRecord) -> Iterator[Message]:
-    """Return the messages of the robots' recordings, in the order of their times as far as their clocks agree."""
+    """Return the messages of the robots' recordings, in the order of their times; clock differences are ignored."""
     streams = []
-    marked = packet_fates(record.captures, record.transfers)
+    packets_by_file = packet_fates(record.captures, record.transfers)
     for file, role in planned_evidence.captures(record.plan).items():
         if file in record.captures:
             topic, meaning = (
                 _named("packets", _step(file)),
-                "IP packets in its capture; with segmentation offload, larger frames.",
+                "IP packets in the robot's capture; with segmentation offload, larger frames.",
             )
             channel = _channel(record, role, topic, schemas.PACKET, meaning)
-            streams.append(packet_messages(channel, record.attempt.folder, marked[file]))
+            streams.append(packet_messages(channel, record.attempt.folder, packets_by_file[file]))
     for role in record.plan.cast:
-        short = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
-        streams.append(iter(sorted(short, key=attrgetter("time_ns"))))
+        robot_stream = [*_phases(record, role), *_links(record, role), *_rtts(record, role)]
+        streams.append(iter(sorted(robot_stream, key=attrgetter("time_ns"))))
     return heapq.merge(*streams, key=attrgetter("time_ns"))
 
 
@@ -231,17 +236,17 @@ def _channel(record: AttemptRecord, role: Role, topic: str, schema: Json, meanin
 
 
 def _named(topic: str, step: str) -> str:
-    """Return the name of a topic below the name of its robot: `rtt`, or `rtt/busy` for a step with a name."""
+    """Return the name of a topic relative to its robot: `rtt`, or `rtt/busy` for a step with a name."""
     return f"{topic}/{step}" if step else topic
 
 
 def _step(file: str) -> str:
-    """Return the name of the step of a capture, empty if it has none."""
+    """Return the name of the step of a capture; empty if the step has no name."""
     return Path(file).stem.rpartition(".")[0]
 
 
 def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
-    """Yield the replies to ping that a robot printed, and ICMP errors, at the times of their output."""
+    """Yield the replies and ICMP errors that a robot's ping printed, at the times of printing."""
     for source in planned_evidence.ping_sources(record.plan):
         if source.role == role and source.file in record.pings:
             yield from _replies(record, role, source.name, source.file)
@@ -249,9 +254,7 @@ def _rtts(record: AttemptRecord, role: Role) -> Iterator[Message]:
 
 def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterator[Message]:
     repeat, pings = record.attempt.folder, record.pings[file]
-    channel = _channel(
-        record, role, _named("rtt", step), schemas.RTT, "Replies to ping at the time when each was printed."
-    )
+    channel = _channel(record, role, _named("rtt", step), schemas.RTT, "Replies to ping, at the times of printing.")
     for reply in pings.replies:
         if reply.at_utc_ns is not None:
             yield Message(channel, reply.at_utc_ns, schemas.rtt(reply.at_utc_ns, repeat, reply))
@@ -267,14 +270,14 @@ def _replies(record: AttemptRecord, role: Role, step: str, file: str) -> Iterato
 
 
 def _links(record: AttemptRecord, role: Role) -> Iterator[Message]:
-    channel = _channel(record, role, "link", schemas.LINK, "State of its radio's links, five times a second.")
+    channel = _channel(record, role, "link", schemas.LINK, "State of the radio's links, five times per second.")
     for sample in record.links[role]:
         yield Message(channel, sample.utc_ns, schemas.link(record.attempt.folder, sample))
 
 
 def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
-    """Yield the start and end of a robot's recording, transfer and ping; steps with a name have separate channels."""
-    meaning = "Start and end of its phases, by the first and last time stamp of its evidence."
+    """Yield the start and end of a robot's recording, transfer and ping. Steps with a name have separate channels."""
+    meaning = "Start and end of the robot's phases: first and last time stamp of the evidence."
     for step, phase, begin_ns, end_ns in _spans(record, role):
         channel = _channel(record, role, _named("phase", step), schemas.PHASE, meaning)
         for t_ns, name in ((begin_ns, phase), (end_ns, "idle")):
@@ -282,14 +285,14 @@ def _phases(record: AttemptRecord, role: Role) -> Iterator[Message]:
 
 
 def _spans(record: AttemptRecord, role: Role) -> Iterator[tuple[str, str, int, int]]:
-    """Yield the phases of a robot: the step's name (empty if it has none), the phase, start and end."""
-    if recorded := record.bags.get(role):
-        yield "", "record", recorded.started_utc_ns, recorded.started_utc_ns + round(recorded.duration_s * 1e9)
+    """Yield the phases of a robot: name of the step (empty if it has no name), phase, start and end."""
+    if bag := record.bags.get(role):
+        yield "", "record", bag.started_utc_ns, bag.started_utc_ns + round(bag.duration_s * 1e9)
     for transfer in record.transfers:
         for end, file in zip((transfer.source, transfer.destination), transfer.captures, strict=True):
             if end == role and file is not None and file in record.captures:
                 forward = transfer.forward(record.captures[file].packets)
-                # Other transfers may have the same direction at the same time as one with a name.
+                # If a transfer has a name, another transfer in the same direction may run at the same time.
                 times_ns = (forward.where(forward.dport == transfer.port) if transfer.name else forward).time_ns
                 if len(times_ns) and times_ns.min() != NO_TIME:
                     yield transfer.name, "transfer", int(times_ns.min()), int(times_ns.max())

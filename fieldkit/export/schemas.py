@@ -19,7 +19,7 @@ from fieldkit.trial.columns import IDENTITY, Row
 
 
 class Level(IntEnum):
-    """Level of a log message, by Foxglove's numbers."""
+    """Level of a log message, with Foxglove's numbers."""
 
     INFO = 2
     WARNING = 3
@@ -28,8 +28,8 @@ class Level(IntEnum):
 
 def time(t_ns: int) -> Json:
     """Return a time stamp in the format of Foxglove's messages."""
-    seconds, rest_ns = divmod(t_ns, 1_000_000_000)
-    return {"sec": seconds, "nsec": rest_ns}
+    seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
+    return {"sec": seconds, "nsec": nanoseconds}
 
 
 def log(t_ns: int, level: Level, text: str, *, name: str, file: str, line: int = 0) -> Json:
@@ -37,11 +37,11 @@ def log(t_ns: int, level: Level, text: str, *, name: str, file: str, line: int =
 
     Args:
         t_ns: Time in nanoseconds since 1970 UTC.
-        level: Its level.
-        text: Its text.
-        name: The repeat.
-        file: File of the trial that it refers to.
-        line: Line in this file, 0 for the whole file.
+        level: Level of the message.
+        text: Text of the message.
+        name: Name of the repeat.
+        file: File of the trial that the message refers to.
+        line: Line in this file; 0 for the whole file.
     """
     return {"timestamp": time(t_ns), "level": level, "message": text, "name": name, "file": file, "line": line}
 
@@ -74,7 +74,7 @@ def _present(values: Mapping[str, Any]) -> Json:
 
 
 def repeat(t_ns: int, folder: str, row: Row, table: tuple[Column, ...]) -> Json:
-    """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, without missing ones."""
+    """Return a message of `repeat_schema`: the numbers of the attempt in `folder`, without missing numbers."""
     measured = {name: row[name] for name in _measured(table) if name in row}
     head = {"timestamp": time(t_ns), "repeat": folder, "status": row["status"], "reason": row.get("reason", "")}
     return head | measured
@@ -97,7 +97,7 @@ def location(t_ns: int, robot: str, place: Vector) -> Json:
 
     Args:
         t_ns: Time in nanoseconds since 1970 UTC.
-        robot: Its name.
+        robot: Name of the robot.
         place: Latitude and longitude in degrees, and height above the ellipsoid in metres; NaN without a height.
     """
     north, east, up_m = place
@@ -132,7 +132,7 @@ LOG: Final = _object(
         "message": _typed("string", "What happened."),
         "name": _typed("string", "The repeat."),
         "file": _typed("string", "File of the trial that the message refers to."),
-        "line": _typed("integer", "Its line, 0 for the whole file.", minimum=0),
+        "line": _typed("integer", "Line of this file; 0 for the whole file.", minimum=0),
     },
 )
 TRANSFORMS: Final = _object(
@@ -172,9 +172,9 @@ RTT: Final = _object(
         "timestamp": _TIME,
         "repeat": _REPEAT,
         "seq": _typed("integer", "Sequence number of the echo request."),
-        "rtt_s": _typed("number", "Round-trip time in seconds; absent if ping printed none."),
-        "duplicate": _typed("boolean", "Whether the request had been answered before."),
-        "damaged": _typed("boolean", "Whether the checksum was wrong."),
+        "rtt_s": _typed("number", "Round-trip time in seconds; absent if ping printed no time."),
+        "duplicate": _typed("boolean", "True if the request had been answered before."),
+        "damaged": _typed("boolean", "True if the checksum was wrong."),
     },
     optional=("rtt_s",),
 )
@@ -186,13 +186,13 @@ PACKET: Final = _object(
         "protocol": _typed("integer", "IP protocol number: 1 ICMP, 6 TCP, 17 UDP."),
         "source": _typed("string", "Source address."),
         "destination": _typed("string", "Destination address."),
-        "source_port": _typed("integer", "Source port; absent if the packet has none."),
-        "destination_port": _typed("integer", "Destination port; absent if the packet has none."),
+        "source_port": _typed("integer", "Source port; absent if the packet has no port."),
+        "destination_port": _typed("integer", "Destination port; absent if the packet has no port."),
         "wire_bytes": _typed("integer", "Length of the frame on the link."),
         "payload_bytes": _typed("integer", "Bytes after the IP header."),
         "fragment_offset": _typed("integer", "Offset of the payload in its datagram, in bytes."),
-        "lost": _typed("boolean", "Whether the receiver's capture has no copy; absent if unknown."),
-        "copy": _typed("boolean", "Whether the same packet had been received before; absent if unknown."),
+        "lost": _typed("boolean", "True if the receiver's capture has no copy; absent if unknown."),
+        "copy": _typed("boolean", "True if the same packet had been received before; absent if unknown."),
     },
     optional=("source_port", "destination_port", "lost", "copy"),
 )
@@ -210,7 +210,7 @@ _STATION: Final = {
 }
 _CHANNEL: Final = {
     "noise_dbm": _typed("number", "Noise in the channel, in dBm; absent if the radio does not report it."),
-    "active_s": _typed("number", "Time for which the radio was on its channel, counted from any start."),
+    "active_s": _typed("number", "Time for which the radio was on its channel, since an arbitrary start."),
     "busy_s": _typed("number", "Part of active_s in which the channel was busy."),
 }
 LINK: Final = _object(
@@ -230,7 +230,7 @@ LINK: Final = _object(
 
 @cache
 def _measured(table: tuple[Column, ...]) -> Json:
-    """Return the schema of each numeric or boolean measure of a table, by name."""
+    """Return the schema of each numeric or boolean column of a table, by name; columns of `IDENTITY` are excluded."""
     kinds = {int: "integer", float: "number", bool: "boolean"}
     return {
         column.name: _typed(kinds[column.type], f"{column.meaning} Unit: {column.unit}.")
@@ -249,7 +249,7 @@ def repeat_schema(table: tuple[Column, ...]) -> Json:
             "timestamp": _TIME,
             "repeat": _REPEAT,
             "status": _typed("string", "valid, void or failed."),
-            "reason": _typed("string", "Why it is not valid; empty when it is."),
+            "reason": _typed("string", "Reason why the attempt is not valid; empty if it is valid."),
             **measured,
         },
         optional=tuple(measured),

@@ -29,27 +29,27 @@ _TYPES: Final[Mapping[type, pa.DataType]] = {
 
 
 def write_csv(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns; the columns of every trial come first.
+    """Write all columns. The columns of every trial are first.
 
     Raises:
         OSError: The file cannot be written.
     """
-    table = of_repeats(repeats)
+    table = repeats_table(repeats)
     lines = zip(*(column.to_pylist() for column in table.columns), strict=True)
     file.write(csv_text(table.column_names, lines).encode())
 
 
 def write_parquet(file: BinaryIO, repeats: Repeats) -> None:
-    """Write all columns with their types; units and meanings are metadata of the columns.
+    """Write all columns with their types. Units and meanings are metadata of the columns.
 
     Raises:
         OSError: The file cannot be written.
     """
-    pa.parquet.write_table(of_repeats(repeats), file, compression="zstd")
+    pa.parquet.write_table(repeats_table(repeats), file, compression="zstd")
 
 
-def of_repeats(repeats: Repeats) -> Table:
-    """Return all columns except the source, with units and meanings as metadata; columns of every trial are first."""
+def repeats_table(repeats: Repeats) -> Table:
+    """Return all columns except the source. Units and meanings are metadata; the columns of every trial are first."""
     arrays = [
         _texts(repeats.texts[column.name])
         if column.name in repeats.texts
@@ -59,7 +59,7 @@ def of_repeats(repeats: Repeats) -> Table:
     return Table.from_arrays(arrays, schema=_schema(repeats.columns))
 
 
-def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
+def cells_table(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
     """Return the content of `analysis.result_tables.to_csv` as a table, with all digits of the numbers.
 
     Args:
@@ -73,11 +73,11 @@ def of_cells(by: Sequence[Column], cells: Sequence[Cell]) -> Table:
     return _table_of_rows(columns, [[None if value == "" else value for value in row] for row in rows])
 
 
-def of_packets(transfers: Mapping[str, SentPackets]) -> Table:
-    """Return the packets of transfers in one table, with the name of the step in each row.
+def packets_table(transfers: Mapping[str, SentPackets]) -> Table:
+    """Return the packets of transfers in one table. Each row contains the name of the step.
 
     Args:
-        transfers: Packets by name of the step, empty if it has none.
+        transfers: Packets by name of the step; the name is empty for a step without a name.
     """
     columns = (
         Column("step", "text", "Name of the step that sent the packet; empty if the step has no name."),

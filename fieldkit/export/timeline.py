@@ -1,6 +1,7 @@
 """The timeline of a trial as messages of an MCAP file, from its journal and raw evidence.
 
-Laptop, sender and receiver have separate clocks. No time is shifted; the metadata of each channel contain its clock.
+Laptop, sender and receiver have separate clocks. Times are not converted; the metadata of a channel contain its
+clock.
 """
 
 import heapq
@@ -26,7 +27,7 @@ from fieldkit.trial.journal import Attempt, JournalEntry
 from fieldkit.trial.plan import Plan
 
 _Evidence = Callable[[Attempt], AttemptEvidence]
-"""Returns the evidence of an attempt; returns the same object again while it is in use."""
+"""Function that returns the evidence of an attempt. It returns the same object for attempts that are in use."""
 
 _OPEN_ATTEMPTS: Final = 2
 _LAPTOP: Final = "laptop"
@@ -55,13 +56,14 @@ def about(plan: Plan) -> dict[str, str]:
 
 
 def messages(folder: Path, plan: Plan) -> Iterator[Message]:
-    """Return the messages of a trial, in the order of their times as far as its clocks agree.
+    """Return the messages of a trial, in the order of their times. Differences between its clocks are ignored.
 
-    The streams advance through the attempts together, so few attempts are in memory at a time, and each is read once.
+    The streams advance through the attempts together, so that few attempts are in memory at a time, and each attempt
+    is read once.
 
     Args:
         folder: The trial's folder.
-        plan: Its plan.
+        plan: Plan of the trial.
 
     Raises:
         EvidenceError: No attempt has ended, or the journal is damaged.
@@ -90,7 +92,7 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
 
 
 def _laptop(plan: Plan, evidence: _Evidence, entries: list[JournalEntry], *, planned: bool) -> Iterator[Message]:
-    """Yield the journal's entries, the planned places at the start of an attempt, and its numbers at its end."""
+    """Yield the journal's entries, the planned places at the start of each attempt, and its numbers at the end."""
     ended = iter(journal.ended_attempts(entries))
     for line, entry in enumerate(entries, start=1):
         if entry.status is Status.PLANNED:
@@ -116,18 +118,18 @@ def _places(plan: Plan, t_ns: int) -> Iterator[Message]:
 
 
 def _tracks(plan: Plan, evidence: _Evidence, attempts: Iterable[tuple[Attempt, int]]) -> Iterator[Message]:
-    """Yield the positions of robots by attempt, each from the best source according to `recorded_positions`."""
+    """Yield the positions of robots, attempt by attempt: recorded positions or, without these, the testbed's."""
     for attempt, ended_ns in attempts:
         samples_by_role = recorded_positions.readable_samples(evidence(attempt))
         # A position from before the start of the attempt is reported at the start.
-        messages_of_attempt = [
+        attempt_messages = [
             _place(plan, point.role, max(point.utc_ns, attempt.started_utc_ns), point.position_m)
             for point in evidence(attempt).read_or_none(track.read, track.FILE) or ()
             if point.position_m is not None and point.role in plan.cast.keys() - samples_by_role.keys()
         ]
         for role in filter(samples_by_role.__contains__, plan.cast):
-            messages_of_attempt += _sampled(plan, role, samples_by_role[role], attempt.started_utc_ns, ended_ns)
-        yield from sorted(messages_of_attempt, key=attrgetter("time_ns"))
+            attempt_messages += _sampled(plan, role, samples_by_role[role], attempt.started_utc_ns, ended_ns)
+        yield from sorted(attempt_messages, key=attrgetter("time_ns"))
 
 
 def _sampled(plan: Plan, role: Role, samples: Samples, started_ns: int, ended_ns: int) -> Iterator[Message]:
@@ -148,7 +150,7 @@ def _place(plan: Plan, role: Role, t_ns: int, place: Vector, frame: str = "field
 
 
 def _numbers(plan: Plan, attempt: Attempt, evidence: AttemptEvidence, t_ns: int) -> Message:
-    meaning = "The measurements of each attempt, at its end."
+    meaning = "Measured numbers of each attempt, at the end of the attempt."
     channel = Channel(f"/repeat/{attempt.repeat.protocol}", schemas.repeat_schema(plan.table), _LAPTOP, meaning)
     row = rows.measure_row(plan, attempt, evidence)
     return Message(channel, t_ns, schemas.repeat(t_ns, attempt.folder, row, plan.table))

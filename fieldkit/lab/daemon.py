@@ -37,7 +37,7 @@ def run_detached(work: Callable[[OnReady], int]) -> int:
             terminal. Returns its exit code.
 
     Returns:
-        0 if start-up is complete, the exit code of `work` if it exited before.
+        0 if start-up is complete, the exit code of `work` if it exited earlier.
     """
     ready_reader, ready_writer = os.pipe()
     sys.stdout.flush()  # otherwise the child would write the buffered text again
@@ -84,7 +84,7 @@ REQUEST_S: Final = 5.0
 _REQUEST_BYTES: Final = 4096
 
 
-def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready: Callable[[Lab], None]) -> None:
+def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, on_ready: Callable[[Lab], None]) -> None:
     """Run the robots of a backend until SIGINT, SIGTERM or SIGHUP, then remove them completely.
 
     Call it in the main thread: the robots are terminated when the thread that started them exits.
@@ -94,7 +94,7 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
         backend: Starts the robots.
         seed: Seed of all random numbers of the lab.
         sink: Receives the names of phases.
-        ready: Called when the robots can be reached.
+        on_ready: Called when the robots can be reached.
 
     Raises:
         ConfigurationError: A lab of this directory is already up.
@@ -103,12 +103,12 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, ready:
     with (
         _until_signal(),
         _lab_lock(folder),
-        _listening(folder) as listener,
+        _listen(folder) as listener,
         backend.open_lab(seed=seed, sink=sink) as robots,
     ):
         start_s = time.monotonic()
         write_ssh_config(folder, robots.login)
-        ready(robots)
+        on_ready(robots)
         while True:
             client, _ = listener.accept()
             _serve(client, robots, start_s)
@@ -126,7 +126,7 @@ def _lab_lock(folder: LabFolder) -> Iterator[None]:
 
 
 @contextmanager
-def _listening(folder: LabFolder) -> Iterator[socket.socket]:
+def _listen(folder: LabFolder) -> Iterator[socket.socket]:
     make(folder)
     try:
         with socket.socket(socket.AF_UNIX) as listener:
@@ -149,14 +149,17 @@ def _until_signal() -> Iterator[None]:
             is_stopping = True
             raise KeyboardInterrupt
 
-    previous = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    previous = {
+        signal_number: signal.signal(signal_number, stop)
+        for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
     try:
         yield
     except KeyboardInterrupt:
         return
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for signal_number, handler in previous.items():
+            signal.signal(signal_number, handler)
 
 
 def _serve(client: socket.socket, robots: Lab, start_s: float) -> None:
@@ -192,12 +195,12 @@ def _pass_socket(client: socket.socket, robots: Lab, name: str) -> None:
             socket.send_fds(client, [b"+"], [stream.fileno()])
 
 
-def _move(robots: Lab, name: str, to: str) -> bytes:
+def _move(robots: Lab, name: str, destination: str) -> bytes:
     """Move a robot; return the answer, which is its new position or an error."""
     try:
         if name not in robots.members:
             raise unknown_robot(name, robots.members)
-        return requests.pack_place(robots.move(name, requests.unpack_destination(to)))
+        return requests.pack_place(robots.move(name, requests.unpack_destination(destination)))
     except FieldkitError as error:
         return requests.pack_error(error)
 

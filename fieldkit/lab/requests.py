@@ -167,13 +167,13 @@ def overview(folder: LabFolder) -> Overview:
     return _request(folder, "overview", unpack_overview)
 
 
-def move(folder: LabFolder, robot: str, to: Destination) -> Vector:
+def move(folder: LabFolder, robot: str, destination: Destination) -> Vector:
     """Move a robot instantly and return the new position of its antenna in metres. Errors as `state`.
 
     Raises:
         ConfigurationError: There is no such robot, or the destination is not in the world.
     """
-    return _request(folder, f"move {robot} {pack_destination(to)}", unpack_place_m)
+    return _request(folder, f"move {robot} {pack_destination(destination)}", unpack_place_m)
 
 
 def end(folder: LabFolder) -> None:
@@ -188,8 +188,8 @@ def end(folder: LabFolder) -> None:
         credentials = lab.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
         process = os.pidfd_open(struct.unpack("3i", credentials)[0])
     try:
-        for number in (signal.SIGTERM, signal.SIGKILL):
-            signal.pidfd_send_signal(process, number)
+        for signal_number in (signal.SIGTERM, signal.SIGKILL):
+            signal.pidfd_send_signal(process, signal_number)
             if select.select([process], [], [], _EXIT_TIMEOUT_S)[0]:
                 return
     finally:

@@ -36,8 +36,8 @@ class EvidenceFolder:
 
     def __init__(self, path: Path) -> None:
         self.has_failed = False
-        self._requested = path
-        self._created: Path | None = None
+        self._requested_path = path
+        self._created_path: Path | None = None
 
     @property
     def path(self) -> Path:
@@ -46,21 +46,21 @@ class EvidenceFolder:
         Raises:
             ConfigurationError: It cannot be created.
         """
-        if self._created is None:
+        if self._created_path is None:
             try:
-                self._created = _new_folder(self._requested)
+                self._created_path = _new_folder(self._requested_path)
             except OSError as error:
                 raise ConfigurationError(
                     f"cannot create the folder for evidence: {error.strerror}",
-                    where=str(self._requested),
+                    where=str(self._requested_path),
                     remedy="choose another folder by --fieldkit-output",
                 ) from error
-        return self._created
+        return self._created_path
 
     @property
     def exists(self) -> bool:
         """Whether the folder was created."""
-        return self._created is not None
+        return self._created_path is not None
 
     def add(self, text: str) -> None:
         """Add lines to the log; the first has the time of day."""
@@ -70,11 +70,11 @@ class EvidenceFolder:
 
     def remove_unless_kept(self, keep: Keep) -> None:
         """Remove the folder unless it must be kept; later content gets a new folder."""
-        if self._created is not None and (keep is Keep.NONE or (keep is Keep.FAILED and not self.has_failed)):
-            shutil.rmtree(self._created, ignore_errors=True)
+        if self._created_path is not None and (keep is Keep.NONE or (keep is Keep.FAILED and not self.has_failed)):
+            shutil.rmtree(self._created_path, ignore_errors=True)
             with suppress(OSError):  # not empty if other tests have folders in it
-                self._created.parent.rmdir()
-            self._created = None
+                self._created_path.parent.rmdir()
+            self._created_path = None
 
 
 class EvidenceKeeper:
@@ -107,11 +107,11 @@ class EvidenceKeeper:
     def begin(self, item: pytest.Item) -> None:
         """Start the evidence of a test."""
         file, _, name = item.nodeid.partition("::")
-        of_file = self._run / _as_name(file)
+        file_folder = self._run / _folder_name(file)
         if item.path != self._file:
             self._set_up_folder.remove_unless_kept(self._keep)
-            self._file, self._set_up_folder = item.path, EvidenceFolder(of_file / _SHARED)
-        self._test_folder = EvidenceFolder(of_file / _as_name(name))
+            self._file, self._set_up_folder = item.path, EvidenceFolder(file_folder / _SHARED)
+        self._test_folder = EvidenceFolder(file_folder / _folder_name(name))
         self._item, self._is_set_up = item, True
 
     def begin_test(self, item: pytest.Item) -> None:
@@ -125,7 +125,7 @@ class EvidenceKeeper:
             return
         if report.failed:
             self._test_folder.has_failed = self._set_up_folder.has_failed = True
-            _as_lab_error(item, call, report)
+            _convert_to_lab_error(item, call, report)
             report.sections += [(_SECTION, path) for path in self._kept_folders()]
         if call.when == "teardown":
             report.user_properties += [
@@ -150,7 +150,7 @@ class EvidenceKeeper:
         ]
 
 
-def _as_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
+def _convert_to_lab_error(item: pytest.Item, call: pytest.CallInfo[None], report: pytest.TestReport) -> None:
     """Report a problem of the lab as an error of the set-up, with the message for operators, instead of a failure."""
     if call.excinfo is None or not isinstance(call.excinfo.value, FieldkitError):
         return
@@ -181,7 +181,7 @@ def _line(event: Event) -> str:
             return ""
 
 
-def _as_name(text: str) -> str:
+def _folder_name(text: str) -> str:
     """Return text as the name of a folder; a long text is truncated and a hash is added."""
     name = re.sub(r"[^\w.-]+", "-", text).strip("-.") or "tests"
     if len(name) <= _MAX_NAME_LENGTH:
@@ -189,9 +189,9 @@ def _as_name(text: str) -> str:
     return f"{name[:_MAX_NAME_LENGTH]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _new_folder(requested: Path) -> Path:
+def _new_folder(requested_path: Path) -> Path:
     """Create a folder; its name gets a number if a rerun of the same test has left one."""
-    path, number = requested, 1
+    path, number = requested_path, 1
     while True:
         with suppress(FileNotFoundError):  # another worker removed the empty parent folder
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -199,6 +199,6 @@ def _new_folder(requested: Path) -> Path:
                 path.mkdir()
             except FileExistsError:
                 number += 1
-                path = requested.with_name(f"{requested.name}-{number}")
+                path = requested_path.with_name(f"{requested_path.name}-{number}")
             else:
                 return path

@@ -34,11 +34,11 @@ T = TypeVar("T")
 
 
 def operator_of(config: pytest.Config, options: LabOptions, sink: Sink) -> Operator:
-    """Return the operator: the person at the terminal, or nobody if the option `yes` is set."""
-    return UNATTENDED if options.yes else Uncaptured(config, sink)
+    """Return the operator: the person at the terminal, or a substitute if the option `yes` is set."""
+    return UNATTENDED if options.yes else UncapturedTerminal(config, sink)
 
 
-class Uncaptured:
+class UncapturedTerminal:
     """Asks questions at the terminal although pytest captures the output and closes the input.
 
     Args:
@@ -93,7 +93,7 @@ class OpenedLab:
 
     Attributes:
         options: Options of the lab.
-        keeper: See above.
+        keeper: Receives events and log lines as evidence.
         session: Identifies the lab in the robots' locks.
         topology: Topology of the open robots; None before any are open.
         robots: The robots.
@@ -152,10 +152,10 @@ class OpenedLab:
                 robots, or something is missing on this machine.
             LinkError, RobotError: A robot cannot be reached, or is locked by another user.
         """
-        requested = topology or self.topology or self._first_topology()
-        if self._testbed is None or requested != self.topology:
+        requested_topology = topology or self.topology or self._first_topology()
+        if self._testbed is None or requested_topology != self.topology:
             self._close()
-            self._open(requested)
+            self._open(requested_topology)
         assert self._testbed is not None
         return self._testbed
 
@@ -203,7 +203,7 @@ class OpenedLab:
                 example = f'{key}="{"3s" if key == "lasts" else "roscore"}"'
                 raise ConfigurationError(
                     f"the fault {fault_kind} {'needs' if is_required else 'has no parameter'} {key}",
-                    remedy=f"write {example}" if is_required else f"leave {key} out",
+                    remedy=f"write {example}" if is_required else f"omit {key}",
                 )
         duration_s = parse_duration_s(lasts) if lasts else 0.0
         self.log(f"{fault_kind} {robot} {lasts or process}")
@@ -253,13 +253,13 @@ class OpenedLab:
             )
         cast = self.backend.cast(topology)
         self.log(f"open {self.backend_name}, {topology}")
-        with ExitStack() as opened:
-            testbed = opened.enter_context(
+        with ExitStack() as open_stack:
+            testbed = open_stack.enter_context(
                 opening.opened(
                     self.backend,
                     cast,
                     session=self.session,
-                    what="pytest",
+                    purpose="pytest",
                     seed=self.options.seed,
                     sink=self.keeper.add_event,
                     operator=self._operator,
@@ -267,7 +267,7 @@ class OpenedLab:
             )
             if not self.backend.by_hand:
                 testbed.place(Placement(Scenario.LOS, topology, parse_distance(self.options.distance)))
-            self._open_robots = opened.pop_all()
+            self._open_robots = open_stack.pop_all()
         self._testbed, self._cast, self.topology = testbed, cast, topology
 
     def _close(self) -> None:

@@ -55,7 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 (xdist declares no type)
-    """Make all workers of pytest-xdist use the same evidence folder."""
+    """Pass the name of the evidence folder to all workers of pytest-xdist, so that they use the same one."""
     node.workerinput[_RUN] = _run(node.config)
 
 
@@ -111,9 +111,9 @@ def _keeper(config: pytest.Config) -> "EvidenceKeeper":
 @pytest.fixture(scope="module")
 def lab_options(pytestconfig: pytest.Config) -> "LabOptions":
     """Options of the lab; define a fixture of this name to change them for a test module."""
-    from fieldkit.pytest.plugin_options import of  # noqa: PLC0415
+    from fieldkit.pytest.plugin_options import read_lab_options  # noqa: PLC0415
 
-    return of(pytestconfig)
+    return read_lab_options(pytestconfig)
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ class LabOptions:
     yes: bool = False
 
 
-def of(config: pytest.Config) -> LabOptions:
+def read_lab_options(config: pytest.Config) -> LabOptions:
     """Return the options of the lab in pytest's command line and configuration."""
     return LabOptions(
         backend=_text(config, "backend"),

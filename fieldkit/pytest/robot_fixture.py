@@ -220,12 +220,12 @@ class RobotHandle:
             LinkError: The robot could not be reached.
             RobotError: The file cannot be read on the robot, or is larger.
         """
-        to = Path(local)
-        to = to / Path(remote).name if to.is_dir() else to
+        path = Path(local)
+        path = path / Path(remote).name if path.is_dir() else path
         deadline = Deadline.after(_seconds_for(limit_bytes))
-        self._shell.fetch(("cat", "--", remote), to, deadline=deadline, limit_bytes=limit_bytes)
-        self._lab.log(f"{self.name} > {remote} to {to}")
-        return to
+        self._shell.fetch(("cat", "--", remote), path, deadline=deadline, limit_bytes=limit_bytes)
+        self._lab.log(f"{self.name} > {remote} to {path}")
+        return path
 
     def link(self) -> LinkSample:
         """Return the present state of its radio's links: signal, rates, counters per station.
@@ -239,10 +239,8 @@ class RobotHandle:
         if testbed.oracle is not None:
             return testbed.oracle.links(continue_sampling=False)[self.role][-1]
         command = ("iw", "dev", self._robot.profile.radio.interface, "station", "dump")
-        completed = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
-        return LinkSample(
-            time.time_ns(), robot_link_samples.parse_stations(completed.stdout.decode(errors="replace"))
-        )
+        result = self._shell.run(command, deadline=Deadline.after(TIMEOUT_S), check=False)
+        return LinkSample(time.time_ns(), robot_link_samples.parse_stations(result.stdout.decode(errors="replace")))
 
     @property
     def _robot(self) -> Robot:
@@ -279,18 +277,18 @@ class RobotHandle:
         __tracebackhide__ = True
         command_text = f"{self.name} $ {quote(argv)}"
         try:
-            completed = wait()
+            result = wait()
         except LinkLostError:
             raise
         except LinkError as error:
             self._lab.log(f"{command_text}\n{error.what}")
             raise ProgramError(f"{self.name}: {error.what}") from None
-        out, err = (text.decode(errors="replace") for text in (completed.stdout, completed.stderr))
-        self._lab.log(f"{command_text}\n{out}{err}exit code {completed.exit_code}")
-        if check and completed.exit_code != 0:
+        out, err = (text.decode(errors="replace") for text in (result.stdout, result.stderr))
+        self._lab.log(f"{command_text}\n{out}{err}exit code {result.exit_code}")
+        if check and result.exit_code != 0:
             excerpt = sanitized((err or out).strip())[-_MAX_SHOWN_CHARACTERS:] or "it printed nothing"
-            raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {completed.exit_code}: {excerpt}")
-        return ProgramOutput(tuple(argv), completed.exit_code, out, err)
+            raise ProgramError(f"{self.name}: `{quote(argv)}` exited with code {result.exit_code}: {excerpt}")
+        return ProgramOutput(tuple(argv), result.exit_code, out, err)
 
 
 class RobotHandles:

@@ -41,15 +41,15 @@ def _sha256() -> str:
 
 def path_from_job() -> str:
     """Return the path of the agent for a job, relative to the folder of its attempt (`jobs.work_folder`)."""
-    return f"../../{_name()}"
+    return f"../../{_file_name()}"
 
 
 def path_from_home() -> str:
     """Return the path of the agent for a command that is not a job, relative to the user's home."""
-    return f"{HOME}/{_name()}"
+    return f"{HOME}/{_file_name()}"
 
 
-def _name() -> str:
+def _file_name() -> str:
     return f"agent-{_sha256()[:12]}.pyz"
 
 
@@ -61,7 +61,9 @@ def install(shell: Shell) -> None:
         RobotError: Its home cannot be written.
     """
     path, deadline = path_from_home(), Deadline.after(_INSTALL_S)
-    checked = shell.run(("sh", "-c", _CHECK_SCRIPT, "sh", path, _sha256()), deadline=deadline, check=False)
-    if checked.exit_code != 0:
-        copied = shell.run(("sh", "-c", _COPY_SCRIPT, "sh", path), stdin=content(), deadline=deadline, check=False)
-        require_success(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")
+    check_result = shell.run(("sh", "-c", _CHECK_SCRIPT, "sh", path, _sha256()), deadline=deadline, check=False)
+    if check_result.exit_code != 0:
+        copy_result = shell.run(
+            ("sh", "-c", _COPY_SCRIPT, "sh", path), stdin=content(), deadline=deadline, check=False
+        )
+        require_success(shell, copy_result, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")

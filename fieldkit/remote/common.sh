@@ -1,9 +1,9 @@
 #!/bin/sh
-# Detached jobs on a robot. fieldkit installs this file once and calls it for each long command, so that a lost
-# connection stops no job, and each process can be stopped by its recorded identity.
+# Detached jobs on a robot. fieldkit installs this file once and calls it for each long command, so that a job continues
+# after a lost connection, and each process can be stopped by its recorded identity.
 #
 #   job.sh start DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
-#                                        start a job in DIR, return when READY is true; kill it if it is not ready after
+#                                        start a job in DIR, return when it is READY; kill it if it is not ready after
 #                                        WITHIN seconds
 #   job.sh run   DIR NAME LIMIT READY WITHIN IN OUT LOG ARGV...
 #                                        start a job, return its exit code after the end of the job and of standard input,
@@ -29,13 +29,13 @@
 #   job.sh sum   DIR FILE                print the hash of FILE
 #   job.sh end   DIR                     stop all running jobs of DIR; no other job can start there
 #   job.sh drop  DIR                     delete DIR, and its parent folder if it is empty
-#   job.sh tidy  DIR NAME...             delete all folders in DIR except these
+#   job.sh tidy  DIR NAME...             delete all folders in DIR except the folders NAME...
 #   job.sh left                          list running jobs of all trials: DIR/NAME PID COMMAND, DIR below the home; and
 #                                        processes whose working folder was deleted
 #   job.sh lock TOKEN SECONDS WHO WHAT   lock this robot; idempotent
-#   job.sh renew TOKEN SECONDS           extend the lock to at least SECONDS from now; fail if TOKEN does not hold it
+#   job.sh renew TOKEN SECONDS           extend the lock to at least SECONDS from now; fail if it is not the lock of TOKEN
 #   job.sh unlock TOKEN                  release the lock
-#   job.sh holder                        print the holder of the lock, if any: TOKEN SECONDS WHO WHAT; it expires in SECONDS
+#   job.sh holder                        print the record of the lock, if any: TOKEN SECONDS WHO WHAT; it expires in SECONDS
 #   job.sh abort WHO                     break the lock, print `held WHO WHAT` or `free`, stop all jobs of all trials and list
 #                                        them as `left` does; needs no installed script and no free disk space; then list the
 #                                        programs that still land a drone: `lands DIR/.jobs/NAME STATE`, as `motion_states`
@@ -54,11 +54,11 @@
 #                                        NONCE and the exit code follow it; with `held` only after another line was read
 #
 # All verbs are idempotent, so that a call can be repeated if its answer was lost: an existing job is not started again.
-# READY is `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (bound, PORT in hex).
-# LIMIT starts when READY is true, or WITHIN seconds after the start.
+# READY is the condition for a job to be ready: `-` (none), `log:TEXT` (LOG contains TEXT), `tcp:PORT` or `udp:PORT` (a
+# socket is bound to PORT, in hex). LIMIT starts when the job is ready, or WITHIN seconds after its start.
 # DIR is below the home; IN, OUT and LOG are files in it.
 # The files of a job are in DIR/.jobs/NAME: command, pid ("PID STARTTIME BOOT"), exit. DIR/.began has TOKEN and boot ID.
-# A start renews the lock for the maximum duration of the job. Error messages begin with `job.sh: `.
+# `start`, `run` and `serve` renew the lock for the maximum duration of the job. Error messages begin with `job.sh: `.
 set -u
 umask 022
 case $0 in /*) self=$0 ;; *) self=$PWD/$0 ;; esac
@@ -78,21 +78,21 @@ needs() {
     [ -z "${missing-}" ] || fail "it lacks$missing"
 }
 
-# On a small computer a fork takes milliseconds, so builtin commands of the shell are preferred to programs.
-clock() { # set now to the seconds since boot
+# On a small computer a fork takes milliseconds, so the script prefers builtin commands of the shell to programs.
+read_uptime() { # set now to the seconds since boot
     read -r now _ </proc/uptime && now=${now%.*}
 }
 
-nap() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds only
+sleep_for() { # sleep for $1 seconds; rounded up if `sleep` supports whole seconds only
     sleep "$1" 2>/dev/null || [ $? -gt 128 ] || sleep $((${1%.*} + 1))
 }
 
-nap_before_poll() { # sleep before poll number $polls + 1: 2 ms, then 20 ms, because polling uses the processor
+sleep_before_poll() { # sleep before poll number $polls + 1: 2 ms, then 20 ms, because polling uses the processor
     polls=$((polls + 1))
-    if [ "$polls" -le 10 ]; then nap 0.002; else nap 0.02; fi
+    if [ "$polls" -le 10 ]; then sleep_for 0.002; else sleep_for 0.02; fi
 }
 
-lasting() { # flush files and folders $@ to the disk
+sync_to_disk() { # flush files and folders $@ to the disk
     # Old versions of sync accept no names, and flush everything.
     sync "$@" 2>/dev/null || sync
 }
@@ -114,14 +114,14 @@ ended() { # true if the job in $1 was started and has ended
     [ -s "$1/exit" ] || { [ -s "$1/pid" ] && ! alive "$1"; }
 }
 
-result() { # return the exit code of the ended job in $1; 137 if it left none because it was killed
+result() { # return the exit code of the job in $1, which has ended; 137 if a killed job wrote none
     [ -s "$1/exit" ] && read -r code <"$1/exit" && return "$code"
-    rebooted "$1" && fail "job ${1##*/} was cut: the robot rebooted" "$REBOOTED"
+    rebooted "$1" && fail "job ${1##*/} was interrupted: the robot rebooted" "$REBOOTED"
     [ -e "$1/pid" ] || fail "no job in $1"
     return 137
 }
 
-rebooted() { # true if the robot has rebooted since the start of the job in $1 or, without a record of it, since `begin`
+rebooted() { # true if the robot has rebooted since the start of the job in $1 or, if its start was not recorded, since `begin`
     began=
     read -r boot </proc/sys/kernel/random/boot_id
     read -r began 2>/dev/null <"$1/pid"
@@ -131,7 +131,7 @@ rebooted() { # true if the robot has rebooted since the start of the job in $1 o
 
 enter() { # change to folder $1
     cd "$1" 2>/dev/null && return
-    clock
+    read_uptime
     [ "$now" -gt "$TTL" ] || fail "no folder $1: the robot booted $now s ago" "$REBOOTED"
     fail "no folder $1"
 }

@@ -1,4 +1,4 @@
-"""The connection to one robot: opened when first needed, and reopened after a loss until a timeout."""
+"""The connection to one robot, which is opened at its first use, and reopened after a loss until a timeout."""
 
 import threading
 import time
@@ -21,15 +21,15 @@ _POLL_S: Final = 0.2
 
 
 class Connection:
-    """One link at a time, shared by all threads.
+    """A connection to a robot. It has at most one link at a time, which all threads share.
 
     Args:
         address: Address of the robot.
         connect: Opens the stream.
         credentials: Host key and login.
         patience_s: Time after the loss of a link during which attempts to reopen it are made.
-        notice: Called with one line when the link is lost, and when it is restored.
-        on_air: Whether the link crosses the radio under test.
+        notice: Called with a line of text when the link is lost, and when it is restored.
+        crosses_radio: Whether the link crosses the radio under test.
         timing: Timeouts of the link.
 
     Attributes:
@@ -45,7 +45,7 @@ class Connection:
         *,
         patience_s: float,
         notice: Callable[[str], None],
-        on_air: bool,
+        crosses_radio: bool,
         timing: Timing,
     ) -> None:
         self.address = address
@@ -54,7 +54,7 @@ class Connection:
         self._credentials = credentials
         self._patience_s = patience_s
         self._notice = notice
-        self._on_air = on_air
+        self._crosses_radio = crosses_radio
         self._timing = timing
         self._connecting = threading.Lock()  # held by the thread that logs in
         self._lock = threading.Lock()  # protects the attributes below; no thread waits while it holds this lock
@@ -74,8 +74,8 @@ class Connection:
 
     def link(self, deadline: Deadline) -> Link:
         """Return the link, which is opened again if it is not alive; raises as `log_in`."""
-        close_event, within = self._close_event, deadline.earlier_of(self._timing.connect_s)
-        if not self._connecting.acquire(timeout=within.remaining_s):
+        close_event, limit = self._close_event, deadline.earlier_of(self._timing.connect_s)
+        if not self._connecting.acquire(timeout=limit.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)
         try:
             link = self._link
@@ -88,7 +88,7 @@ class Connection:
                 self._connect,
                 self._credentials,
                 timing=self._timing,
-                deadline=within,
+                deadline=limit,
                 close_event=close_event,
             )
             with self._lock:
@@ -116,7 +116,7 @@ class Connection:
             LinkError: The deadline passed with an open link, the link was not restored, or `close` was called.
             FieldkitError: As `attempt` and `log_in`.
         """
-        close_event, final = self._close_event, Deadline(deadline.at_s + self._patience_s)
+        close_event, final_deadline = self._close_event, Deadline(deadline.at_s + self._patience_s)
         while True:
             try:
                 return attempt(deadline)
@@ -125,13 +125,13 @@ class Connection:
                     raise closed_error(self.address) from error
                 if not isinstance(error, (LinkLostError, LoginRefusedError)) or not self._was_up:
                     raise
-                self._wait_for_link(error, final, close_event)
+                self._wait_for_link(error, final_deadline, close_event)
             deadline = deadline.later_of(self._timing.reply_s)
 
     def _wait_for_link(
-        self, error: LinkLostError | LoginRefusedError, final: Deadline, close_event: threading.Event
+        self, error: LinkLostError | LoginRefusedError, final_deadline: Deadline, close_event: threading.Event
     ) -> None:
-        """Wait until the link is open again; raise the last error after `patience_s`, or at `final`.
+        """Wait until the link is open again; raise the last error after `patience_s`, or at `final_deadline`.
 
         A robot that refuses the login although it accepted it before is treated as a robot that boots.
         """
@@ -143,20 +143,20 @@ class Connection:
                 self._register_loss()
             lost_at_s = self._lost_at_s = self._lost_at_s or time.monotonic()
         silence_s = self._wait_for_silence(error, close_event, notify=is_first)
-        until = Deadline(min(final.at_s, lost_at_s + silence_s + self._patience_s))
+        end = Deadline(min(final_deadline.at_s, lost_at_s + silence_s + self._patience_s))
         if is_first and not silence_s and not self._suppress_notices:
-            self._notify_lost(until)
+            self._notify_lost(end)
         pause_s = self._pause_s
-        while not until.expired:
-            if close_event.wait(min(pause_s, until.remaining_s)):
+        while not end.expired:
+            if close_event.wait(min(pause_s, end.remaining_s)):
                 raise closed_error(self.address) from error
             try:
-                self.link(until.later_of(self._timing.connect_s))
+                self.link(end.later_of(self._timing.connect_s))
             except (LinkLostError, LoginRefusedError) as retry_error:
                 error, pause_s = retry_error, min(2 * pause_s, self._timing.probe_s)
                 if self._suppress_notices:
                     self._suppress_notices = False
-                    self._notify_lost(until)
+                    self._notify_lost(end)
             else:
                 return
         raise error
@@ -172,9 +172,9 @@ class Connection:
             min(2 * self._pause_s, self._timing.probe_s) if self._suppress_notices else self._timing.pause_s
         )
 
-    def _notify_lost(self, until: Deadline) -> None:
-        if not until.expired:
-            patience = format_duration(until.remaining_s)
+    def _notify_lost(self, end: Deadline) -> None:
+        if not end.expired:
+            patience = format_duration(end.remaining_s)
             self._notice(f"{self.address.robot}: the link is lost; trying again for {patience}")
 
     def _wait_for_silence(self, error: Exception, close_event: threading.Event, *, notify: bool) -> float:
@@ -188,7 +188,7 @@ class Connection:
                 raise closed_error(self.address) from error
         return initial_s
 
-    def open_spares(self, link: Link, shell_command: str | None) -> None:
+    def open_spare_channels(self, link: Link, shell_command: str | None) -> None:
         """Start to open channels for later commands, unless the radio is measured, because this sends packets.
 
         Args:
@@ -201,27 +201,27 @@ class Connection:
         with self._lock:
             if self._silence_s():
                 return
-            link.open_spares()
+            link.open_spare_channels()
             if shell_command is not None:
                 self.shells.restore(link, shell_command)
 
     @contextmanager
     def silence(self, seconds: float) -> Iterator[None]:
-        """Keep the link silent during the body, as `Shell.silence`.
+        """Send no packets on the link during the body, as `Shell.silence`.
 
-        A link without answers is not closed during this time, since keepalive probes would send packets. The body
+        A link without answers is not closed during this time, because keepalive probes are packets. The body
         starts after the channels that are being opened are open.
         """
-        if not self._on_air:
+        if not self._crosses_radio:
             yield
             return
         link = self._link
         try:
             with ExitStack() as stack:
-                with self._block_opening(self._timing.reply_s) as within:
+                with self._block_opening(self._timing.reply_s) as limit:
                     if link is not None:
-                        link.wait_until_opened(within)
-                        self.shells.wait_until_opened(within)
+                        link.wait_until_open(limit)
+                        self.shells.wait_until_open(limit)
                     stack.enter_context(self._block_opening(seconds))
                 self._extend_timeout(link, max(seconds, self._silence_s()))
                 yield
@@ -234,14 +234,14 @@ class Connection:
 
         Several steps may measure at the same time; the latest end applies.
         """
-        until = Deadline.after(seconds)
+        end = Deadline.after(seconds)
         with self._lock:
-            self._silent_periods.append(until)
+            self._silent_periods.append(end)
         try:
-            yield until
+            yield end
         finally:
             with self._lock:
-                self._silent_periods = [silence for silence in self._silent_periods if silence is not until]
+                self._silent_periods = [silence for silence in self._silent_periods if silence is not end]
 
     def _extend_timeout(self, link: Link | None, seconds: float) -> None:
         if link is not None:

@@ -1,4 +1,4 @@
-"""Wait for a remote command: for an expected output, and for its end. Both streams are read, all with a deadline."""
+"""Wait for an output of a remote command, or for its end, with a deadline. Both output streams are read."""
 
 import select
 import time
@@ -16,27 +16,28 @@ _MAX_WAIT_S: Final = 1.0
 
 
 def wait_for_output(channel: Execution, expected: bytes, *, deadline: Deadline, robot: str) -> bool:
-    """Wait until the command has written as many bytes as `expected` has; return False if it ended before.
+    """Wait until the command has written as many bytes as `expected` has; return False if it ended earlier.
 
     Raises:
         ExpiredError, EOFError, RobotError: As `drain`.
     """
-    remaining = len(expected)
-    while remaining and not deadline.expired:
+    remaining_bytes = len(expected)
+    while remaining_bytes and not deadline.expired:
         start_s, wait_s = time.monotonic(), min(deadline.remaining_s, _MAX_WAIT_S)
         channel.settimeout(wait_s)
         try:
-            chunk = channel.recv(remaining)  # `select` would also report standard error, which only `drain` reads
+            # `select` would also report standard error, which only `drain` reads.
+            chunk = channel.recv(remaining_bytes)
         except TimeoutError:
             deadline = deadline.extended_by_suspension(start_s, wait_s)
             continue
-        remaining -= len(chunk)
+        remaining_bytes -= len(chunk)
         if not chunk:
             if not channel.status_event.wait(deadline.remaining_s):
                 break
-            _exit_code(channel, b"", robot)  # raises an error if the link has ended, and not only the command
+            _exit_code(channel, b"", robot)  # raises an error if not only the command, but also the link has ended
             return False
-    if remaining:
+    if remaining_bytes:
         raise ExpiredError("report")
     return True
 
@@ -54,21 +55,21 @@ def drain(
         RobotError: There was more output than `limit_bytes`, or a signal terminated the command.
     """
     stderr = bytearray()
-    received = 0
+    received_bytes = 0
     pending = None if stdin is None else memoryview(stdin)
     while not deadline.expired:
         if isinstance(channel, Channel):
             pending = _feed(channel, pending)
-        ended = _is_at_end(channel)  # before the buffers are read, so that no output is missed
+        is_at_end = _is_at_end(channel)  # before the buffers are read, so that no output is missed
         # One chunk of each stream per iteration, so that limit and deadline apply to a sender that never pauses.
         if channel.recv_ready():
-            received += out.write(channel.recv(_CHUNK))
-        if received > limit_bytes:
+            received_bytes += out.write(channel.recv(_CHUNK))
+        if received_bytes > limit_bytes:
             raise RobotError(f"sent more than {limit_bytes} bytes", where=robot, remedy="check what it sends")
         if channel.recv_stderr_ready():
             stderr += channel.recv_stderr(_CHUNK)
             del stderr[:-_CHUNK]
-        if ended and not (channel.recv_ready() or channel.recv_stderr_ready()):
+        if is_at_end and not (channel.recv_ready() or channel.recv_stderr_ready()):
             # recv_exit_status has no timeout (paramiko/paramiko#1815), but its event has one.
             if not channel.status_event.wait(deadline.remaining_s):
                 break

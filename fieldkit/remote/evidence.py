@@ -1,4 +1,4 @@
-"""The folder of an attempt on a robot: its creation before the attempt, the stop of its jobs, and its deletion."""
+"""Create the folder of an attempt on a robot, stop the jobs of the attempt, and delete the folder."""
 
 from collections.abc import Collection, Sequence
 from typing import Final
@@ -23,8 +23,8 @@ def begin_command(
 ) -> tuple[str, ...]:
     """Return the command that creates `folder` and records the state of the host in it; see `begin`."""
     lock = "-" if token is None else word(token)
-    polled = (old or "", *map(quote, sources)) if sources else ((old,) if old else ())
-    return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *polled)
+    optional_words = (old or "", *map(quote, sources)) if sources else ((old,) if old else ())
+    return (*CALL, "begin", folder, role, interface, str(need_kib), lock, *optional_words)
 
 
 def begin(
@@ -60,9 +60,9 @@ def begin(
         RobotError: Its disk has less free space than needed, or cannot be written.
     """
     command = begin_command(folder, role, interface, old=old, token=token, need_kib=need_kib, sources=sources)
-    completed = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
-    require_success(shell, completed)
-    return printable(completed.stdout)
+    result = shell.run(command, deadline=Deadline.after(REPLY_S), check=False)
+    require_success(shell, result)
+    return printable(result.stdout)
 
 
 def boot_id(shell: Shell) -> str:
@@ -72,8 +72,8 @@ def boot_id(shell: Shell) -> str:
         LinkError: The robot did not answer.
         RobotError: The boot ID cannot be read.
     """
-    completed = shell.run(("cat", "/proc/sys/kernel/random/boot_id"), deadline=Deadline.after(REPLY_S))
-    return printable(completed.stdout)
+    result = shell.run(("cat", "/proc/sys/kernel/random/boot_id"), deadline=Deadline.after(REPLY_S))
+    return printable(result.stdout)
 
 
 def end_jobs(shell: Shell, folder: str) -> None:

@@ -1,15 +1,15 @@
-# The folder of an attempt: created before it and sent after it, with the state of the host at both times.
+# The folder of an attempt: it is created before the attempt and sent after it, with the state of the host at both times.
 
 PIECE=4194304 # as PIECE_BYTES of fetching.py
 
-state() { # print the state of the host; $1 interface
+print_state() { # print the state of the host; $1 interface
     interface=$1
     set --
     for file in /proc/net/snmp /proc/net/netstat /proc/net/dev /proc/net/wireless /proc/loadavg \
         /proc/sys/net/ipv4/tcp_congestion_control; do
         [ -r "$file" ] && set -- "$@" "$file"
     done
-    moment
+    print_clock
     awk 'FNR == 1 { print "==> " FILENAME " <==" } { print }' "$@"
     echo "==> ip -s link <==" && { ip -s link show dev "$interface" || ip link show dev "$interface"; }
     PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
@@ -26,14 +26,14 @@ state() { # print the state of the host; $1 interface
     echo "==> end <==" # missing if the disk is full
 }
 
-moment() { # print the boot ID, and three times the clock between two readings of the seconds since boot
+print_clock() { # print the boot ID, then three times the clock between two readings of the seconds since boot
     read -r boot </proc/sys/kernel/random/boot_id
     echo "==> boot <=="
     echo "$boot"
     echo "==> clock <=="
     for _ in 1 2 3; do
         read -r before _ </proc/uptime
-        precise || time=$(date -u +%s)
+        read_clock || time=$(date -u +%s)
         read -r after _ </proc/uptime
         echo "$before $time $after"
     done
@@ -41,7 +41,7 @@ moment() { # print the boot ID, and three times the clock between two readings o
     echo "$time"
 }
 
-precise() { # set time to the clock with the fraction of a second, for busybox from its adjtimex
+read_clock() { # set time to the clock with the fraction of a second; busybox provides the fraction only through adjtimex
     time=$(date -u +%s.%N)
     case $time in '' | *[!0-9.]* | *.) ;; *) return ;; esac
     time=$(adjtimex 2>/dev/null | awk '
@@ -49,7 +49,7 @@ precise() { # set time to the clock with the fraction of a second, for busybox f
         END { if (s == "" || u == "") exit 1; printf "%d.%09d\n", s, nano ? u : u * 1000 }')
 }
 
-endings() { # print the end of each job: NAME HOW CODE STARTED ENDED; STARTED in clock ticks, ENDED in seconds since boot
+print_job_ends() { # print the end of each job: NAME HOW CODE STARTED ENDED; STARTED in clock ticks, ENDED in seconds since boot
     for meta in .jobs/*; do
         [ -s "$meta/pid" ] || continue
         how=itself code=- ended=-
@@ -62,40 +62,40 @@ endings() { # print the end of each job: NAME HOW CODE STARTED ENDED; STARTED in
     done
 }
 
-free() { # set free to the free disk space in KiB
+read_free_space() { # set free to the free disk space in KiB
     table=$(df -Pk "$base")
     set -- ${table##*
 }
     free=${4-}
-    case $free in '' | *[!0-9]*) fail "df says nothing about $base" ;; esac
+    case $free in '' | *[!0-9]*) fail "df prints no free space of $base" ;; esac
 }
 
-unwritten() { # fail with the reason why file $1 cannot be written
-    free
+fail_to_write() { # fail with the reason why file $1 cannot be written
+    read_free_space
     rm -f -- "$1"
     [ "$free" -gt 64 ] || fail "cannot write $1: No space left on device" "$DISK"
-    why=$({ printf '' >"$1"; } 2>&1) && rm -f -- "$1"
-    fail "cannot write $1${why:+: ${why##*: }}"
+    reason=$({ printf '' >"$1"; } 2>&1) && rm -f -- "$1"
+    fail "cannot write $1${reason:+: ${reason##*: }}"
 }
 
-reported() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
-    [ -e "$1" ] || snapshot ".sources-$$" "$2" ../.hung-sources >"$1" 2>/dev/null || unwritten "$1"
+write_snapshot() { # write file $1 with a snapshot of the sources of this robot with interface $2, unless it exists
+    [ -e "$1" ] || snapshot ".sources-$$" "$2" ../.hung-sources >"$1" 2>/dev/null || fail_to_write "$1"
 }
 
 begin() {
     dir=$1 role=$2 interface=$3 kib=$4 token=$5 old=${6-}
-    [ -z "$old" ] || remove "$old" # before the lock is checked, so that fetched files are deleted also without a lock
+    [ -z "$old" ] || remove "$old" # before the lock is checked, because fetched files must be deleted also without a lock
     [ "$token" = - ] || renew "$token" 0
-    free
+    read_free_space
     [ "$free" -ge "$kib" ] || fail "$free KiB of disk are free, $kib KiB are needed" "$DISK"
-    mkdir -p "$dir/.jobs" && cd "$dir" || unwritten "$dir"
+    mkdir -p "$dir/.jobs" && cd "$dir" || fail_to_write "$dir"
     if [ ! -s .began ]; then
-        read -r boot </proc/sys/kernel/random/boot_id && echo "$token $boot" >.began || unwritten .began
-        lasting .began . "$base" </dev/null >/dev/null 2>&1 &
+        read -r boot </proc/sys/kernel/random/boot_id && echo "$token $boot" >.began || fail_to_write .began
+        sync_to_disk .began . "$base" </dev/null >/dev/null 2>&1 &
     fi
-    [ -e "$role-before.txt" ] || state "$interface" >"$role-before.txt" 2>&1 || unwritten "$role-before.txt"
-    reported "$role-sources-before.txt" "$interface"
-    watch "$role" "$interface"
+    [ -e "$role-before.txt" ] || print_state "$interface" >"$role-before.txt" 2>&1 || fail_to_write "$role-before.txt"
+    write_snapshot "$role-sources-before.txt" "$interface"
+    start_sampler "$role" "$interface"
     [ $# -le 6 ] || { shift 6 && poll_sources "$role" "$interface" "$@"; }
     read -r boot </proc/sys/kernel/random/boot_id && echo "$boot"
 }
@@ -103,18 +103,18 @@ begin() {
 pack() {
     dir=$1 role=$2
     enter "$dir"
-    unwatch "$role"
-    gone
-    [ -e "$role-after.txt" ] || { echo "==> jobs <==" && endings && state "$3"; } >"$role-after.txt" 2>&1 ||
-        unwritten "$role-after.txt"
-    reported "$role-sources-after.txt" "$3"
+    stop_samplers "$role"
+    await_leaving_jobs
+    [ -e "$role-after.txt" ] || { echo "==> jobs <==" && print_job_ends && print_state "$3"; } >"$role-after.txt" 2>&1 ||
+        fail_to_write "$role-after.txt"
+    write_snapshot "$role-sources-after.txt" "$3"
     set --
     for file in * */*; do
         [ -f "$file" ] && [ ! -L "$file" ] && set -- "$@" "$file"
     done
-    # The names are unique, so that a repeated pack does not overwrite files that the first one still sends.
-    wc -c -- "$@" >".sizes-$$" || unwritten ".sizes-$$"
-    printf '' >".large-$$" || unwritten ".large-$$"
+    # The names are unique, so that a repeated `pack` does not overwrite files that the first `pack` still sends.
+    wc -c -- "$@" >".sizes-$$" || fail_to_write ".sizes-$$"
+    printf '' >".large-$$" || fail_to_write ".large-$$"
     exec 6<".sizes-$$"
     left=$# small=0
     while [ "$left" -gt 0 ]; do
@@ -125,12 +125,12 @@ pack() {
             small=$((small + size))
             set -- "$@" "$file"
         else
-            printf '%s %s\n' "$size" "$file" >>".large-$$" || unwritten ".large-$$"
+            printf '%s %s\n' "$size" "$file" >>".large-$$" || fail_to_write ".large-$$"
         fi
     done
-    sha256sum -- "$@" >".sums-$$" || unwritten ".sums-$$"
+    sha256sum -- "$@" >".sums-$$" || fail_to_write ".sums-$$"
     tar -cf - -- ".sums-$$" ".large-$$" "$@" || exit
-    [ -z "$late" ] || fail "$late"
+    [ -z "$late_error" ] || fail "$late_error"
 }
 
 piece() {
@@ -143,11 +143,11 @@ sum() {
     exec sha256sum -- "$2"
 }
 
-tidy() { # delete the folders in $1 except those named by the other arguments
+tidy() { # delete the folders in $1 except those with the names in the other arguments
     trial=$1
     shift
     for dir in "$trial"/*; do
-        for kept do [ "${dir##*/}" != "$kept" ] || continue 2; done
+        for kept_name do [ "${dir##*/}" != "$kept_name" ] || continue 2; done
         remove "$dir"
     done
     rm -f -- "$trial/.hung-sources"

@@ -65,20 +65,20 @@ class FetchProgress:
 
     Args:
         report: Called every few seconds with a text, and the estimated remaining time in seconds.
-        is_over: Returns True if the fetch was cancelled.
+        is_cancelled: Returns True if the fetch was cancelled.
     """
 
     def __init__(
-        self, report: Callable[[str, float], None] = lambda *_: None, is_over: Callable[[], bool] = lambda: False
+        self, report: Callable[[str, float], None] = lambda *_: None, is_cancelled: Callable[[], bool] = lambda: False
     ) -> None:
         self._report = report
-        self._is_over = is_over
-        self._total = self._done = self._received = 0
+        self._is_cancelled = is_cancelled
+        self._total_bytes = self._done_bytes = self._received_bytes = 0
         self._start_s = self._reported_s = 0.0
 
     def begin(self, total_bytes: int) -> None:
         """Start the fetch of files with this total size."""
-        self._total, self._done, self._received = total_bytes, 0, 0
+        self._total_bytes, self._done_bytes, self._received_bytes = total_bytes, 0, 0
         self._start_s = self._reported_s = time.monotonic()
 
     def add(self, size_bytes: int, *, fetched_before: bool = False) -> None:
@@ -91,17 +91,17 @@ class FetchProgress:
         Raises:
             LinkError: The fetch was cancelled. Without this error the next piece would open the connection again.
         """
-        if self._is_over():
+        if self._is_cancelled():
             raise LinkError("the fetch was cancelled")
-        self._done += size_bytes
+        self._done_bytes += size_bytes
         if fetched_before:
             return
-        self._received += size_bytes
+        self._received_bytes += size_bytes
         now_s = time.monotonic()
         if now_s - self._reported_s >= _REPORT_S:
             self._reported_s = now_s
-            remaining_s = (self._total - self._done) * (now_s - self._start_s) / self._received
-            self._report(f"{format_bytes(self._done)} of {format_bytes(self._total)}", remaining_s)
+            remaining_s = (self._total_bytes - self._done_bytes) * (now_s - self._start_s) / self._received_bytes
+            self._report(f"{format_bytes(self._done_bytes)} of {format_bytes(self._total_bytes)}", remaining_s)
 
 
 def pack_command(folder: str, role: str, interface: str) -> tuple[str, ...]:
@@ -114,13 +114,13 @@ def fetch(
     folder: str,
     role: str,
     interface: str,
-    into: Path,
+    destination: Path,
     *,
     expected_bytes: int = 0,
     progress: FetchProgress | None = None,
-    foreign: Callable[[str], str | None] = lambda _: None,
+    forbidden_reason: Callable[[str], str | None] = lambda _: None,
 ) -> None:
-    """Make the robot record its state again, fetch its files of a repeat, and check the hash of each file.
+    """Cause the robot to record its state again, fetch the files of a repeat, and check the hash of each file.
 
     Small files are sent in one archive, large files piece by piece. Each transfer has a timeout, the total time
     increases with the size, and an interrupted fetch continues from the last piece, also in a later call.
@@ -134,10 +134,10 @@ def fetch(
         folder: The folder, from `jobs.work_folder`.
         role: Role of the robot, the prefix of the files with the state.
         interface: Network interface of the radio.
-        into: The destination folder.
+        destination: The destination folder.
         expected_bytes: Expected total size; see `EXPECTED_TIMES`.
         progress: Receives the progress of large files.
-        foreign: Returns the reason why this robot must not send a file of this name, or None if it may.
+        forbidden_reason: Returns the reason why this robot must not send a file of this name, or None if it may.
 
     Raises:
         LinkError: The robot did not answer.
@@ -145,23 +145,29 @@ def fetch(
         RobotError: It has no such folder, or could not pack its files; files that arrived are kept.
         EvidenceError: The files are incomplete, unsafe or too large, or do not match their hash.
     """
-    packed = into / f".{role}.tar"
+    archive_path = destination / f".{role}.tar"
     try:
-        large, job_error = _fetch_small(shell, pack_command(folder, role, interface), packed, folder, foreign)
+        large_sizes, job_error = _fetch_small(
+            shell, pack_command(folder, role, interface), archive_path, folder, forbidden_reason
+        )
     finally:
-        packed.unlink(missing_ok=True)
-    if large:
-        _require_space(shell, large, into, expected_bytes)
+        archive_path.unlink(missing_ok=True)
+    if large_sizes:
+        _require_space(shell, large_sizes, destination, expected_bytes)
         progress = progress or FetchProgress()
-        progress.begin(sum(large.values()))
-        for name, size_bytes in large.items():
-            _LargeFile(shell, folder, name, size_bytes).fetch(into, role, progress)
+        progress.begin(sum(large_sizes.values()))
+        for name, size_bytes in large_sizes.items():
+            _LargeFile(shell, folder, name, size_bytes).fetch(destination, role, progress)
     if job_error is not None:
         raise job_error
 
 
 def _fetch_small(
-    shell: Shell, command: tuple[str, ...], packed: Path, folder: str, foreign: Callable[[str], str | None]
+    shell: Shell,
+    command: tuple[str, ...],
+    archive_path: Path,
+    folder: str,
+    forbidden_reason: Callable[[str], str | None],
 ) -> tuple[Mapping[str, int], RobotError | None]:
     """Fetch and unpack the archive of all small files.
 
@@ -170,11 +176,11 @@ def _fetch_small(
     """
     job_error: RobotError | None = None
     try:
-        shell.fetch(command, packed, deadline=Deadline.after(_PIECE_S), limit_bytes=_PACKED_BYTES)
+        shell.fetch(command, archive_path, deadline=Deadline.after(_PIECE_S), limit_bytes=_PACKED_BYTES)
     except RobotError as error:
         job_error = _pack_error(error, folder)
     try:
-        return _unpack(packed, packed.parent, shell.robot, foreign), job_error
+        return _unpack(archive_path, archive_path.parent, shell.robot, forbidden_reason), job_error
     except (EvidenceError, FileNotFoundError) as error:
         if isinstance(job_error, LateJobError):
             # The archive is incomplete, so the error must not report that all files arrived.
@@ -184,28 +190,29 @@ def _fetch_small(
 
 def _pack_error(error: RobotError, folder: str) -> RobotError:
     """Return the error that the job script reported when it packed a folder."""
-    reported = error_message(error.what.encode())
-    if reported.startswith(_NO_FOLDER):
-        return NoFolderError(f"it no longer has {reported.removeprefix('no ')}", where=error.where)
-    if reported.startswith(_LATE_JOB):
-        return LateJobError(reported, where=error.where, remedy=f"inspect {folder} on the robot")
-    return RobotError(reported, where=error.where, remedy=f"inspect {folder} on the robot") if reported else error
+    message = error_message(error.what.encode())
+    if message.startswith(_NO_FOLDER):
+        return NoFolderError(f"it no longer has {message.removeprefix('no ')}", where=error.where)
+    if message.startswith(_LATE_JOB):
+        return LateJobError(message, where=error.where, remedy=f"inspect {folder} on the robot")
+    return RobotError(message, where=error.where, remedy=f"inspect {folder} on the robot") if message else error
 
 
-def _require_space(shell: Shell, large: Mapping[str, int], into: Path, expected_bytes: int) -> None:
+def _require_space(shell: Shell, large_sizes: Mapping[str, int], destination: Path, expected_bytes: int) -> None:
     """Raise `EvidenceError` if large files do not fit on this disk, or are much larger than expected."""
-    total = sum(large.values())
-    free = files.free_bytes(into)
-    limit = max(ALWAYS_ALLOWED_BYTES, EXPECTED_TIMES * expected_bytes, UNEXPECTED_SHARE * free)
-    space = free - RESERVE_BYTES + sum(part.stat().st_size for part in into.glob(".*.part"))
-    if total > limit:
-        reason = f"at most {format_bytes(limit)} are fetched if {format_bytes(expected_bytes)} are expected"
-    elif total > space:
-        reason = f"{format_bytes(max(0, space))} are free here"
+    total_bytes = sum(large_sizes.values())
+    free_bytes = files.free_bytes(destination)
+    limit_bytes = max(ALWAYS_ALLOWED_BYTES, EXPECTED_TIMES * expected_bytes, UNEXPECTED_SHARE * free_bytes)
+    available_bytes = free_bytes - RESERVE_BYTES + sum(part.stat().st_size for part in destination.glob(".*.part"))
+    if total_bytes > limit_bytes:
+        reason = f"at most {format_bytes(limit_bytes)} are fetched if {format_bytes(expected_bytes)} are expected"
+    elif total_bytes > available_bytes:
+        reason = f"{format_bytes(max(0, available_bytes))} are free here"
     else:
         return
     raise EvidenceError(
-        f"{format_bytes(total)} must be fetched ({', '.join(large)}), but {reason}: they stay on the robot",
+        f"{format_bytes(total_bytes)} must be fetched ({', '.join(large_sizes)}), but {reason}; "
+        "the files stay on the robot",
         where=shell.robot,
     )
 
@@ -219,9 +226,9 @@ class _LargeFile:
     name: str
     size_bytes: int
 
-    def fetch(self, into: Path, role: str, progress: FetchProgress) -> None:
+    def fetch(self, destination: Path, role: str, progress: FetchProgress) -> None:
         """Fetch the file piece by piece, after the pieces of an earlier call, and check its hash."""
-        part, piece = into / f".{role}.{self.name.replace('/', '+')}.part", into / f".{role}.piece"
+        part, piece = destination / f".{role}.{self.name.replace('/', '+')}.part", destination / f".{role}.piece"
         digest = hashlib.sha256()
         with part.open("ab+") as file:
             fetched_bytes = min(file.tell(), self.size_bytes) // PIECE_BYTES * PIECE_BYTES
@@ -241,7 +248,7 @@ class _LargeFile:
         if self._remote_hash() != digest.hexdigest():
             part.unlink()  # pieces of an earlier call may be wrong, so all are fetched again
             raise EvidenceError(f"hash differs: {self.name}", where=self.shell.robot)
-        path = _target_path(into, self.name, self.shell.robot)
+        path = _target_path(destination, self.name, self.shell.robot)
         try:
             # Reserve the name first, because the files of another robot are fetched at the same time.
             path.open("xb").close()
@@ -249,11 +256,11 @@ class _LargeFile:
             raise _duplicate_error(self.name, self.shell.robot) from error
         part.rename(path)
 
-    def _piece(self, start: int, to: Path) -> bytes:
+    def _piece(self, start: int, path: Path) -> bytes:
         number, expected = start // PIECE_BYTES, min(PIECE_BYTES, self.size_bytes - start)
         command = (*CALL, "piece", self.folder, self.name, str(number), str(PIECE_BYTES))
-        self.shell.fetch(command, to, deadline=Deadline.after(_PIECE_S), limit_bytes=PIECE_BYTES)
-        content = to.read_bytes()
+        self.shell.fetch(command, path, deadline=Deadline.after(_PIECE_S), limit_bytes=PIECE_BYTES)
+        content = path.read_bytes()
         if len(content) < expected:
             what = f"sent {len(content)} bytes of {self.name} from byte {start} on, instead of {expected}"
             raise EvidenceError(what, where=self.shell.robot)
@@ -264,47 +271,53 @@ class _LargeFile:
         return _parse_hashes(call(self.shell, "sum", self.folder, self.name, deadline=deadline)).get(self.name)
 
 
-def _unpack(packed: Path, into: Path, robot: str, foreign: Callable[[str], str | None]) -> Mapping[str, int]:
+def _unpack(
+    archive_path: Path, destination: Path, robot: str, forbidden_reason: Callable[[str], str | None]
+) -> Mapping[str, int]:
     """Unpack an archive of small files, check them, and return the sizes of the large files by name."""
     hashes: dict[str, str] = {}
-    large: dict[str, int] = {}
-    received: dict[str, str] = {}
-    with packed.open("rb") as file:
+    large_sizes: dict[str, int] = {}
+    received_hashes: dict[str, str] = {}
+    with archive_path.open("rb") as file:
         for member in archive.members(file, robot):
             if _HASH_LIST.match(member.name) and not hashes:
                 hashes = _parse_hashes(b"".join(islice(member.chunks, _LIST_CHUNKS)))
-            elif _LARGE.match(member.name) and not large:
-                large = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
-                for name in large:
-                    _require_own(name, robot, foreign)
+            elif _LARGE.match(member.name) and not large_sizes:
+                large_sizes = _parse_sizes(b"".join(islice(member.chunks, _LIST_CHUNKS)), robot)
+                for name in large_sizes:
+                    _require_allowed_name(name, robot, forbidden_reason)
             elif not _SAFE_NAME.match(member.name):
                 raise EvidenceError(f"sent {member.name!r}, which is not a regular file of a repeat", where=robot)
             else:
-                _require_own(member.name, robot, foreign)
-                received[member.name] = _write(member, into, robot)
-    wrong = sorted(name for name in hashes.keys() | received.keys() if hashes.get(name) != received.get(name))
-    if wrong or not received:
-        raise EvidenceError(f"hash differs or file missing: {', '.join(wrong) or 'all files'}", where=robot)
-    return large
+                _require_allowed_name(member.name, robot, forbidden_reason)
+                received_hashes[member.name] = _write(member, destination, robot)
+    differing_names = sorted(
+        name for name in hashes.keys() | received_hashes.keys() if hashes.get(name) != received_hashes.get(name)
+    )
+    if differing_names or not received_hashes:
+        raise EvidenceError(f"hash differs or file missing: {', '.join(differing_names) or 'all files'}", where=robot)
+    return large_sizes
 
 
-def _require_own(name: str, robot: str, foreign: Callable[[str], str | None]) -> None:
+def _require_allowed_name(name: str, robot: str, forbidden_reason: Callable[[str], str | None]) -> None:
     """Check that this name is not reserved for a file that the laptop or another robot writes.
 
     Raises:
-        EvidenceError: The laptop or another robot writes it.
+        EvidenceError: The name is reserved.
     """
-    reason = "only the laptop writes a file of this name" if laptop_files.is_reserved(name) else foreign(name)
+    reason = (
+        "only the laptop writes a file of this name" if laptop_files.is_reserved(name) else forbidden_reason(name)
+    )
     if reason:
         raise EvidenceError(
             f"sent {name}: {reason}", where=robot, remedy=f"find out what writes {name} on the robot, and rename it"
         )
 
 
-def _write(member: archive.TarMember, into: Path, robot: str) -> str:
+def _write(member: archive.TarMember, destination: Path, robot: str) -> str:
     """Write a member to a new file; return its hash."""
     try:
-        file = _target_path(into, member.name, robot).open("xb")
+        file = _target_path(destination, member.name, robot).open("xb")
     except FileExistsError as error:
         raise _duplicate_error(member.name, robot) from error
     digest = hashlib.sha256()
@@ -315,9 +328,9 @@ def _write(member: archive.TarMember, into: Path, robot: str) -> str:
     return digest.hexdigest()
 
 
-def _target_path(into: Path, name: str, robot: str) -> Path:
+def _target_path(destination: Path, name: str, robot: str) -> Path:
     """Return the path for a file of this name; its folder is created."""
-    path = into / name
+    path = destination / name
     try:
         path.parent.mkdir(exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:

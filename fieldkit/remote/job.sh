@@ -5,73 +5,73 @@ launch() { # start a job; $1 is start, run or serve
     shift 9
     enter "$dir"
     meta=$PWD/.jobs/$name
-    clock
-    over_s=$((now + ${limit%.*} + within + 10)) # a caller that has not requested the end by then is lost
+    read_uptime
+    over_s=$((now + ${limit%.*} + within + 10)) # a caller that has not requested the end by then has lost its connection
     if [ -d "$meta" ]; then
-        ours=
+        is_new=
     elif [ -e .ended ]; then
-        late
-    elif keep && why=$(mkdir "$meta" 2>&1); then
-        ours=1
-        [ -O . ] || give "$meta"
+        fail_late
+    elif renew_for_job && reason=$(mkdir "$meta" 2>&1); then
+        is_new=1
+        [ -O . ] || give_ownership "$meta"
         printf '%s\n' "$*" >"$meta/command"
         set -- "$meta" "$limit" "$ready" "$within" "$in" "$out" "$log" "$@"
     else
-        ours=
-        [ -d "$meta" ] || fail "cannot start job $name: $why"
+        is_new=
+        [ -d "$meta" ] || fail "cannot start job $name: $reason"
     fi
-    case $how$ours in
+    case $how$is_new in
         run1)
             setsid sh "$self" supervise - "$@" </dev/null
             code=$?
-            [ -s "$meta/pid" ] || unwritten "$meta/pid"
-            [ -s "$meta/exit" ] || [ ! -e .ended ] || late
-            conclude "$code"
+            [ -s "$meta/pid" ] || fail_to_write "$meta/pid"
+            [ -s "$meta/exit" ] || [ ! -e .ended ] || fail_late
+            exit_when_requested "$code"
             ;;
         run)
-            rise
+            wait_until_ready
             await "$meta"
             result "$meta"
-            conclude $?
+            exit_when_requested $?
             ;;
         *1) detach "$@" ;;
     esac
-    [ "$how" = serve ] || { rise; return; }
+    [ "$how" = serve ] || { wait_until_ready; return; }
     # A repeated call for a job that was ready succeeds, even if the job has ended since.
-    [ -e "$meta/up" ] || rise
+    [ -e "$meta/up" ] || wait_until_ready
     { printf '' >"$meta/up"; } 2>/dev/null
     echo up
     await "$meta" $((${limit%.*} + 10)) || exit 124
     result "$meta"
 }
 
-keep() { # renew the lock under which the folder was created, until a job with this limit has ended
+renew_for_job() { # renew the lock under which the folder was created, until a job with this limit has ended
     token=-
     [ ! -s .began ] || read -r token _ <.began
     [ "$token" = - ] || renew "$token" $((${limit%.*} + within))
 }
 
-give() { # change the owner of $1, which root created, to the owner of this folder, so that it can be deleted
-    made=$1
+give_ownership() { # change the owner of $1, which root created, to the owner of this folder, so that it can be deleted
+    path=$1
     set -- $(ls -ldn .)
-    chown "$3:$4" "$made"
+    chown "$3:$4" "$path"
 }
 
-late() { # fail because the jobs of this folder were stopped already
+fail_late() { # fail because the jobs of this folder were stopped already
     by=
     read -r by 2>/dev/null <.ended
-    fail "job $name comes too late: the jobs of $dir were ended${by:+ by $by}"
+    fail "job $name cannot start: the jobs of $dir were stopped${by:+ by $by}"
 }
 
-within_s() { # replace the shell by the command after $1, with a timeout of $1 seconds
+exec_with_timeout() { # replace the shell by the command in $2..., with a timeout of $1 seconds
     cd / # the timeout of busybox runs a second longer, and must not be a process in a deleted folder
     exec timeout "$@"
 }
 
-conclude() { # exit with $1 when the caller closes standard input to request the result, or after a timeout
+exit_when_requested() { # exit with $1 when the caller closes standard input to request the result, or after a timeout
     [ ! -c /proc/self/fd/0 ] || exit "$1" # standard input is /dev/null: report without a request
-    clock
-    [ "$now" -ge "$over_s" ] || (within_s $((over_s - now)) cat) >/dev/null 2>&1
+    read_uptime
+    [ "$now" -ge "$over_s" ] || (exec_with_timeout $((over_s - now)) cat) >/dev/null 2>&1
     case $? in
         0 | 124 | 143) ;;
         *) while read -r _; do :; done ;; # the timeout of old versions of busybox has another syntax
@@ -86,30 +86,30 @@ detach() {
     { (read -r shell _ </proc/self/stat; setsid sh "$self" supervise "$shell" "$@" </dev/null >/dev/null; :); :; } 2>/dev/null
 }
 
-rise() { # wait until the job in $meta is ready
+wait_until_ready() { # wait until the job in $meta is ready
     [ "$how" != run ] || ready=-
-    clock
+    read_uptime
     until_s=$((now + within)) polls=0
-    [ "$ready" = - ] || nap 0.01 # a job with a condition needs at least this time
-    until [ -s "$meta/pid" ] && ready "$ready" "$log"; do
+    [ "$ready" = - ] || sleep_for 0.01 # a job with a condition needs at least this time
+    until [ -s "$meta/pid" ] && is_ready "$ready" "$log"; do
         if ended "$meta"; then
-            [ -s "$meta/exit" ] || [ ! -e .ended ] || late
-            ready "$ready" "$log" && return
+            [ -s "$meta/exit" ] || [ ! -e .ended ] || fail_late
+            is_ready "$ready" "$log" && return
             [ -s "$meta/exit" ] || ! rebooted "$meta" || result "$meta"
             fail "job $name ended before it was ready
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
-        clock
+        read_uptime
         if [ "$now" -gt "$until_s" ]; then
             [ -s "$meta/pid" ] || ! rebooted "$meta" || result "$meta"
-            [ -s "$meta/pid" ] || unwritten "$meta/pid"
+            [ -s "$meta/pid" ] || fail_to_write "$meta/pid"
             alive "$meta" && signal KILL && await "$meta" 1
-            fail "job $name was not up in $within s
+            fail "job $name was not ready within $within s
 $(tail -n 3 "$log" 2>/dev/null)"
         fi
-        nap_before_poll
+        sleep_before_poll
     done
-    [ -s "$meta/exit" ] || [ ! -e .ended ] || late
+    [ -s "$meta/exit" ] || [ ! -e .ended ] || fail_late
 }
 
 await() { # wait for the end of the job in $1, for at most $2 seconds
@@ -120,18 +120,18 @@ await() { # wait for the end of the job in $1, for at most $2 seconds
         if [ -z "${2-}" ]; then
             read -r _ <&7
         else
-            (within_s "$2" cat) <&7 >/dev/null 2>&1
+            (exec_with_timeout "$2" cat) <&7 >/dev/null 2>&1
             case $? in 124 | 143) return 1 ;; esac
         fi
     fi
     # After the end of the FIFO the process may exist for a moment. Polling is also needed for jobs of older versions of
     # this script without a FIFO, for jobs of root, and for old versions of busybox with another timeout.
-    clock
+    read_uptime
     until_s=$((now + ${2-86400}))
     while alive "$1"; do
-        clock
+        read_uptime
         [ "$now" -le "$until_s" ] || return 1
-        nap 0.05
+        sleep_for 0.05
     done
 }
 
@@ -139,11 +139,11 @@ settle() { # wait until file $1 has not grown for 20 ms, for at most 2 s
     n=0 last=-1
     while size=$(wc -c <"$1") && [ "$size" != "$last" ] && [ "$n" -lt 100 ]; do
         last=$size n=$((n + 1))
-        nap 0.02
+        sleep_for 0.02
     done
 }
 
-ask() { # record that fieldkit stops the job in $meta; a full disk must not prevent the stop
+mark_stopped() { # record that fieldkit stops the job in $meta; a full disk must not prevent the stop
     { printf '' >"$meta/asked"; } 2>/dev/null || :
 }
 
@@ -151,7 +151,7 @@ signal() { # send signal $1 to the process group from `alive`; with sudo for cap
     kill "-$1" "-$pid" 2>/dev/null || sudo -n sh -c 'kill "-$1" "-$2"' sh "$1" "$pid" 2>/dev/null || ! alive "$meta"
 }
 
-remove() { # delete folder $1; a second try, because a concurrent abort may create a file in it
+remove() { # delete folder $1; it is tried twice, because a concurrent abort may create a file in the folder
     rm -rf -- "$1" 2>/dev/null || rm -rf -- "$1" 2>/dev/null || sudo -n sh -c 'rm -rf -- "$1"' sh "$1" || fail "cannot remove $1"
 }
 
@@ -160,7 +160,7 @@ stop() {
     [ -e "$meta/leaves" ] && return
     [ "${5--}" = - ] || settle "$1/$5"
     if alive "$meta" && [ ! -s "$meta/exit" ]; then
-        ask
+        mark_stopped
         signal "$3" || fail "cannot signal the group $pid"
         [ -n "$end_text" ] && reports_end "$4" && return
         await "$meta" "$4" || { signal KILL; await "$meta" 2; }
@@ -169,25 +169,25 @@ stop() {
 }
 
 reports_end() { # true if $log contains $end_text within $1 seconds, which shows that the job in $meta has finished its work
-    clock
+    read_uptime
     until_s=$((now + $1)) polls=0
-    until holds "$log" "$end_text"; do
-        clock
+    until has_line_with "$log" "$end_text"; do
+        read_uptime
         [ "$now" -le "$until_s" ] && alive "$meta" || return 1
-        nap_before_poll
+        sleep_before_poll
     done
     printf '' >"$meta/leaves"
 }
 
-gone() { # wait for the jobs of this folder for which `stop` did not wait; set late to the error of a failed one
-    late=
+await_leaving_jobs() { # wait for the jobs of this folder for which `stop` did not wait; set late_error if one has failed
+    late_error=
     for meta in .jobs/*; do
         [ -e "$meta/leaves" ] || continue
         alive "$meta" && { await "$meta" 2 || { signal KILL; await "$meta" 2; }; }
         (result "$meta") 2>/dev/null
         code=$?
-        [ "$code" -eq 0 ] || late="job ${meta##*/} ended with exit code $code"
-        [ -s "$meta/exit" ] || ! rebooted "$meta" || late="job ${meta##*/} was cut: the robot rebooted"
+        [ "$code" -eq 0 ] || late_error="job ${meta##*/} ended with exit code $code"
+        [ -s "$meta/exit" ] || ! rebooted "$meta" || late_error="job ${meta##*/} was interrupted: the robot rebooted"
     done
 }
 
@@ -195,38 +195,38 @@ end() { # stop and list all jobs in the folders $@: SIGINT to all, SIGKILL after
     for dir do
         [ -d "$dir/.jobs" ] && { printf '%s\n' "${by-}" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
-            alive "$meta" && describe && ask && signal INT
+            alive "$meta" && print_job && mark_stopped && signal INT
         done
     done
-    patient=1 stuck=
+    may_wait=1 stuck=
     for dir do
         for meta in "$dir"/.jobs/*; do
             alive "$meta" || continue
-            [ -n "$patient" ] && await "$meta" 2 && continue
-            patient=
+            [ -n "$may_wait" ] && await "$meta" 2 && continue
+            may_wait=
             [ ! -e "$meta/unhurried" ] || continue
             signal KILL && await "$meta" 2 || stuck="$stuck ${dir#"${base%/*}"/}/${meta##*/}"
         done
     done
-    [ -z "$stuck" ] || fail "cannot end$stuck"
+    [ -z "$stuck" ] || fail "cannot stop$stuck"
 }
 
-describe() { # print a line about the job in $meta, after `alive`
+print_job() { # print a line about the job in $meta, after `alive`
     line=
     read -r line <"$meta/command"
     line="${meta%/.jobs/*}/${meta##*/} $pid $line"
     echo "${line#"${base%/*}"/}"
 }
 
-left() {
+left() { # list the running jobs of all trials, and processes in deleted folders
     for meta in "$base"/*/*/.jobs/*; do
-        alive "$meta" && describe
+        alive "$meta" && print_job
     done
-    strays
+    list_strays
     return 0
 }
 
-strays() { # list processes in deleted folders of jobs, and send them signal $1 if it is given
+list_strays() { # list processes in deleted folders of jobs, and send them signal $1 if it is given
     home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
     # grep reads the list of a computer with many processes much faster than the shell.
     ls -ld /proc/[0-9]*/cwd 2>/dev/null | grep -F "/cwd -> $home/" | while read -r line; do

@@ -32,9 +32,9 @@ __all__ = [
     "REPLY_S",
     "SCRIPT_PATH",
     "STILL_RUNNING",
-    "Aborted",
+    "AbortResult",
     "Job",
-    "Pending",
+    "PendingJob",
     "abort",
     "begin",
     "begin_wait",
@@ -163,12 +163,12 @@ def start(shell: Shell, job: Job) -> None:
         RobotError: The job ended before it was ready, or was not ready in time; the message has the end of its log.
     """
     within_s = REPLY_S - READY_S + job.ready_s
-    completed = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
-    require_success(shell, completed, remedy=f"inspect {job.folder} on the robot")
+    result = shell.run(command("start", job), deadline=Deadline.after(within_s), check=False)
+    require_success(shell, result, remedy=f"inspect {job.folder} on the robot")
 
 
 @dataclass(frozen=True)
-class Pending:
+class PendingJob:
     """A started job, or a wait for one. The control connection is silent until `end` is called.
 
     Attributes:
@@ -188,17 +188,17 @@ class Pending:
             LinkError: The robot did not answer in `within_s`.
             RobotError: The robot could not start the job, has no such job, or rebooted while it ran.
         """
-        completed = self.session.end(deadline=Deadline.after(within_s), check=False)
-        return _exit_code(self.shell, self.job, completed)
+        result = self.session.end(deadline=Deadline.after(within_s), check=False)
+        return _exit_code(self.shell, self.job, result)
 
 
-def begin(shell: Shell, job: Job) -> Pending:
-    """Start a job whose end is reported only when `Pending.end` requests it, so that no report disturbs the radio.
+def begin(shell: Shell, job: Job) -> PendingJob:
+    """Start a job whose end is reported only when `PendingJob.end` requests it, so that no report disturbs the radio.
 
     Raises:
         LinkError: The robot did not answer.
     """
-    return Pending(shell, job, shell.begin(command("run", job), deadline=Deadline.after(REPLY_S)))
+    return PendingJob(shell, job, shell.begin(command("run", job), deadline=Deadline.after(REPLY_S)))
 
 
 def run(shell: Shell, job: Job) -> int:
@@ -214,10 +214,10 @@ def run(shell: Shell, job: Job) -> int:
         RobotError: The job could not be started.
     """
     session = shell.begin(command("run", job), deadline=Deadline.after(REPLY_S), until=b"")
-    return Pending(shell, job, session).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
+    return PendingJob(shell, job, session).end((READY_S if job.ready else 0) + job.limit_s + REPLY_S)
 
 
-def serve(shell: Shell, job: Job) -> Pending:
+def serve(shell: Shell, job: Job) -> PendingJob:
     """Start a job and return when it is ready; the robot reports its end without a request.
 
     A job that was started before is not started again. The robot waits for its end until `REPLY_S` after its limit.
@@ -228,19 +228,19 @@ def serve(shell: Shell, job: Job) -> Pending:
     """
     session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
     if not session.is_ready:
-        completed = session.end(deadline=Deadline.after(REPLY_S), check=False)
-        require_success(shell, completed, remedy=f"inspect {job.folder} on the robot")
-    return Pending(shell, job, session)
+        result = session.end(deadline=Deadline.after(REPLY_S), check=False)
+        require_success(shell, result, remedy=f"inspect {job.folder} on the robot")
+    return PendingJob(shell, job, session)
 
 
-def begin_wait(shell: Shell, job: Job, seconds: float) -> Pending:
+def begin_wait(shell: Shell, job: Job, seconds: float) -> PendingJob:
     """Start to wait on the robot for the end of a started job, for at most `seconds`.
 
     Raises:
         LinkError: The robot did not answer.
     """
     argv = (*_script(job), "wait", job.folder, job.name, f"{seconds:.0f}")
-    return Pending(shell, job, shell.begin(argv, deadline=Deadline.after(REPLY_S)))
+    return PendingJob(shell, job, shell.begin(argv, deadline=Deadline.after(REPLY_S)))
 
 
 def stop(
@@ -280,8 +280,8 @@ def stop(
         settle or "-",
         *([job.log, end_text] if end_text else []),
     )
-    completed = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
-    return _exit_code(shell, job, completed)
+    result = shell.run(argv, deadline=Deadline.after(grace_s + REPLY_S), check=False)
+    return _exit_code(shell, job, result)
 
 
 def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
@@ -290,7 +290,7 @@ def list_running(shell: Shell, deadline: Deadline) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True)
-class Aborted:
+class AbortResult:
     """Result of `abort` on a robot.
 
     Attributes:
@@ -307,7 +307,7 @@ class Aborted:
     error: FieldkitError | None = None
 
 
-def abort(shell: Shell, user: str, deadline: Deadline) -> Aborted:
+def abort(shell: Shell, user: str, deadline: Deadline) -> AbortResult:
     """Break the robot's lock in the name of `user`, and stop all jobs of all trials.
 
     The job script is not installed for this, because a full or read-only disk may be the reason for the abort.
@@ -316,14 +316,16 @@ def abort(shell: Shell, user: str, deadline: Deadline) -> Aborted:
         LinkError: The robot did not answer.
     """
     argv = ("sh", "-c", 'eval "$(cat)"', SCRIPT_PATH, "abort", user)
-    completed = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
-    output, error = completed.stdout, None
+    result = shell.run(argv, stdin=SCRIPT, deadline=deadline, check=False)
+    output, error = result.stdout, None
     try:
-        require_success(shell, completed)
+        require_success(shell, result)
     except RobotError as script_error:
         error = script_error
     landing = tuple((match["program"].decode(), match["state"].decode()) for match in _LANDING_LINE.finditer(output))
-    return Aborted(locked=_HELD_LINE.search(output) is not None, jobs=_lines(output), landing=landing, error=error)
+    return AbortResult(
+        locked=_HELD_LINE.search(output) is not None, jobs=_lines(output), landing=landing, error=error
+    )
 
 
 def _lines(output: bytes) -> tuple[str, ...]:
@@ -335,7 +337,7 @@ def _script(job: Job) -> Sequence[str]:
     return ("sudo", "-n", *CALL) if job.as_root else CALL
 
 
-def _exit_code(shell: Shell, job: Job, completed: Completed) -> int:
-    if error_message(completed.stderr):
-        require_success(shell, completed, remedy=f"inspect {job.folder} on the robot")
-    return completed.exit_code
+def _exit_code(shell: Shell, job: Job, result: Completed) -> int:
+    if error_message(result.stderr):
+        require_success(shell, result, remedy=f"inspect {job.folder} on the robot")
+    return result.exit_code

@@ -1,7 +1,7 @@
-# The leader of the session and process group of a job. This part precedes the other parts and exits the shell: parsing
+# The leader of the session and process group of a job. This part comes before the larger parts and exits the shell: parsing
 # the rest would take half a millisecond for each of the up to eight jobs of a repeat.
 
-bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listener has state 0A
+is_bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listener has state 0A
     if [ "$1" = tcp ] && listening=$(ss -tn state listening "sport = :$((0x$2))" 2>/dev/null); then
         # ss requests listeners only; reading a table of all connections takes up to 4 ms.
         case $listening in *":$((0x$2)) "*) return ;; *) return 1 ;; esac
@@ -10,7 +10,7 @@ bound() { # true if a socket is bound; $1 protocol, $2 port in hex; a TCP listen
     grep -qsE "^ *[0-9]+: [0-9A-F]+:$2 [0-9A-F]+:0000 $state " "/proc/net/$1" "/proc/net/${1}6"
 }
 
-holds() { # true if file $1 has a line that contains $2
+has_line_with() { # true if file $1 has a line that contains $2
     [ -e "$1" ] || return 1
     while read -r line || [ -n "$line" ]; do
         case $line in *"$2"*) return 0 ;; esac
@@ -18,11 +18,11 @@ holds() { # true if file $1 has a line that contains $2
     return 1
 }
 
-ready() {
+is_ready() { # true if condition $1 (READY in common.sh) is met; $2 log of the job
     case $1 in
         -) true ;;
-        log:*) holds "$2" "${1#log:}" ;;
-        *) bound "${1%%:*}" "${1#*:}" ;;
+        log:*) has_line_with "$2" "${1#log:}" ;;
+        *) is_bound "${1%%:*}" "${1#*:}" ;;
     esac
 }
 
@@ -31,14 +31,14 @@ supervise() { # run a job as the leader of its session and process group; $1 is 
     shift 8
     trap : INT TERM HUP
     [ "$shell" != "$PPID" ] || kill -KILL "$shell"
-    mkfifo "$meta/end" && exec 9<>"$meta/end" # open until the job ends: a reader then receives end-of-file
+    mkfifo "$meta/end" && exec 9<>"$meta/end" # open until the job ends; a reader then receives end-of-file
     { identify $$ && echo "$identity" >"$meta/pid"; } || exit "$GENERAL" # without a record it could not be stopped
-    # `end` writes .ended before it lists the jobs, and this job has written its pid: one of the two detects the other.
+    # `end` writes .ended before it lists the jobs, and this job has written its pid, so one of the two detects the other.
     [ ! -e "${meta%/.jobs/*}/.ended" ] || exit "$GENERAL"
     # The watchdog may lose the final signal if it arrives before its traps are reset. Then the exit code exists already
     # or, if the folder was deleted, the leader has exited.
     (trap - INT TERM HUP
-        [ -s "$meta/exit" ] || ! kill -0 $$ 2>/dev/null || { await_ready; nap "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
+        [ -s "$meta/exit" ] || ! kill -0 $$ 2>/dev/null || { await_ready; sleep_for "$limit"; printf '' >"$meta/limit"; kill -INT 0; sleep 5; kill -KILL 0; }) \
         </dev/null >/dev/null 2>&1 9>&- &
     if [ "$out" = "$log" ]; then "$@" <"$in" >"$log" 2>&1 9>&-; else "$@" <"$in" >"$out" 2>"$log" 9>&-; fi
     code=$?
@@ -50,11 +50,11 @@ supervise() { # run a job as the leader of its session and process group; $1 is 
 
 await_ready() { # wait until the job is ready, or $within seconds have passed
     [ "$ready" != - ] || return
-    clock
+    read_uptime
     until_s=$((now + within))
     # Polled slowly, because reading the table of sockets takes up to 4 ms.
-    while nap 0.2 && clock && [ "$now" -le "$until_s" ]; do
-        ready "$ready" "$log" && return
+    while sleep_for 0.2 && read_uptime && [ "$now" -le "$until_s" ]; do
+        is_ready "$ready" "$log" && return
     done
 }
 

@@ -22,7 +22,7 @@ from fieldkit.remote.sockets import Connect, Timing
 Channel = paramiko.Channel
 Transport = paramiko.Transport
 
-SPARES: Final = 2
+SPARE_CHANNELS: Final = 2
 """Number of channels that are opened in advance: one for the next command, and one for the time in which a further
 channel is opened."""
 
@@ -154,7 +154,7 @@ class Link:
 
     @property
     def alive(self) -> bool:
-        """Whether it is logged in, and no error has occurred."""
+        """Whether the link is logged in, and no error has occurred."""
         return not self._closed and self._transport is not None and self._transport.is_authenticated()
 
     def exchange_keys(self, kind: str) -> HostKey:
@@ -202,11 +202,11 @@ class Link:
             ConfigurationError: There is no key for the login.
             OSError, SSHException, EOFError: As `exchange_keys`.
         """
-        pinned = credentials.host_key
-        offered = self.exchange_keys(pinned.kind)
-        if offered != pinned:
+        pinned_key = credentials.host_key
+        server_key = self.exchange_keys(pinned_key.kind)
+        if server_key != pinned_key:
             raise HostKeyError(
-                f"the host key changed: pinned {pinned.fingerprint}, offered {offered.fingerprint}",
+                f"the host key changed: pinned {pinned_key.fingerprint}, offered {server_key.fingerprint}",
                 where=address.robot,
                 remedy=f"continue only if it was reinstalled: fieldkit enroll {address.robot} --replace",
             )
@@ -217,7 +217,7 @@ class Link:
             with contextlib.suppress(paramiko.AuthenticationException):
                 attempt()
             if transport.is_authenticated():
-                self.open_spares()
+                self.open_spare_channels()
                 return
             if not transport.is_active():  # a server may disconnect after several wrong keys, OpenSSH after six
                 break
@@ -252,20 +252,20 @@ class Link:
         stream, _ = self._connection()
         sockets.set_timeout(stream, self._timing.dead_s + seconds)
 
-    def open_spares(self) -> None:
+    def open_spare_channels(self) -> None:
         """Start to open channels in advance, so that later commands need not wait for a channel.
 
         Must be called after a command has ended. At the start of a command, the answers would collide with its
         packets.
         """
         _, transport = self._connection()
-        if _closes_spares(transport):
+        if _closes_spare_channels(transport):
             return
         with self._lock:
-            missing = max(0, SPARES - len(self._spares))
-            self._spares += [self._open_in_background(transport) for _ in range(missing)]
+            missing_count = max(0, SPARE_CHANNELS - len(self._spares))
+            self._spares += [self._open_in_background(transport) for _ in range(missing_count)]
 
-    def wait_until_opened(self, deadline: Deadline) -> None:
+    def wait_until_open(self, deadline: Deadline) -> None:
         """Wait until all channels that are being opened in advance are open, or the deadline has passed."""
         with self._lock:
             spares = list(self._spares)
@@ -278,7 +278,7 @@ class Link:
             OSError, SSHException, EOFError: The connection broke, or the server refuses more.
         """
         _, transport = self._connection()
-        if _closes_spares(transport):
+        if _closes_spare_channels(transport):
             return None
         with self._lock:
             spares = list(self._spares)
@@ -300,13 +300,13 @@ class Link:
     def _open_in_background(self, transport: paramiko.Transport) -> "Future[Channel]":
         future: Future[Channel] = Future()
 
-        def work() -> None:
+        def open_channel() -> None:
             try:
                 future.set_result(self._open(transport))
             except BROKEN as error:
                 future.set_exception(error)
 
-        threading.Thread(target=work, daemon=True).start()
+        threading.Thread(target=open_channel, daemon=True).start()
         return future
 
     def _open(self, transport: paramiko.Transport) -> Channel:
@@ -356,7 +356,7 @@ def connection_error(transport: paramiko.Transport) -> BaseException | None:
     return error
 
 
-def _closes_spares(transport: paramiko.Transport) -> bool:
+def _closes_spare_channels(transport: paramiko.Transport) -> bool:
     """Return True if the server closes channels that are opened in advance.
 
     dropbear (2022.83) closes channels without a command when the command of another channel ends.

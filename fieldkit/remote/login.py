@@ -46,9 +46,9 @@ def read_host_key(address: Address, connect: Connect, *, deadline: Deadline, kin
     Raises:
         LinkLostError: The robot was not reached, or did not answer before the deadline.
     """
-    link, never = Link(connect, Timing()), threading.Event()
-    with _converting_errors(link, address, never), contextlib.closing(link):
-        return call_with_deadline(lambda: link.exchange_keys(kind), deadline, never)
+    link, no_event = Link(connect, Timing()), threading.Event()
+    with _converting_errors(link, address, no_event), contextlib.closing(link):
+        return call_with_deadline(lambda: link.exchange_keys(kind), deadline, no_event)
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
-# Stop the programs of the agent that drive this robot, fly it, or guard a drone.
+# Stop the motion programs of this robot: the programs of the agent that drive it, fly it, or guard a drone.
 
-moves() { # true if the job in $1 is such a program; sets program to `drive` or `fly`
+is_motion_program() { # true if the job in $1 is a motion program; sets program to `drive` or `fly`
     line=
     read -r line 2>/dev/null <"$1/command" || [ -n "$line" ] || return 1
     case $line in
@@ -10,48 +10,48 @@ moves() { # true if the job in $1 is such a program; sets program to `drive` or 
     esac
 }
 
-halt_motion() { # in the name of $1; only the programs of folder $2 if it is given
-    by=$1 halted=
+halt_motion() { # stop the programs in the name of $1; only those of folder $2 if it is given
+    by=$1 programs=
     # The signals are sent first: they need no disk space and no wait.
     if [ -n "${2-}" ]; then
-        brake "$base/${2#*/}"
+        signal_programs "$base/${2#*/}"
     else
-        brake "$base"/*/*
-        stray_movers
-        newest
-        # After this the trial that holds the lock starts nothing, and `renew` reports the reason to it.
-        [ "$kind" != held ] || broken stopped || full=1
-        brake "$base"/*/* # programs that were started in the meantime
+        signal_programs "$base"/*/*
+        signal_strays
+        read_newest
+        # After this the trial that has the lock starts no program, and `renew` reports the reason to it.
+        [ "$kind" != held ] || record_break stopped || full=1
+        signal_programs "$base"/*/* # programs that were started in the meantime
     fi
     tries=0
-    while [ "$tries" -lt 60 ] && awaited; do # each takes 20 ms and a fork
+    while [ "$tries" -lt 60 ] && is_any_silent; do # each try takes 20 ms and a fork
         tries=$((tries + 1))
-        nap 0.02
+        sleep_for 0.02
     done
-    case $tries$(motion_states $halted) in
+    case $tries$(motion_states $programs) in
         0*) ;;
-        *" land"* | *" return"*) nap 0.05 ;; # a drone on the ground reports `landed` within this time
+        *" land"* | *" return"*) sleep_for 0.05 ;; # a drone on the ground reports `landed` within this time
     esac
-    motion_states $halted
-    for name in $halted; do
+    motion_states $programs
+    for name in $programs; do
         meta=$base/${name#*/}
-        moves "$meta" && motion_state "$meta"
+        is_motion_program "$meta" && motion_state "$meta"
         # A driving program that does not react is killed. A program of a drone is not: it may still land the drone.
         [ "$state:$program" != silent:drive ] || { alive "$meta" && signal KILL; }
     done
-    [ -z "${full-}" ] || unwritten "$base/lock"
+    [ -z "${full-}" ] || fail_to_write "$base/lock"
 }
 
-brake() { # signal each such program in folders $@, and add it to halted: TRIAL/ATTEMPT/.jobs/NAME below the home
+signal_programs() { # signal each motion program in folders $@, and add it to programs: TRIAL/ATTEMPT/.jobs/NAME below the home
     for dir do
-        # A starting program writes its pid and then checks for this file: it is found here, or finds the file.
+        # A starting program writes its pid and then checks for this file. Either this function finds it, or it finds the file.
         [ -d "$dir/.jobs" ] && { printf '%s\n' "$by" >"$dir/.ended"; } 2>/dev/null
         for meta in "$dir"/.jobs/*; do
             name=${meta#"${base%/*}"/}
-            case " $halted " in *" $name "*) continue ;; esac
-            moves "$meta" && alive "$meta" || continue
-            halted="$halted $name"
-            ask
+            case " $programs " in *" $name "*) continue ;; esac
+            is_motion_program "$meta" && alive "$meta" || continue
+            programs="$programs $name"
+            mark_stopped
             # A suspended process handles SIGINT after SIGCONT.
             signal INT
             signal CONT
@@ -59,7 +59,7 @@ brake() { # signal each such program in folders $@, and add it to halted: TRIAL/
     done
 }
 
-stray_movers() { # signal such programs whose folder was deleted; they have no record, and are listed as ended
+signal_strays() { # signal motion programs whose folder was deleted; they have no record, so they are listed as ended
     home=$(cd "$base" 2>/dev/null && pwd -P) || return 0
     ls -ld /proc/[0-9]*/cwd 2>/dev/null | while read -r line; do
         case $line in *"/cwd -> $home/"*" (deleted)") ;; *) continue ;; esac
@@ -75,15 +75,15 @@ stray_movers() { # signal such programs whose folder was deleted; they have no r
     done
 }
 
-awaited() { # true if a program of halted has not reported the state of its robot yet
-    for name in $halted; do
-        moves "$base/${name#*/}" && motion_state "$base/${name#*/}"
+is_any_silent() { # true if one of programs has not reported the state of its robot yet
+    for name in $programs; do
+        is_motion_program "$base/${name#*/}" && motion_state "$base/${name#*/}"
         [ "$state" != silent ] || return 0
     done
     return 1
 }
 
-motion_state() { # set state to that of the program in $1; program must be set
+motion_state() { # set state to the state of the program in $1; program must be set
     state=silent
     if [ "$program" = drive ]; then
         [ ! -e "$1/stationary" ] || state=stationary
@@ -100,9 +100,9 @@ motion_state() { # set state to that of the program in $1; program must be set
     case $state in silent | land | return) alive "$1" || state=ended ;; esac
 }
 
-landing() { # list the programs of all trials that still land a drone: DIR/.jobs/NAME STATE
+list_landing() { # list the programs of all trials that still land a drone: DIR/.jobs/NAME STATE
     for meta in "$base"/*/*/.jobs/*; do
-        [ -e "$meta/unhurried" ] && alive "$meta" && moves "$meta" && motion_state "$meta" &&
+        [ -e "$meta/unhurried" ] && alive "$meta" && is_motion_program "$meta" && motion_state "$meta" &&
             echo "lands ${meta#"${base%/*}"/} $state"
     done
     return 0
@@ -112,8 +112,8 @@ life_signs() { # print file $1, which the pilot and the guard of a drone share, 
     cat "$1" /proc/uptime
 }
 
-motion_states() { # print the states of programs $@
+motion_states() { # print the states of the programs in $@
     for name do
-        moves "$base/${name#*/}" && motion_state "$base/${name#*/}" && echo "$name $state"
+        is_motion_program "$base/${name#*/}" && motion_state "$base/${name#*/}" && echo "$name $state"
     done
 }

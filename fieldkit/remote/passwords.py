@@ -10,11 +10,11 @@ from fieldkit.core.errors import ConfigurationError, shell_command
 
 SERVICE: Final = "fieldkit"
 
-Ask = Callable[[str, str, str], str]
+PasswordSource = Callable[[str, str, str], str]
 """Returns a password; the arguments are the user, the host, and the name of the robot."""
 
 
-def at_terminal(user: str, host: str, robot: str) -> str:
+def read_from_terminal(user: str, host: str, robot: str) -> str:
     """Return the password that the operator types, without echo.
 
     Raises:
@@ -29,7 +29,7 @@ def at_terminal(user: str, host: str, robot: str) -> str:
     return getpass.getpass(f"password of {user}@{host} ({robot}): ")
 
 
-def in_keyring(user: str, host: str, robot: str) -> str:
+def read_from_keyring(user: str, host: str, robot: str) -> str:
     """Return the password from the keyring.
 
     Raises:

@@ -1,10 +1,10 @@
 """Persistent shells on a robot: they run commands without a new SSH session for each command.
 
 A command is a line `NONCE VERB WORD...`, quoted as all remote commands. On both streams the shell writes the nonce,
-the output of the command, and the nonce again with the exit code. If `held` precedes the verb, the shell writes the
-end only after it has received another line. The nonce is random for each command, and programs on the robot do not
-receive it. Therefore no output, with or without a newline at its end, can be mistaken for the end of an answer, and
-output of processes that a command left running is dropped between two commands.
+the output of the command, and the nonce again with the exit code. If the word `held` precedes the verb, the shell
+writes the end only after it has received another line. The nonce is random for each command, and programs on the
+robot do not receive it. Therefore no output, with or without a newline at its end, can be mistaken for the end of an
+answer, and output of processes that a command left running is dropped between two commands.
 """
 
 import re
@@ -26,7 +26,7 @@ _SHELL_COUNT: Final = 2
 
 
 class ShellPool:
-    """The persistent shells of one robot, which are opened again on each link. Each runs one command at a time.
+    """The persistent shells of one robot, which are opened again on each link. Each shell runs one command at a time.
 
     If no shell is free, the caller must open a separate channel for its command.
     """
@@ -39,11 +39,17 @@ class ShellPool:
         self._opener: threading.Thread | None = None
 
     def begin(
-        self, link: Link, command_line: str, deadline: Deadline, close_event: threading.Event, *, held: bool = False
+        self,
+        link: Link,
+        command_line: str,
+        deadline: Deadline,
+        close_event: threading.Event,
+        *,
+        ends_on_request: bool = False,
     ) -> "RunningCommand | None":
         """Start a command in a shell on `link`; return None if no shell is free, or if the shell has ended.
 
-        With `held`, the shell reports the end of the command only after `RunningCommand.request_end`.
+        With `ends_on_request`, the shell reports the end of the command only after `RunningCommand.request_end`.
 
         Raises:
             ExpiredError: The deadline passed, or `close_event` was set.
@@ -54,7 +60,7 @@ class ShellPool:
         shell = next((candidate for candidate in shells if candidate.reserve()), None)
         if shell is None:
             return None
-        full_line = f"held {command_line}" if held else command_line
+        full_line = f"held {command_line}" if ends_on_request else command_line
         command = call_with_deadline(lambda: shell.start(full_line), deadline, close_event, what="start")
         link.acknowledge()
         return command
@@ -71,7 +77,7 @@ class ShellPool:
             self._opener = threading.Thread(target=self._open, args=(link, command), daemon=True)
             self._opener.start()
 
-    def wait_until_opened(self, deadline: Deadline) -> None:
+    def wait_until_open(self, deadline: Deadline) -> None:
         """Wait until no shell is being opened any more, or the deadline has passed."""
         with self._lock:
             opener = self._opener
@@ -182,7 +188,7 @@ class RunningCommand:
         self.close()
 
     def request_end(self) -> None:
-        """Request the end of a command that was started with `held`.
+        """Request the end of a command that was started with `ends_on_request`.
 
         Raises:
             OSError, SSHException: The connection broke.
@@ -268,8 +274,8 @@ class RunningCommand:
     @property
     def _is_cut_off(self) -> bool:
         """Whether the channel has ended, and all received data have been read."""
-        ended = self._channel.closed or self._channel.eof_received
-        return bool(ended) and not (self._channel.recv_ready() or self._channel.recv_stderr_ready())
+        has_channel_ended = self._channel.closed or self._channel.eof_received
+        return bool(has_channel_ended) and not (self._channel.recv_ready() or self._channel.recv_stderr_ready())
 
 
 Execution = Channel | RunningCommand

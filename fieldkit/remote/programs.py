@@ -55,5 +55,5 @@ def copy(shell: Shell, folder: str, program_path: str, content: bytes, sha256: s
         sha256,
     )
     deadline = Deadline.after(2 * REPLY_S + len(content) / _MIN_BYTES_PER_S)
-    copied = shell.run(argv, stdin=content, deadline=deadline, check=False)
-    require_success(shell, copied, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")
+    copy_result = shell.run(argv, stdin=content, deadline=deadline, check=False)
+    require_success(shell, copy_result, remedy=f"on the robot: touch ~/{HOME}/x; df -h ~")

@@ -56,16 +56,16 @@ HELD_REMEDY: Final = "wait, resume that trial if it is yours, or end it: fieldki
 
 _MESSAGE_PREFIX: Final = b"job.sh: "
 _HELD: Final = re.compile(
-    r"held (?P<age>-?\d{1,11}) (?P<rest>-?\d{1,11}) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII
+    r"held (?P<age>-?\d{1,11}) (?P<rest>-?\d{1,11}) (?P<since>\d{1,11}) (?P<user>\S+) (?P<purpose>.+)", re.ASCII
 )
 _LOST: Final = re.compile(
-    r"(?P<kind>aborted|stopped|held|gone) (?P<since>\d{1,11}) (?P<who>\S+) (?P<what>.+)", re.ASCII
+    r"(?P<kind>aborted|stopped|held|gone) (?P<since>\d{1,11}) (?P<user>\S+) (?P<purpose>.+)", re.ASCII
 )
 _LOSS_MESSAGES: Final = {
-    "aborted": "the trial was aborted by {who} at {at}",
-    "stopped": "{who} stopped the robots at {at} (fieldkit stop)",
-    "held": "{who} locked the robot at {at} for {what}, after this trial's lock had expired",
-    "gone": "the lock of this trial is missing; the last lock was that of {who} at {at} for {what}",
+    "aborted": "the trial was aborted by {user} at {at}",
+    "stopped": "{user} stopped the robots at {at} (fieldkit stop)",
+    "held": "{user} locked the robot at {at} for {purpose}, after this trial's lock had expired",
+    "gone": "the lock of this trial is missing; the last lock was that of {user} at {at} for {purpose}",
 }
 
 
@@ -76,22 +76,24 @@ def install(shell: Shell, deadline: Deadline) -> None:
         LinkError: The robot did not answer.
         RobotError: Its home cannot be written, a program is missing, or its login shell prints a greeting.
     """
-    checked = shell.run(("sh", "-c", _CHECK_SCRIPT, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False)
-    if checked.stdout:  # a greeting would be mixed with the output of jobs, and with evidence
+    check_result = shell.run(
+        ("sh", "-c", _CHECK_SCRIPT, "sh", HOME, SCRIPT_PATH, _SHA256), deadline=deadline, check=False
+    )
+    if check_result.stdout:  # a greeting would be mixed with the output of jobs, and with evidence
         raise RobotError(
-            f"its login shell answers every command with {printable(checked.stdout[:_GREETING_BYTES])!r}",
+            f"its login shell answers every command with {printable(check_result.stdout[:_GREETING_BYTES])!r}",
             where=shell.robot,
             remedy="first line of its start-up file (~/.bashrc) on the robot: case $- in *i*) ;; *) return ;; esac",
         )
-    if checked.exit_code == 0:
+    if check_result.exit_code == 0:
         return
-    copied = shell.run(
+    copy_result = shell.run(
         ("sh", "-c", _COPY_SCRIPT, "sh", HOME, SCRIPT_PATH), stdin=SCRIPT, deadline=deadline, check=False
     )
     require_success(
         shell,
-        copied,
-        remedy=_INSTALL if _MISSING_PROGRAM in copied.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~",
+        copy_result,
+        remedy=_INSTALL if _MISSING_PROGRAM in copy_result.stderr else f"on the robot: touch ~/{HOME}/x; df -h ~",
     )
 
 
@@ -121,12 +123,12 @@ def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> 
     match completed.exit_code:
         case 75 if match := _HELD.match(what):  # exit codes of the script, see common.sh
             age, remaining = (format_duration(float(match[name])) for name in ("age", "rest"))
-            holder = f"{match['who']} holds it since {_start_time(match)}, {age} ago, for {match['what']}"
-            what = f"{holder}; expires in {remaining}"
+            holder = f"{match['user']} locked it at {_start_time(match)}, {age} ago, for {match['purpose']}"
+            what = f"{holder}; the lock expires in {remaining}"
             remedy = HELD_REMEDY
-        case 76 if lost := _LOST.match(what):
+        case 76 if loss := _LOST.match(what):
             raise LockLostError(
-                _LOSS_MESSAGES[lost["kind"]].format(at=_start_time(lost), **lost.groupdict()), where=shell.robot
+                _LOSS_MESSAGES[loss["kind"]].format(at=_start_time(loss), **loss.groupdict()), where=shell.robot
             )
         case 77:
             remedy = "check its battery and power supply; on the robot: uptime -s"

@@ -1,15 +1,16 @@
-# Snapshot of what the programs of a robot report on its state, before and after an attempt.
+# Snapshot of the state of a robot, as its programs report it, before and after an attempt.
 #
 # All sources run at the same time, each with a time limit, so a program that hangs delays an attempt by SOURCE_S seconds
-# at most, and is not started again in the same trial. The sources use local sockets only and send no packet over a network: chronyc without names (-n), pmc without
-# boundary hops (-b 0), a passive scan. The output has a line `==> NAME <==` per source, then its lines, each after a blank, so that no
-# output can contain such a line; the last one is `code CODE`.
+# at most, and is not started again in the same trial. The sources use local sockets only and send no packet over a
+# network: chronyc without names (-n), pmc without boundary hops (-b 0), a passive scan. For each source, a line
+# `==> NAME <==` precedes its output. Each line of the output begins with a blank, so that it differs from such a line;
+# the last line is `code CODE`.
 
 SOURCE_S=2
 KILLED=137 # exit code after SIGKILL
 SOURCE_BLOCKS=64 # limit of the output of a source, in blocks of 512 or 1,024 bytes
 
-source_of() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
+start_source() { # NAME COMMAND...: start a source; it writes the file NAME in $folder
     [ -d "$folder" ] || mkdir "$folder" || return
     name=$folder/$1
     if has_hung "$1"; then
@@ -22,7 +23,7 @@ source_of() { # NAME COMMAND...: start a source; it writes the file NAME in $fol
         (ulimit -f "$SOURCE_BLOCKS"; cd / && exec setsid timeout -s KILL "$SOURCE_S" "$@") 2>&1 &
         wait "$!"
         code=$?
-        kill -KILL "-$!" # processes that it left, which the timeout of busybox does not end
+        kill -KILL "-$!" # remaining processes of the source, which the timeout of busybox does not stop
         echo
         echo "code $code"
     } </dev/null >"$name" 2>/dev/null &
@@ -32,19 +33,19 @@ has_hung() { # true if source $1 did not answer in time in an earlier snapshot
     case $hung_sources in *":$1:"*) ;; *) return 1 ;; esac
 }
 
-clock_sources() {
-    ! command -v chronyc >/dev/null || source_of chrony chronyc -n -c tracking
+start_clock_sources() {
+    ! command -v chronyc >/dev/null || start_source chrony chronyc -n -c tracking
     if [ -d /run/systemd/system ] && command -v timedatectl >/dev/null; then
-        source_of timedatectl timedatectl show
-        source_of timesyncd timedatectl timesync-status
+        start_source timedatectl timedatectl show
+        start_source timesyncd timedatectl timesync-status
     fi
     if command -v pmc >/dev/null; then # its default socket is in a folder that only root can write
-        source_of ptp pmc -u -b 0 -i "/tmp/fieldkit-pmc-$$" \
+        start_source ptp pmc -u -b 0 -i "/tmp/fieldkit-pmc-$$" \
             'GET CURRENT_DATA_SET' 'GET TIME_STATUS_NP' 'GET PORT_DATA_SET'
     fi
 }
 
-health() { # print values of the computer, one a line
+health() { # print values of the computer, one per line
     read -r line </proc/stat && echo "$line"
     for zone in /sys/class/thermal/thermal_zone*/temp; do
         read -r value 2>/dev/null <"$zone" && echo "temperature $value"
@@ -60,12 +61,12 @@ health() { # print values of the computer, one a line
         read -r value 2>/dev/null <"$monitor/name" && [ "$value" = rpi_volt ] || continue
         read -r value 2>/dev/null <"$monitor/in0_lcrit_alarm" && echo "undervoltage $value"
     done
-    (free && echo "disk $free") || :
+    (read_free_space && echo "disk $free") || :
 }
 
-radio_sources() { # $1 interface
+start_radio_sources() { # $1 interface
     command -v iw >/dev/null || return 0
-    source_of iw-info iw dev "$1" info
+    start_source iw-info iw dev "$1" info
     has_hung iw-info || wait "$!"
     info=$(cat "$folder/iw-info")
     case ${info##*"code "} in
@@ -73,15 +74,15 @@ radio_sources() { # $1 interface
         "$KILLED") return 0 ;;
         *) rm -f -- "$folder/iw-info" && return 0 ;; # it has no such interface
     esac
-    source_of iw-reg iw reg get
+    start_source iw-reg iw reg get
     # The channel is read twice while the robots send nothing for an attempt, in which the scan only receives.
-    source_of iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
+    start_source iw-survey sh -c 'iw dev "$1" survey dump && { sleep 0.5 || sleep 1; } && echo == && iw dev "$1" survey dump' sh "$1"
     case $info in *"channel "*" ("*" MHz"*) ;; *) return 0 ;; esac
     info=${info#*channel *" ("}
     info=${info%%" MHz"*}
     set -- iw dev "$1" scan freq "${info%.*}" passive
     [ "$(id -u)" = 0 ] || set -- sudo -n "$@"
-    source_of iw-scan "$@"
+    start_source iw-scan "$@"
 }
 
 snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, or -, $3 file with the names of sources that
@@ -91,10 +92,10 @@ snapshot() { # $1 a new folder for temporary files, $2 interface of the radio, o
     (
         PATH=$PATH:/usr/local/sbin:/usr/sbin:/sbin # often missing in a session without a terminal
         export LC_ALL=C
-        clock_sources
-        [ "$2" = - ] || radio_sources "$2"
-        source_of health sh "$self" health
-        ! command -v vcgencmd >/dev/null || source_of vcgencmd vcgencmd get_throttled
+        start_clock_sources
+        [ "$2" = - ] || start_radio_sources "$2"
+        start_source health sh "$self" health
+        ! command -v vcgencmd >/dev/null || start_source vcgencmd vcgencmd get_throttled
         wait
         [ "$3" = - ] || for source in "$folder"/*; do
             [ "$(tail -n 1 "$source")" != "code $KILLED" ] || has_hung "${source##*/}" || echo "${source##*/}" >>"$3"

@@ -1,4 +1,4 @@
-"""TCP sockets under SSH connections: how they are connected, and when the kernel closes them."""
+"""TCP sockets of SSH connections: their connection, and the timeouts after which the kernel closes them."""
 
 import socket
 from collections.abc import Callable

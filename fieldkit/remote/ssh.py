@@ -40,7 +40,7 @@ class SshShell:
         port: SSH port, for messages.
         patience_s: Time after a loss during which attempts to reopen the connection are made.
         notice: Called with one line when the connection is lost, and when it is restored.
-        on_air: Whether the connection crosses the radio under test.
+        crosses_radio: Whether the connection crosses the radio under test.
         timing: Timeouts of the connection.
 
     Raises:
@@ -60,7 +60,7 @@ class SshShell:
         port: int = 22,
         patience_s: float = PATIENCE_S,
         notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
-        on_air: bool = False,
+        crosses_radio: bool = False,
         timing: Timing = Timing(),  # noqa: B008 (frozen)
     ) -> None:
         self._connection = Connection(
@@ -69,7 +69,7 @@ class SshShell:
             Credentials(HostKey.parse(host_key, robot), private_key, password),
             patience_s=patience_s,
             notice=notice,
-            on_air=on_air,
+            crosses_radio=crosses_radio,
             timing=timing,
         )
 
@@ -107,13 +107,13 @@ class SshShell:
         has_input: bool = False,
         until: bytes = b"",
     ) -> "SshSession":
-        def attempt(within: Deadline) -> SshSession:
+        def attempt(attempt_deadline: Deadline) -> SshSession:
             link, channel = _start(
-                self._connection, argv, within, ends_on_request=ends_on_request, has_input=has_input
+                self._connection, argv, attempt_deadline, ends_on_request=ends_on_request, has_input=has_input
             )
             with _converting_errors(self._connection.address, link, argv), contextlib.ExitStack() as stack:
                 stack.enter_context(contextlib.closing(channel))
-                is_ready = not until or wait_for_output(channel, until, deadline=within, robot=self.robot)
+                is_ready = not until or wait_for_output(channel, until, deadline=attempt_deadline, robot=self.robot)
                 link.acknowledge()
                 stack.pop_all()
             return SshSession(
@@ -142,7 +142,7 @@ class SshSession:
     Args:
         connection: The connection.
         argv: The command.
-        running: The link, and the channel of the command on it.
+        link_and_channel: The link, and the channel of the command on it.
         ends_on_request: Whether the robot reports the end of the command only on request.
         has_input: Whether the command has standard input.
         is_ready: True if the command wrote the expected output, see `Session.is_ready`.
@@ -152,7 +152,7 @@ class SshSession:
         self,
         connection: Connection,
         argv: Sequence[str],
-        running: tuple[Link, Execution],
+        link_and_channel: tuple[Link, Execution],
         *,
         ends_on_request: bool,
         has_input: bool,
@@ -161,7 +161,7 @@ class SshSession:
         self.is_ready = is_ready
         self._connection = connection
         self._argv = tuple(argv)
-        self._running: tuple[Link, Execution] | None = running
+        self._link_and_channel: tuple[Link, Execution] | None = link_and_channel
         self._ends_on_request = ends_on_request
         self._has_input = has_input
 
@@ -186,11 +186,15 @@ class SshSession:
         buffer = io.BytesIO()
         output = out or buffer
 
-        def attempt(within: Deadline) -> tuple[int, bytes]:
-            link, channel = self._running or _start(
-                self._connection, self._argv, within, ends_on_request=self._ends_on_request, has_input=self._has_input
+        def attempt(attempt_deadline: Deadline) -> tuple[int, bytes]:
+            link, channel = self._link_and_channel or _start(
+                self._connection,
+                self._argv,
+                attempt_deadline,
+                ends_on_request=self._ends_on_request,
+                has_input=self._has_input,
             )
-            self._running = None
+            self._link_and_channel = None
             output.seek(0)
             output.truncate()
             with _converting_errors(self._connection.address, link, self._argv), contextlib.closing(channel):
@@ -200,10 +204,15 @@ class SshSession:
                     if self._ends_on_request:
                         channel.request_end()
                 completed = drain(
-                    channel, output, stdin=pending_input, deadline=within, limit_bytes=limit_bytes, robot=self._robot
+                    channel,
+                    output,
+                    stdin=pending_input,
+                    deadline=attempt_deadline,
+                    limit_bytes=limit_bytes,
+                    robot=self._robot,
                 )
                 shell_command = f"exec {quote((*CALL, 'command_loop'))}" if _is_call(self._argv) else None
-                self._connection.open_spares(link, shell_command)
+                self._connection.open_spare_channels(link, shell_command)
                 return completed
 
         exit_code, stderr = self._connection.run_with_retries(attempt, deadline)
@@ -236,12 +245,12 @@ def _start(
     link = connection.link(deadline)
     try:
         with _converting_errors(connection.address, link, argv):
-            running = None
+            command = None
             if _is_call(argv) and not has_input:
-                running = connection.shells.begin(
-                    link, quote(argv[len(CALL) :]), deadline, close_event, held=ends_on_request
+                command = connection.shells.begin(
+                    link, quote(argv[len(CALL) :]), deadline, close_event, ends_on_request=ends_on_request
                 )
-            return link, running or link.begin(command_line, deadline, close_event)
+            return link, command or link.begin(command_line, deadline, close_event)
     except LinkError:
         link.close()  # a server that does not answer this command will not answer the next one
         raise

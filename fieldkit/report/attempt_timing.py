@@ -1,6 +1,6 @@
 """Times and flows in one attempt on the clock of the first sending robot.
 
-These are times of packets, pings, jobs, faults and moves. Flows over time are the rate of iperf3, the payload of
+The times are those of packets, pings, jobs, faults and moves. The flows are the rate of iperf3, the payload of
 transfers, and the panels of steps that draw them (`DrawsPanels`).
 """
 
@@ -59,11 +59,11 @@ class AttemptTimes:
     """Times from the evidence of one attempt, all of them on the clock of the first sending robot.
 
     Attributes:
-        recorded: The bags that were sent, by file.
+        bags: Contents of the bags that were sent, by file.
         transfers: Transfers with known fates of their packets.
         pings: Step name, role and output of each ping with an output.
         clock_offset_ns: Clock offset of each role relative to the first sending robot; 0 if unknown.
-        clocks: A sentence about the source of the clock offset.
+        clock_note: A sentence about the source of the clock offset.
         links: Samples of the radio link at each end.
         distances_m: Distances between the ends, with the start time of each; empty if unknown.
         ends: Roles of the first transfer's sender and receiver.
@@ -71,11 +71,11 @@ class AttemptTimes:
         activities: Activities in order of time.
     """
 
-    recorded: Mapping[str, RecordingContents]
+    bags: Mapping[str, RecordingContents]
     transfers: Sequence[tuple[Transfer, Fates]]
     pings: Sequence[tuple[str, Role, ping.Ping]]
     clock_offset_ns: Mapping[Role, int]
-    clocks: str
+    clock_note: str
     links: Mapping[Role, Sequence[tuple[int, StationSample]]]
     distances_m: Sequence[tuple[int, float | None]]
     ends: tuple[Role, Role]
@@ -86,33 +86,36 @@ class AttemptTimes:
 def read(evidence: AttemptEvidence, plan: Plan, repeats: Repeats, row: int) -> AttemptTimes:
     """Return the times from the evidence of the attempt in a row."""
     transfers = planned_evidence.transfers(plan, model.Protocol(repeats.texts["protocol"][row]))
-    first = next(iter(transfers), None)
-    ends = (first.source, first.destination) if first else (Role.SENDER, Role.RECEIVER)
+    first_transfer = next(iter(transfers), None)
+    ends = (first_transfer.source, first_transfer.destination) if first_transfer else (Role.SENDER, Role.RECEIVER)
     packets = [
         (transfer, packet_fates)
         for transfer in transfers
         if (packet_fates := fates.read(evidence, transfer)) is not None
     ]
-    bags = {transfer.sent_file: evidence.read_or_none(recordings.read, transfer.sent_file) for transfer in transfers}
+    sent_bags = {
+        transfer.sent_file: evidence.read_or_none(recordings.read, transfer.sent_file) for transfer in transfers
+    }
     outputs = [
         (source.name, source.role, evidence.read_or_none(ping.read, source.file))
         for source in planned_evidence.ping_sources(plan)
     ]
-    offset_ns, clocks = _clock_offset(
+    offset_ns, clock_note = _clock_offset(
         transfers, packets, ends, {transfer.name: _offset_s(repeats, row, transfer) for transfer in transfers}
     )
     clock_offset_ns = dict.fromkeys((*plan.cast, *ends), 0) | {ends[1]: offset_ns}
     links = {role: link.link_history(evidence.links(role)) for role in ends}
     times = AttemptTimes(
-        recorded={file: contents for file, contents in bags.items() if contents},
+        bags={file: contents for file, contents in sent_bags.items() if contents},
         transfers=[
-            (transfer, _shifted(packet_fates, transfer, clock_offset_ns)) for transfer, packet_fates in packets
+            (transfer, _correct_clocks(packet_fates, transfer, clock_offset_ns)) for transfer, packet_fates in packets
         ],
         pings=[(name, role, output) for name, role, output in outputs if output],
         clock_offset_ns=clock_offset_ns,
-        clocks=clocks,
+        clock_note=clock_note,
         links={
-            role: [(at_ns - clock_offset_ns[role], sample) for at_ns, sample in line] for role, line in links.items()
+            role: [(at_ns - clock_offset_ns[role], sample) for at_ns, sample in history]
+            for role, history in links.items()
         },
         ends=ends,
         distances_m=position_columns.distances_m(evidence, ends),
@@ -159,13 +162,13 @@ def _clock_offset(
         ),
         None,
     )
-    unknown = f"The offset between the clocks of {ends[0]} and {ends[1]} is not known"
+    unknown_text = f"The offset between the clocks of {ends[0]} and {ends[1]} is not known"
     if offset_ns is None:
-        return 0, f"{unknown}: each time is by the clock of its robot."
-    return offset_ns, f"{unknown}: here the delay of the first packet is assumed to be 0."
+        return 0, f"{unknown_text}: each time is by the clock of its robot."
+    return offset_ns, f"{unknown_text}: here the delay of the first packet is assumed to be 0."
 
 
-def _shifted(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[Role, int]) -> Fates:
+def _correct_clocks(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[Role, int]) -> Fates:
     return replace(
         packet_fates,
         sent_ns=packet_fates.sent_ns - clock_offset_ns[transfer.source],
@@ -174,9 +177,9 @@ def _shifted(packet_fates: Fates, transfer: Transfer, clock_offset_ns: Mapping[R
 
 
 def _activities_of_evidence(times: AttemptTimes) -> Iterator[Activity]:
-    """Yield recordings, transfers and pings, which have times in their evidence."""
-    for file, recording in times.recorded.items():
-        label = _step_label("record", Path(file).stem if len(times.recorded) > 1 else "")
+    """Yield recordings, transfers and pings, whose evidence contains times."""
+    for file, recording in times.bags.items():
+        label = _step_label("record", Path(file).stem if len(times.bags) > 1 else "")
         yield Activity(
             label, recording.started_utc_ns, recording.started_utc_ns + round(recording.duration_s * 1e9), "sky"
         )
@@ -202,11 +205,11 @@ def _step_label(what: str, name: str) -> str:
 
 def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
     """Yield the jobs that no other evidence shows. Jobs of the same name on several robots are combined."""
-    shown = {activity.name.partition(" ")[0] for activity in _activities_of_evidence(times)}
+    names_with_evidence = {activity.name.partition(" ")[0] for activity in _activities_of_evidence(times)}
     names = dict.fromkeys(name for _, name in times.jobs)
     for name in names:
         what = plain_name(name)
-        if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & shown):
+        if what.startswith("fault-") or (what in _SHOWN_BY_EVIDENCE and {what, "receive"} & names_with_evidence):
             continue
         spans = [span for (_, job), span in times.jobs.items() if job == name]
         step = name.rpartition(".")[0]
@@ -217,13 +220,15 @@ def _activities_of_jobs(times: AttemptTimes) -> Iterator[Activity]:
 
 def _activities_of_faults(times: AttemptTimes, evidence: AttemptEvidence) -> Iterator[Activity]:
     """Yield each fault from its start to the end of its cause, which is the start of the job that awaits recovery."""
-    for (role, name), (heals_ns, _) in times.jobs.items():
+    for (role, name), (recovery_ns, _) in times.jobs.items():
         step, _, what = name.rpartition(".")
         kind = what.removeprefix("fault-").removesuffix(_HEALS_SUFFIX)
         if what.startswith("fault-") and what.endswith(_HEALS_SUFFIX) and kind in {str(fault) for fault in FaultKind}:
             note = step_prefixed(step, outage.note_file(FaultKind(kind)))
             lasted_s = evidence.read_or_none(outage.cause_duration_s, note) or 0.0
-            yield Activity(f"fault {_step_label(kind, step)}", heals_ns - round(lasted_s * 1e9), heals_ns, "lost")
+            yield Activity(
+                f"fault {_step_label(kind, step)}", recovery_ns - round(lasted_s * 1e9), recovery_ns, "lost"
+            )
             yield from _outage(times, evidence, role, FaultKind(kind), step)
 
 
@@ -285,16 +290,16 @@ def flow_panels(evidence: AttemptEvidence, plan: Plan, times: AttemptTimes, zero
         times: Times of the attempt.
         zero_ns: Start of the time axis, in nanoseconds since 1970 UTC.
     """
-    for placed in plan.procedure.walk():
-        if placed.kind == "iperf3":
-            yield from _iperf3(placed, evidence, times, zero_ns)
-        elif isinstance(placed.step, DrawsPanels):
-            yield from placed.step.panels(evidence, times, zero_ns)
+    for placed_step in plan.procedure.walk():
+        if placed_step.kind == "iperf3":
+            yield from _iperf3(placed_step, evidence, times, zero_ns)
+        elif isinstance(placed_step.step, DrawsPanels):
+            yield from placed_step.step.panels(evidence, times, zero_ns)
 
 
-def _iperf3(placed: PlacedStep, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
+def _iperf3(placed_step: PlacedStep, evidence: AttemptEvidence, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the payload rate that each end counted per second. The first second starts with the client."""
-    step = placed.step
+    step = placed_step.step
     client = next((span for (_, job), span in times.jobs.items() if job == step.prefixed_name("iperf3-client")), None)
     if client is None:
         return

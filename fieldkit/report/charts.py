@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fieldkit.report.theme import Colour, Style
 
 Join = Literal["line", "steps", "none"]
-"""Type of line between points. With `steps` a value holds until the next point, as in a distribution function."""
+"""Type of line between points. With `steps` a value applies until the next point, as in a distribution function."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,17 +18,17 @@ class Series:
     """Points that belong together.
 
     Attributes:
-        label: For the legend; series of one label have one style.
+        label: Label in the legend; series with the same label have the same style.
         style: Colour, marker and line.
         x: Positions.
         y: Values.
         low: Lower ends of their intervals, None for a point without interval; empty if no point has one.
         high: Upper ends.
         join: Type of line between the points.
-        behind: Single values behind the points, as (x, y), drawn faintly.
+        behind: Single values, as (x, y), which are drawn faintly behind the points.
         breaks: Indices of points after which the line is interrupted.
         notes: A short text next to each point, empty for none; an empty sequence if no point has one.
-        bounds: True for each value that is only a lower bound; empty if none is.
+        bounds: True for each value that is only a lower bound; empty if no value is one.
         behind_bounds: Like `behind`, for values that are only lower bounds.
     """
 
@@ -148,9 +148,9 @@ class Chart:
     """A figure: panels side by side, under one legend.
 
     Attributes:
-        name: For file names and links.
-        title: Its title.
-        caption: Explanation, and what was left out.
+        name: Name in file names and links.
+        title: Title of the figure.
+        caption: Explanation, and a note about omitted data.
         panels: At least one.
         is_dense: True if panels are simple enough to be drawn small.
         is_stacked: True if panels are below each other.

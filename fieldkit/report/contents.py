@@ -69,7 +69,7 @@ class CellTable:
     Attributes:
         title: The protocol, and the step.
         quantities: Quantities of the visible columns.
-        more: Quantities of collapsed columns.
+        collapsed_quantities: Quantities of collapsed columns.
         lines: Cells, each with the part of its condition in which the cells differ.
         notes: Text below the name of a quantity.
         words: Labels of text columns, by name of the column.
@@ -78,7 +78,7 @@ class CellTable:
 
     title: str
     quantities: Sequence[Quantity]
-    more: Sequence[Quantity]
+    collapsed_quantities: Sequence[Quantity]
     lines: Sequence[tuple[str, Cell]]
     notes: Mapping[str, str]
     words: Mapping[str, str] = field(default_factory=dict)
@@ -90,10 +90,10 @@ class ChartSection:
     """Charts under one heading.
 
     Attributes:
-        name: For links.
+        name: Name in links.
         title: The heading.
         charts: At least one.
-        note: What is left out, and how to draw it.
+        note: Names of omitted quantities, and how to draw them.
     """
 
     name: str
@@ -176,12 +176,14 @@ def build_contents(
             contains its values as written in the command. None or empty for other repeats.
     """
     evidence = load_evidence(repeats, repeat)
-    is_whole = evidence.plans.keys() == set(repeats.texts["source"].tolist())
+    has_all_plans = evidence.plans.keys() == set(repeats.texts["source"].tolist())
     cells = sorted(aggregate(repeats), key=_sort_key)
     identities = Identities(cells)
     row = repeat_to_draw(cells, evidence, repeat)
     ranking = Ranking(evidence)
-    first = list(dict.fromkeys(plain_name(quantity.name) for quantity in ranking.first(measured_in(cells))))
+    first = list(
+        dict.fromkeys(plain_name(quantity.name) for quantity in ranking.first_quantities(measured_in(cells)))
+    )
     is_crowded = bool(sweep) and len({identities.of(cell).rank for cell in cells}) > len(CYCLE)
     against_distance: list[ChartSection] = []
     sections: list[ChartSection] = []
@@ -209,7 +211,7 @@ def build_contents(
         bursts=list(packet_rasters.groups(cells, evidence)),
         trials=list(summary.trial_provenance(evidence)),
         evidence=evidence,
-        command=shlex.join([*command, "--rebuild"] if is_whole else command),
+        command=shlex.join([*command, "--rebuild"] if has_all_plans else command),
         export_command=shlex.join(("fieldkit", "export", *paths, "--format", "csv", "-o", "attempts.csv")),
     )
 
@@ -222,8 +224,8 @@ def _against_distance(
         (_FIRST, first),
         *((kind, [name for name in names if name not in first]) for kind, names in _SECTIONS),
     ):
-        drawn = list(distance.charts(cells, identities, evidence, names))
-        yield ChartSection(heading.replace(" ", "-"), f"{heading.capitalize()} against distance", drawn)
+        drawn_charts = list(distance.charts(cells, identities, evidence, names))
+        yield ChartSection(heading.replace(" ", "-"), f"{heading.capitalize()} against distance", drawn_charts)
 
 
 def _further_charts(
@@ -242,22 +244,24 @@ def _further_charts(
         requested: Names of quantities that are drawn in any case.
         first: Plain names of quantities that are drawn already.
     """
-    drawn = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
-    others: dict[str, str] = {}  # by plain name, the first name
+    drawn_names = {*distance.LOSS, *distance.DELAY, *distance.RATE, *first}
+    undefined_names: dict[str, str] = {}  # by plain name, the first name
     for quantity in measured_in(cells):
         if (
             not quantity.is_builtin
-            and plain_name(quantity.name) not in drawn
+            and plain_name(quantity.name) not in drawn_names
             and distance.has_curve(cells, quantity, evidence)
         ):
-            others.setdefault(plain_name(quantity.name), quantity.name)
-    chosen = dict.fromkeys((*map(plain_name, requested), *list(others)[:_MAX_FURTHER]))
-    undrawn = [name for plain, name in others.items() if plain not in chosen]
+            undefined_names.setdefault(plain_name(quantity.name), quantity.name)
+    selected_names = dict.fromkeys((*map(plain_name, requested), *list(undefined_names)[:_MAX_FURTHER]))
+    undrawn_names = [name for plain, name in undefined_names.items() if plain not in selected_names]
     return ChartSection(
         "further",
         "Further figures against distance",
-        [*distance.charts(cells, identities, evidence, [name for name in chosen if name not in drawn])],
-        f"Not drawn: {', '.join(undrawn)}. To draw one: --quantity {undrawn[0]}." if undrawn else "",
+        [*distance.charts(cells, identities, evidence, [name for name in selected_names if name not in drawn_names])],
+        f"Not drawn: {', '.join(undrawn_names)}. To draw one: --quantity {undrawn_names[0]}."
+        if undrawn_names
+        else "",
     )
 
 
@@ -290,13 +294,13 @@ def repeat_to_draw(cells: Sequence[Cell], evidence: Evidence, requested: str) ->
         for name in ("transfer_s", "rtt_median_s")
         for quantity in with_plain_name(measured, name)
     ]
-    for name, least in names:
+    for name, minimum in names:
         measured_cells = [cell for cell in cells if name in cell.estimates]
         for cell in sorted(measured_cells, key=lambda cell: cell.estimates[name].value, reverse=True):
-            values, rows = evidence.repeats.numbers[name], evidence.valid(cell, name)
-            shown = [row for row in rows[values[rows] > least].tolist() if evidence.attempt(row)]
-            if shown:
-                return int(sorted(shown, key=lambda row: values[row])[(len(shown) - 1) // 2])
+            values, rows = evidence.repeats.numbers[name], evidence.valid_rows(cell, name)
+            candidates = [row for row in rows[values[rows] > minimum].tolist() if evidence.attempt(row)]
+            if candidates:
+                return int(sorted(candidates, key=lambda row: values[row])[(len(candidates) - 1) // 2])
     return None
 
 
@@ -330,7 +334,7 @@ def _missing_reasons(table: CellTable, evidence: Evidence) -> dict[tuple[int, st
     numbers = {id(cell): number for number, cell in enumerate(cells)}
     return {
         (numbers[id(absence.cell)], quantity.name): absence.text
-        for quantity in (*table.quantities, *table.more)
+        for quantity in (*table.quantities, *table.collapsed_quantities)
         for absence in absences(cells, quantity, evidence)
         if absence.is_total
     }
@@ -342,7 +346,7 @@ def _tables_of_protocol(
     """Yield the tables of one protocol: expected and lab-declared quantities, built-in ones, steps, words."""
     lines = [(wording.place(cell, differing=differing), cell) for cell in cells]
     words = word_labels(cells)
-    first = ranking.first(measured_in(cells))
+    first = ranking.first_quantities(measured_in(cells))
     if lab_words := {name: label for name, label in words.items() if ranking.is_lab_declared(name)}:
         words = {name: label for name, label in words.items() if name not in lab_words}
     if first or lab_words:
@@ -350,19 +354,23 @@ def _tables_of_protocol(
     remaining = [quantity for quantity in measured_in(cells) if quantity not in first]
     for step in dict.fromkeys(("", *(quantity.step for quantity in remaining))):
         builtin = [quantity for quantity in remaining if quantity.step == step and quantity.is_builtin]
-        others = [quantity for quantity in remaining if quantity.step == step and not quantity.is_builtin]
+        other_quantities = [quantity for quantity in remaining if quantity.step == step and not quantity.is_builtin]
         # If no quantity is always visible, the first ones are visible.
         visible = [quantity for quantity in builtin if plain_name(quantity.name) in _ALWAYS_VISIBLE] or builtin[
             :_MAX_IN_TABLE
         ]
-        more = [quantity for quantity in builtin if quantity not in visible]
+        collapsed_quantities = [quantity for quantity in builtin if quantity not in visible]
         if builtin or (not step and not remaining and not first):
             yield CellTable(
-                ", ".join(filter(None, (title, step))), visible, more, lines, _ping_sizes(visible, cells, evidence)
+                ", ".join(filter(None, (title, step))),
+                visible,
+                collapsed_quantities,
+                lines,
+                _ping_sizes(visible, cells, evidence),
             )
-        if others:
+        if other_quantities:
             title_text = ", ".join(filter(None, (title, step, "further figures")))
-            yield CellTable(title_text, others[:_MAX_IN_TABLE], others[_MAX_IN_TABLE:], lines, {})
+            yield CellTable(title_text, other_quantities[:_MAX_IN_TABLE], other_quantities[_MAX_IN_TABLE:], lines, {})
     if words:
         yield CellTable(f"{title}, words", (), (), lines, {}, words)
 

@@ -23,8 +23,8 @@ _LOSSES: Final = {
     "iperf3": ("iperf3_loss", "iperf3_captured_loss"),
 }
 """Losses that belong to a quantity, by the first part of its column's name."""
-_OF_TRANSFERS: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "file_loss")
-_ALL_LOSSES: Final = frozenset((*_OF_TRANSFERS, *(name for names in _LOSSES.values() for name in names)))
+_TRANSFER_LOSSES: Final = ("datagram_loss", "ip_loss", "tcp_byte_loss", "file_loss")
+_ALL_LOSSES: Final = frozenset((*_TRANSFER_LOSSES, *(name for names in _LOSSES.values() for name in names)))
 
 NOTHING_ARRIVED: Final = "nothing arrived"
 NO_VALUE: Final = "no value"
@@ -93,17 +93,17 @@ class Absence:
 def repeat_counts(cell: Cell, evidence: Evidence, silent: Rows) -> RepeatCounts:
     """Return the numbers of repeats under one condition by outcome; `silent` as returned by `everything_lost`."""
     texts, rows = evidence.repeats.texts, evidence.rows(cell)
-    last: dict[tuple[str, str, float], str] = {}
+    last_statuses: dict[tuple[str, str, float], str] = {}
     for row in rows.tolist():  # in order of time
         key = texts["source"][row], texts["trial"][row], float(evidence.repeats.numbers["repeat"][row])
-        if last.get(key) != Status.VALID:
-            last[key] = texts["status"][row]
-    statuses = list(last.values())
+        if last_statuses.get(key) != Status.VALID:
+            last_statuses[key] = texts["status"][row]
+    statuses = list(last_statuses.values())
     planned = 0
-    for source in {source for source, *_ in last}:
+    for source in {source for source, *_ in last_statuses}:
         plan = evidence.plans.get(source)
-        started = sum(key[0] == source for key in last)
-        planned += max(started, plan.repeats) if plan else started
+        started_count = sum(key[0] == source for key in last_statuses)
+        planned += max(started_count, plan.repeats) if plan else started_count
     valid, void, failed = (statuses.count(status) for status in ENDED)
     is_silent = silent[rows] & (texts["status"][rows] == Status.VALID)
     return RepeatCounts(planned, valid, void, failed, int(is_silent.sum()))
@@ -118,10 +118,10 @@ def everything_lost(repeats: Repeats) -> Rows:
 def nothing_arrived(repeats: Repeats, quantity: Quantity, rows: NDArray[np.int64]) -> Rows:
     """Return a mask of the given rows in which nothing arrived; shape of `rows`.
 
-    A row without a loss that belongs to the quantity is judged by all its losses.
+    For a row without a loss that belongs to the quantity, all losses of the row are used.
     """
     kind = plain_name(quantity.name).partition("_")[0]
-    related = {step_prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _OF_TRANSFERS)}
+    related = {step_prefixed(quantity.step, loss) for loss in _LOSSES.get(kind, _TRANSFER_LOSSES)}
     losses = {name: column[rows] for name, column in repeats.numbers.items() if plain_name(name) in _ALL_LOSSES}
     related_columns = [column for name, column in losses.items() if name in related]
     is_known = (
@@ -162,8 +162,8 @@ def _is_measured(cell: Cell, quantity: Quantity, cells: Iterable[Cell], evidence
     """Return True if the repeats of a cell measure a quantity, according to their plan, or else to similar cells."""
     if quantity.name in cell.estimates:
         return True
-    if (declared := evidence.declared(cell)) is not None:
-        return quantity.name in declared
+    if (measured_columns := evidence.measured_columns(cell)) is not None:
+        return quantity.name in measured_columns
     similar_by = ("procedure", "scenario", "topology", "backend", "protocol")
     similar = (other for other in cells if all(other.key[name] == cell.key[name] for name in similar_by))
     if not cell.n_valid or any(quantity.name in other.estimates for other in similar):
@@ -179,7 +179,7 @@ def _absences_of(cell: Cell, quantity: Quantity, evidence: Evidence) -> Iterator
     rows = evidence.rows(cell)
     rows = rows[evidence.repeats.texts["status"][rows] == Status.VALID]
     rows_without_value = rows[~np.isfinite(evidence.repeats.observed(quantity)[0][rows])]
-    silent = int(nothing_arrived(evidence.repeats, quantity, rows_without_value).sum())
-    for reason, count in ((NOTHING_ARRIVED, silent), (NO_VALUE, len(rows_without_value) - silent)):
+    silent_count = int(nothing_arrived(evidence.repeats, quantity, rows_without_value).sum())
+    for reason, count in ((NOTHING_ARRIVED, silent_count), (NO_VALUE, len(rows_without_value) - silent_count)):
         if count:
             yield Absence(cell, reason, count, len(rows))

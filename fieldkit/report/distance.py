@@ -23,7 +23,7 @@ _DODGE: Final = 0.026
 """Offset between series at the same distance, as a share of the axis, so that intervals do not overlap."""
 _ASIDE: Final = 0.009
 """Offset of single repeats from the interval of their estimate, as a share of the axis."""
-_FEWEST_JOINED: Final = 4
+_MIN_JOINED: Final = 4
 """Smallest number of distances whose points are joined. A line through fewer points suggests an unmeasured curve."""
 _MAX_WIDE: Final = 2
 """Maximum number of panels of a chart of several steps that are drawn large."""
@@ -45,11 +45,13 @@ def charts(
     for name in names:
         matches = with_plain_name(evidence.quantities.values(), name)
         cells_by_step = {
-            quantity: measured for quantity in matches if quantity.step and (measured := _placed(cells, quantity))
+            quantity: placed_cells
+            for quantity in matches
+            if quantity.step and (placed_cells := _cells_with_distance(cells, quantity))
         }
         for quantity in matches:
             for size, same_size in ({} if quantity.step else by_size(cells, quantity, evidence)).items():
-                if placed_cells := _placed(same_size, quantity):
+                if placed_cells := _cells_with_distance(same_size, quantity):
                     yield from (chart.of_size(size) for chart in drawing.chart({quantity: placed_cells}))
         yield from drawing.chart(cells_by_step)
 
@@ -58,14 +60,14 @@ def is_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> b
     """Return True if any panel has a quantity, or should have it, at more than one distance."""
     cells_without = (absence.cell for absence in absences(cells, quantity, evidence) if absence.is_total)
     metres: dict[tuple[str, str], set[float]] = {}
-    for cell in (*_placed(cells, quantity), *cells_without):
+    for cell in (*_cells_with_distance(cells, quantity), *cells_without):
         metres.setdefault(wording.group(cell), set()).add(wording.metres(cell))
     return any(len(places) > 1 for places in metres.values())
 
 
 def has_curve(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> bool:
     """Return True if a quantity of these cells has a curve, with pings of all sizes combined."""
-    return is_curve(with_missing(cells, quantity, _placed(cells, quantity)), quantity, evidence)
+    return is_curve(with_missing(cells, quantity, _cells_with_distance(cells, quantity)), quantity, evidence)
 
 
 def by_size(cells: Sequence[Cell], quantity: Quantity, evidence: Evidence) -> Mapping[str, Sequence[Cell]]:
@@ -86,7 +88,7 @@ def with_missing(cells: Sequence[Cell], quantity: Quantity, group: Sequence[Cell
     ]
 
 
-def _placed(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
+def _cells_with_distance(cells: Sequence[Cell], quantity: Quantity) -> list[Cell]:
     """Return the cells that have a quantity and a distance."""
     return [cell for cell in cells if quantity.name in cell.estimates and cell.key["distance_m"] is not None]
 
@@ -113,30 +115,32 @@ class _CurveDrawing:
     evidence: Evidence
     ranking: Ranking
 
-    def chart(self, measured: Mapping[Quantity, Sequence[Cell]]) -> Iterator[Chart]:
+    def chart(self, cells_by_quantity: Mapping[Quantity, Sequence[Cell]]) -> Iterator[Chart]:
         """Yield the chart of a quantity, or of one quantity of several steps, if it has several distances."""
         if not any(
             is_curve(with_missing(self.cells, step_quantity, cells), step_quantity, self.evidence)
-            for step_quantity, cells in measured.items()
+            for step_quantity, cells in cells_by_quantity.items()
         ):
             return
-        quantity, several = next(iter(measured)), len(measured) > 1
+        quantity, has_steps = next(iter(cells_by_quantity)), len(cells_by_quantity) > 1
         values = [
-            cell.estimates[step_quantity.name].value for step_quantity, cells in measured.items() for cell in cells
+            cell.estimates[step_quantity.name].value
+            for step_quantity, cells in cells_by_quantity.items()
+            for cell in cells
         ]
         scale = scale_of(quantity, values)
         groups = {
-            _panel_title(title, step_quantity if several else None, group, self.evidence): self._places(
+            _panel_title(title, step_quantity if has_steps else None, group, self.evidence): self._places(
                 step_quantity, group, scale.factor
             )
-            for step_quantity, cells in measured.items()
+            for step_quantity, cells in cells_by_quantity.items()
             for title, group in panels(cells).items()
         }
-        label = quantity.label if quantity.step and not several else _capital(quantity.plain_label)
+        label = quantity.label if quantity.step and not has_steps else _capital(quantity.plain_label)
         unit = "% of repeats" if quantity.kind is Kind.FLAG else scale.unit
         y_label = f"{label} [{unit}]" if unit else label
         points = [place.content for places in groups.values() for place in places if isinstance(place.content, Point)]
-        of_protocols = {
+        limits_by_protocol = {
             protocol: axis_limits([point for point in points if point.protocol == protocol], scale.unit)
             for protocol in {point.protocol for point in points}
         }
@@ -144,13 +148,13 @@ class _CurveDrawing:
         name = plain_name(quantity.name).removesuffix("_s").removesuffix("_bit").replace("_", "-")
         yield Chart(
             name=f"{name}-of-steps" if quantity.step else name,
-            title=f"{label} against distance{', by step' if several else ''}",
-            caption=_caption(quantity, points, of_protocols, is_lacking=bool(missing)),
+            title=f"{label} against distance{', by step' if has_steps else ''}",
+            caption=_caption(quantity, points, limits_by_protocol, is_lacking=bool(missing)),
             panels=[
-                self._panel(title, places, y_label, of_protocols[wording.text(places[0].cell, "protocol")])
+                self._panel(title, places, y_label, limits_by_protocol[wording.text(places[0].cell, "protocol")])
                 for title, places in groups.items()
             ],
-            is_dense=several and len(groups) > _MAX_WIDE,
+            is_dense=has_steps and len(groups) > _MAX_WIDE,
         )
 
     def _places(self, quantity: Quantity, group: Sequence[Cell], factor: float) -> list[_CurvePlace]:
@@ -173,15 +177,15 @@ class _CurveDrawing:
         span = (max(metres) - min(metres)) or 1.0
         middle = (len(places_by_label) - 1) / 2
         margin = (_MARGIN + middle * _DODGE) * span if len(set(metres)) > 1 else span / 2
-        ranked = sorted(places_by_label.values(), key=lambda pair: pair[0].rank)
-        shifts = [(rank - middle) * _DODGE * span for rank in range(len(ranked))]
+        ranked_series = sorted(places_by_label.values(), key=lambda pair: pair[0].rank)
+        shifts = [(rank - middle) * _DODGE * span for rank in range(len(ranked_series))]
         return Panel(
             title=title,
             x_label="distance",
             y_label=y_label,
             series=[
-                _series(identity, own_places, shift, _ASIDE * span, limits)
-                for shift, (identity, own_places) in zip(shifts, ranked, strict=True)
+                _series(identity, series_places, shift, _ASIDE * span, limits)
+                for shift, (identity, series_places) in zip(shifts, ranked_series, strict=True)
             ],
             words=_words(title, y_label, places_by_label.values()),
             x_ticks=_ticks(places, span),
@@ -191,8 +195,8 @@ class _CurveDrawing:
             right=max(metres) + margin,
             edges=[
                 EdgeMark(place.metres + shift, place.content.text, identity.style.colour, place.is_high)
-                for shift, (identity, own_places) in zip(shifts, ranked, strict=True)
-                for place in own_places
+                for shift, (identity, series_places) in zip(shifts, ranked_series, strict=True)
+                for place in series_places
                 if isinstance(place.content, Absence)
             ],
         )
@@ -211,12 +215,12 @@ def _panel_title(title: str, quantity: Quantity | None, cells: Sequence[Cell], e
     return ", ".join((quantity.step, title, *sizes))
 
 
-_NONE: Final = ", dotted if nothing was lost, because each repeat then counts as one trial"
-_CUT: Final = "an arrow if an interval continues beyond the axis; no repeat is drawn there"
-_LACKING: Final = "a cross at the edge, with the reason, if a condition has no value"
-_SOME: Final = "next to a point, the number of valid repeats with a value, if not all have one"
-_BOUND: Final = "hollow, with an arrow: a lower bound, because something had not ended"
-_HOW: Final = {
+_NO_LOSS_NOTE: Final = ", dotted if nothing was lost, because each repeat then counts as one trial"
+_CUT_NOTE: Final = "an arrow if an interval continues beyond the axis; no repeat is drawn there"
+_ABSENCE_NOTE: Final = "a cross at the edge, with the reason, if a condition has no value"
+_COUNT_NOTE: Final = "next to a point, the number of valid repeats with a value, if not all have one"
+_BOUND_NOTE: Final = "hollow, with an arrow: a lower bound, because something had not ended"
+_MEANINGS: Final = {
     "counted": "Share of all that was sent",
     "mean": "Mean over repeats",
     "median": "Median over repeats",
@@ -231,17 +235,17 @@ def _caption(
     *,
     is_lacking: bool,
 ) -> str:
-    is_none = (
+    has_no_loss = (
         quantity.unit == "share" and quantity.kind is not Kind.FLAG and any(point.value == 0 for point in points)
     )
     is_cut = any(point.top > limits[point.protocol][1] for point in points)
     parts = (
-        f"{_HOW[quantity.kind]}, with its 95 % interval{_NONE if is_none else ''}",
+        f"{_MEANINGS[quantity.kind]}, with its 95 % interval{_NO_LOSS_NOTE if has_no_loss else ''}",
         "" if quantity.kind is Kind.FLAG else "faint: each repeat",
-        _CUT if is_cut else "",
-        _LACKING if is_lacking else "",
-        _SOME if any(point.note for point in points) else "",
-        _BOUND if any(any(point.bounds) for point in points) else "",
+        _CUT_NOTE if is_cut else "",
+        _ABSENCE_NOTE if is_lacking else "",
+        _COUNT_NOTE if any(point.note for point in points) else "",
+        _BOUND_NOTE if any(any(point.bounds) for point in points) else "",
     )
     return f"{'; '.join(filter(None, parts))}."
 
@@ -250,7 +254,7 @@ def _series(
     identity: Identity, places: Sequence[_CurvePlace], shift: float, aside: float, limits: tuple[float, float]
 ) -> Series:
     points = [place.content for place in places if isinstance(place.content, Point)]
-    is_line = len({point.metres for point in points}) >= _FEWEST_JOINED
+    is_line = len({point.metres for point in points}) >= _MIN_JOINED
     return Series(
         label=identity.label,
         style=identity.style,
@@ -282,11 +286,11 @@ def _breaks(places: Sequence[_CurvePlace], limits: tuple[float, float]) -> froze
 
 def _ticks(places: Sequence[_CurvePlace], span: float) -> list[tuple[float, str]]:
     """Return the distances that get a label, as the operator wrote them."""
-    chosen: list[tuple[float, str]] = []
+    labels: list[tuple[float, str]] = []
     for metres, label in sorted({(place.metres, wording.distance(place.cell)) for place in places}):
-        if not chosen or metres - chosen[-1][0] >= _TICKS_APART * span:
-            chosen.append((metres, label))
-    return chosen
+        if not labels or metres - labels[-1][0] >= _TICKS_APART * span:
+            labels.append((metres, label))
+    return labels
 
 
 def _words(title: str, y_label: str, series: Iterable[tuple[Identity, list[_CurvePlace]]]) -> str:

@@ -70,7 +70,7 @@ def _reply_samples(quantity: Quantity, cells: Sequence[Cell], evidence: Evidence
     """Return all round-trip times of each cell, or None if a repeat with a median has no output of ping."""
     samples = []
     for cell in cells:
-        outputs = [evidence.pings(row, quantity.step) for row in evidence.valid(cell, quantity.name).tolist()]
+        outputs = [evidence.pings(row, quantity.step) for row in evidence.valid_rows(cell, quantity.name).tolist()]
         if None in outputs:
             return None
         samples.append(_Sample(cell, np.sort([rtt_s for output in outputs if output for rtt_s in output.rtt_s])))
@@ -79,7 +79,7 @@ def _reply_samples(quantity: Quantity, cells: Sequence[Cell], evidence: Evidence
 
 def _repeat_samples(name: str, cells: Sequence[Cell], evidence: Evidence) -> list[_Sample]:
     numbers = evidence.repeats.numbers[name]
-    return [_Sample(cell, np.sort(numbers[evidence.valid(cell, name)])) for cell in cells]
+    return [_Sample(cell, np.sort(numbers[evidence.valid_rows(cell, name)])) for cell in cells]
 
 
 def _chart(

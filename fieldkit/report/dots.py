@@ -31,7 +31,7 @@ _LABELS: Final = {
     "m/s": "speed",
     "count": "count",
 }
-_HOW: Final = (
+_EXPLANATION: Final = (
     "Each quantity with its 95 % interval: losses as shares of all that was sent, times and rates as medians over "
     "repeats. Faint points below it are single repeats. Properties that are true or false are shares of the valid "
     "repeats."
@@ -59,10 +59,13 @@ def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
     """Yield the dot plot of all quantities without a chart against distance, if there are any."""
     ranking = Ranking(evidence)
     quantities = measured(cells)
-    first = ranking.first(quantities)
-    ordered = [*first, *(quantity for quantity in quantities if quantity not in first)]
+    first_quantities = ranking.first_quantities(quantities)
+    ordered_quantities = [
+        *first_quantities,
+        *(quantity for quantity in quantities if quantity not in first_quantities),
+    ]
     groups: dict[tuple[str, str, str], list[_Lane]] = {}
-    for quantity in ordered:
+    for quantity in ordered_quantities:
         for size, same_size in distance.by_size(cells, quantity, evidence).items():
             all_cells = distance.with_missing(cells, quantity, same_size)
             if distance.is_curve(all_cells, quantity, evidence):
@@ -78,12 +81,14 @@ def charts(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
         drawing = _DotDrawing(identities, evidence, ranking)
         units = list(dict.fromkeys(unit for *_, unit in groups))
         places = list(dict.fromkeys(place for _, place, _ in groups))
-        ranked = sorted(groups.items(), key=lambda item: (units.index(item[0][2]), *item[0][:2]))
-        drawn = [
+        ranked_groups = sorted(groups.items(), key=lambda item: (units.index(item[0][2]), *item[0][:2]))
+        drawn_panels = [
             drawing.panel(title if len(places) == 1 else f"{title}, {place}", unit, lanes)
-            for (title, place, unit), lanes in ranked
+            for (title, place, unit), lanes in ranked_groups
         ]
-        yield Chart("quantities", f"All quantities at {wording.join_words(places)}", _caption(drawn), drawn)
+        yield Chart(
+            "quantities", f"All quantities at {wording.join_words(places)}", _caption(drawn_panels), drawn_panels
+        )
 
 
 @dataclass(frozen=True)
@@ -102,13 +107,15 @@ class _DotDrawing:
         conditions.sort(key=lambda cell: self.identities.of(cell).rank)
         step = _DODGE / len(conditions)
         offsets = {id(cell): _DODGE / 2 - (index + 0.5) * step for index, cell in enumerate(conditions)}
-        placed: dict[str, tuple[Identity, list[tuple[float, Point]]]] = {}
+        points_by_label: dict[str, tuple[Identity, list[tuple[float, Point]]]] = {}
         edges: list[EdgeMark] = []
         for height, lane in enumerate(reversed(lanes)):
             for cell in lane.cells:
                 identity = self.identities.of(cell)
                 estimate = point(cell, lane.quantity, scale.factor, self.evidence)
-                placed.setdefault(identity.label, (identity, []))[1].append((height + offsets[id(cell)], estimate))
+                points_by_label.setdefault(identity.label, (identity, []))[1].append(
+                    (height + offsets[id(cell)], estimate)
+                )
             is_high = self.ranking.more_is_worse(lane.quantity) is not False
             edges += [
                 EdgeMark(
@@ -120,14 +127,14 @@ class _DotDrawing:
                 for absence in absences(lane.with_missing, lane.quantity, self.evidence)
                 if absence.is_total
             ]
-        points = [estimate for _, placed_points in placed.values() for _, estimate in placed_points]
-        ranked = sorted(placed.values(), key=lambda pair: pair[0].rank)
+        points = [estimate for _, placed_points in points_by_label.values() for _, estimate in placed_points]
+        ranked_series = sorted(points_by_label.values(), key=lambda pair: pair[0].rank)
         return _with_limits(
             Panel(
                 title=title,
                 x_label=_axis(unit, scale, lanes),
                 y_label="",
-                series=[_series(identity, placed_points, _ASIDE * step) for identity, placed_points in ranked],
+                series=[_series(identity, placed_points, _ASIDE * step) for identity, placed_points in ranked_series],
                 words=_words(title, lanes, scale),
                 lanes=[lane.label for lane in reversed(lanes)],
                 edges=edges,
@@ -153,33 +160,33 @@ def _with_limits(panel: Panel, points: Sequence[Point], unit: str) -> Panel:
     return replace(panel, left=left, right=right)
 
 
-def _series(identity: Identity, placed: Sequence[tuple[float, Point]], aside: float) -> Series:
-    points = [point for _, point in placed]
+def _series(identity: Identity, placed_points: Sequence[tuple[float, Point]], aside: float) -> Series:
+    points = [point for _, point in placed_points]
     return Series(
         label=identity.label,
         style=replace(identity.style, line="none"),
         x=[point.value for point in points],
-        y=[height for height, _ in placed],
+        y=[height for height, _ in placed_points],
         low=[point.low for point in points],
         high=[point.high for point in points],
         join="none",
-        behind=[(value, height - aside) for height, point in placed for value in point.singles(False)],
-        behind_bounds=[(value, height - aside) for height, point in placed for value in point.singles(True)],
+        behind=[(value, height - aside) for height, point in placed_points for value in point.singles(False)],
+        behind_bounds=[(value, height - aside) for height, point in placed_points for value in point.singles(True)],
         bounds=[point.is_bound for point in points],
         notes=[point.note for point in points] if any(point.note for point in points) else (),
     )
 
 
-def _caption(drawn: Sequence[Panel]) -> str:
+def _caption(drawn_panels: Sequence[Panel]) -> str:
     parts = [
-        _HOW,
+        _EXPLANATION,
         "The axis is logarithmic if values differ by a factor of more than 30."
-        if any(panel.x_log for panel in drawn)
+        if any(panel.x_log for panel in drawn_panels)
         else "",
         "Hollow, with an arrow: a lower bound, because something had not ended."
-        if any(series.behind_bounds for panel in drawn for series in panel.series)
+        if any(series.behind_bounds for panel in drawn_panels for series in panel.series)
         else "",
-        "A cross marks a condition without a value." if any(panel.edges for panel in drawn) else "",
+        "A cross marks a condition without a value." if any(panel.edges for panel in drawn_panels) else "",
     ]
     return " ".join(filter(None, parts))
 

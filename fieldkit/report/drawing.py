@@ -132,8 +132,8 @@ def _draw_series(axes: Axes, series: Series, panel: Panel) -> None:
             axes.plot(series.x[start:stop], series.y[start:stop], clip_on=False, **(options | {"marker": None}))
     for x, y, low, high in zip(series.x, series.y, series.low, series.high, strict=False):
         if low is not None:
-            ends = (low, math.inf if high is None else high)
-            _draw_interval(axes, (y, x) if is_sideways else (x, y), ends, series.style, panel)
+            interval = (low, math.inf if high is None else high)
+            _draw_interval(axes, (y, x) if is_sideways else (x, y), interval, series.style, panel)
     for x, y, is_bound in zip(series.x, series.y, series.bounds, strict=False):
         if is_bound:
             _draw_bound(axes, (x, y), series.style, is_sideways=is_sideways)
@@ -153,9 +153,9 @@ def _draw_singles(axes: Axes, series: Series, panel: Panel) -> None:
         (series.behind, "o", _POINT),
         (series.behind_bounds, ">" if is_sideways else "^", _BOUND),
     ):
-        shown = [point for point in points if point[0 if is_sideways else 1] <= top]
+        visible_points = [point for point in points if point[0 if is_sideways else 1] <= top]
         faint: dict[str, Any] = {"color": colour, "alpha": _FAINT, "markersize": size, "markeredgewidth": 0}
-        axes.plot([x for x, _ in shown], [y for _, y in shown], marker, **faint)
+        axes.plot([x for x, _ in visible_points], [y for _, y in visible_points], marker, **faint)
 
 
 def _draw_bound(axes: Axes, at: tuple[float, float], style: Style, *, is_sideways: bool) -> None:

@@ -92,7 +92,7 @@ def _inches(panel: Panel) -> tuple[float, float]:
     return _PANEL_INCHES[0], lanes if panel.lanes else _PANEL_INCHES[1]
 
 
-def paper(chart: Chart, form: Format) -> bytes:
+def paper(chart: Chart, file_format: Format) -> bytes:
     """Return a whole chart with its legend, in the width of a paper's column, or of both for several panels."""
     columns = 1 if chart.is_stacked else min(2, len(chart.panels))
     rows = -(-len(chart.panels) // columns)
@@ -105,7 +105,7 @@ def paper(chart: Chart, form: Format) -> bytes:
         if chart.legend:
             handles = [drawing.handle(label, style) for label, style in chart.legend.items()]
             figure.legend(handles=handles, loc="outside upper center", ncols=min(4, len(handles)))
-        return _to_bytes(figure, form, transparent=False)
+        return _to_bytes(figure, file_format, transparent=False)
 
 
 def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
@@ -119,13 +119,13 @@ def save(charts: Iterable[Chart], folder: Path) -> Iterator[Path]:
         OSError: A file cannot be written.
     """
     for chart in charts:
-        for form in FORMATS:
-            path = folder / f"{chart.name}.{form}"
-            files.write(path, paper(chart, form))
+        for file_format in FORMATS:
+            path = folder / f"{chart.name}.{file_format}"
+            files.write(path, paper(chart, file_format))
             yield path
 
 
-def overview(lab: Overview, form: Format) -> bytes:
+def overview(lab: Overview, file_format: Format) -> bytes:
     """Return a plan view of a lab: obstacles, robots, and links coloured by SNR (dotted: no reception)."""
     with _settings(8.0):
         figure = _Figure(figsize=(_BOTH_COLUMNS_INCHES, _BOTH_COLUMNS_INCHES * 0.75), layout="constrained")
@@ -147,18 +147,18 @@ def overview(lab: Overview, form: Format) -> bytes:
         for name, place_m in lab.robots.items():
             # Labels are away from the links, which are in the middle, but inside of the world.
             share = place_m[1] / lab.area_m[1]
-            above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
+            is_above = share < _EDGE or (place_m[1] >= fmean(north_m) and share <= 1 - _EDGE)
             axes.annotate(
                 sanitized(name),
                 place_m,
-                (0, 4 if above else -4),
+                (0, 4 if is_above else -4),
                 textcoords="offset points",
                 fontsize=5,
                 ha=_side(place_m[0], lab.area_m[0]),
-                va="bottom" if above else "top",
+                va="bottom" if is_above else "top",
                 zorder=5,
             )
-        return _to_bytes(figure, form, transparent=False)
+        return _to_bytes(figure, file_format, transparent=False)
 
 
 def _side(east_m: float, width_m: float) -> Literal["left", "center", "right"]:
@@ -169,7 +169,7 @@ def _side(east_m: float, width_m: float) -> Literal["left", "center", "right"]:
 
 def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
     lines = [[lab.robots[end] for end in link.ends] for link in lab.links]
-    drawn = LineCollection(
+    line_collection = LineCollection(
         lines,
         array=[link.snr_db for link in lab.links],
         cmap="viridis",
@@ -177,9 +177,9 @@ def _draw_links(figure: Figure, axes: Axes, lab: Overview) -> None:
         linewidths=1.2 if len(lines) <= _MAX_LABELLED else 0.4,
         zorder=2,
     )
-    drawn.set_clim(*_SNR_DB)
-    axes.add_collection(drawn)
-    figure.colorbar(drawn, ax=axes, label="SNR (dB)", shrink=0.7)
+    line_collection.set_clim(*_SNR_DB)
+    axes.add_collection(line_collection)
+    figure.colorbar(line_collection, ax=axes, label="SNR (dB)", shrink=0.7)
     for (place_m, other_m), link in zip(lines, lab.links, strict=True):
         if len(lines) <= _MAX_LABELLED and math.dist(place_m, other_m) > _MIN_LABELLED * max(lab.area_m):
             middle_m = (place_m[0] + other_m[0]) / 2, (place_m[1] + other_m[1]) / 2
@@ -205,7 +205,7 @@ def _settings(points: float) -> Iterator[None]:
         yield
 
 
-def _to_bytes(figure: Figure, form: Format, *, transparent: bool) -> bytes:
+def _to_bytes(figure: Figure, file_format: Format, *, transparent: bool) -> bytes:
     out = io.BytesIO()
-    figure.savefig(out, format=form, metadata=METADATA[form], transparent=transparent)
+    figure.savefig(out, format=file_format, metadata=METADATA[file_format], transparent=transparent)
     return out.getvalue()

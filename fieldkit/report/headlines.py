@@ -1,4 +1,4 @@
-"""Headlines of a report: first missing results, then each quantity with its worst condition first."""
+"""Headlines of a report: first the missing results, then each quantity, its worst condition first."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +36,7 @@ class Ranking:
             self._expected.setdefault(expectation.quantity, expectation)
         self._lab_columns = dict.fromkeys(name for plan in plans for name in _lab_columns(plan))
 
-    def first(self, quantities: Iterable[Quantity]) -> list[Quantity]:
+    def first_quantities(self, quantities: Iterable[Quantity]) -> list[Quantity]:
         """Return the expected quantities, then the quantities that a lab declares; others are omitted."""
         by_name = {quantity.name: quantity for quantity in quantities}
         return [by_name[name] for name in dict.fromkeys((*self._expected, *self._lab_columns)) if name in by_name]
@@ -62,8 +62,8 @@ def _lab_columns(plan: Plan) -> Iterator[str]:
             yield from (column.name for column in placed.step.output_columns())
 
 
-_OF_PROTOCOLS: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
-_OF_TOPICS: Final = ("topic_loss", "topic_delay_median_s")
+_PROTOCOL_QUANTITIES: Final = {"udp": ("datagram_loss", "rtt_median_s"), "tcp": ("tcp_byte_loss", "rtt_median_s")}
+_TOPIC_QUANTITIES: Final = ("topic_loss", "topic_delay_median_s")
 """Quantities of trials that stream topics, in which pings and transfers only provide clock offset and load."""
 _MAX_FIRST: Final = 6
 """Maximum number of headlines of expected quantities and of a lab's quantities."""
@@ -82,14 +82,14 @@ class HeadlineLine:
     """One line of a headline.
 
     Attributes:
-        which: `least`, `most`; empty if there is nothing to compare.
+        extreme: `least` or `most`; empty if there is nothing to compare.
         value: The figure with its unit, or the missing result.
         interval: Its 95 % interval, and the number of repeats with a value if not all have one; may be empty.
         place: The condition.
         is_missing: True if it reports something missing or lost.
     """
 
-    which: str
+    extreme: str
     value: str
     interval: str
     place: str
@@ -110,9 +110,10 @@ class Headline:
 
 
 def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[str] = ()) -> Iterator[Headline]:
-    """Yield the outcomes of repeats, then the expected, the lab's, and each protocol's quantities.
+    """Yield the headline of the outcomes of repeats, then headlines of quantities.
 
-    Steps that differ only in their names share a headline, in which the step is part of the condition.
+    Quantities with an expectation and quantities that a lab declares come first, then the quantities of each
+    protocol. Steps that differ only in their names share a headline, in which the step is part of the condition.
 
     Args:
         cells: Conditions.
@@ -120,21 +121,21 @@ def headlines(cells: Sequence[Cell], evidence: Evidence, unmeasured: Sequence[st
         unmeasured: Planned conditions without any attempt, in words.
     """
     writer = _HeadlineWriter(evidence, Ranking(evidence), wording.differing(cells))
-    yield writer.repeats(cells, unmeasured)
-    first = writer.ranking.first(measured(cells))[:_MAX_FIRST]
-    for quantity in first:
+    yield writer.repeats_headline(cells, unmeasured)
+    first_quantities = writer.ranking.first_quantities(measured(cells))[:_MAX_FIRST]
+    for quantity in first_quantities:
         protocols = {cell.key["protocol"] for cell in cells if quantity.name in cell.estimates}
         group_cells = [cell for cell in cells if cell.key["protocol"] in protocols]
-        yield from writer.quantity(quantity.label, [quantity], group_cells)
-    for protocol, names in _OF_PROTOCOLS.items():
-        of_protocol = [cell for cell in cells if cell.key["protocol"] == protocol]
-        with_topics = [cell for cell in of_protocol if with_plain_name(measured([cell]), _OF_TOPICS[0])]
-        others = [cell for cell in of_protocol if cell not in with_topics]
-        for group_cells, quantity_names in ((with_topics, _OF_TOPICS), (others, names)):
+        yield from writer.quantity_headlines(quantity.label, [quantity], group_cells)
+    for protocol, names in _PROTOCOL_QUANTITIES.items():
+        protocol_cells = [cell for cell in cells if cell.key["protocol"] == protocol]
+        topic_cells = [cell for cell in protocol_cells if with_plain_name(measured([cell]), _TOPIC_QUANTITIES[0])]
+        other_cells = [cell for cell in protocol_cells if cell not in topic_cells]
+        for group_cells, quantity_names in ((topic_cells, _TOPIC_QUANTITIES), (other_cells, names)):
             for quantities_of_name in _existing_quantities(measured(group_cells), quantity_names):
-                if quantities_of_name[0] not in first:
-                    yield from writer.quantity(
-                        _subject(quantities_of_name, protocol, group_cells is with_topics),
+                if quantities_of_name[0] not in first_quantities:
+                    yield from writer.quantity_headlines(
+                        _subject(quantities_of_name, protocol, group_cells is topic_cells),
                         quantities_of_name,
                         group_cells,
                     )
@@ -154,16 +155,16 @@ class _HeadlineWriter:
     ranking: Ranking
     differing: Collection[str]
 
-    def repeats(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
+    def repeats_headline(self, cells: Sequence[Cell], unmeasured: Sequence[str]) -> Headline:
         """Return the number of valid repeats, and the conditions of the other repeats, the worst first."""
         silent = coverage.everything_lost(self.evidence.repeats)
-        counted = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
-        planned, valid = (sum(getattr(counts, name) for _, counts in counted) for name in ("planned", "valid"))
+        cell_counts = [(cell, coverage.repeat_counts(cell, self.evidence, silent)) for cell in cells]
+        planned, valid = (sum(getattr(counts, name) for _, counts in cell_counts) for name in ("planned", "valid"))
         is_missing = valid < planned or bool(unmeasured)
         lines = [HeadlineLine("", wording.without_breaks(f"{valid} of {planned} valid"), "", "", is_missing)]
         for name, text in _COUNT_TEXTS.items():
             affected = [
-                (cell, getattr(counts, name), counts.planned) for cell, counts in counted if getattr(counts, name)
+                (cell, getattr(counts, name), counts.planned) for cell, counts in cell_counts if getattr(counts, name)
             ]
             affected.sort(key=lambda item: -item[1] / item[2])
             places = [
@@ -178,7 +179,9 @@ class _HeadlineWriter:
             lines.append(HeadlineLine("", f"{total} not run", "", _first_places(unmeasured), is_missing=True))
         return Headline("Repeats", lines)
 
-    def quantity(self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]) -> Iterator[Headline]:
+    def quantity_headlines(
+        self, subject: str, variants: Sequence[Quantity], cells: Sequence[Cell]
+    ) -> Iterator[Headline]:
         """Yield the headline of a quantity, or of its variants in several steps; one per payload size of pings."""
         if len(variants) > 1 or plain_name(variants[0].name) != "rtt_median_s":
             sizes = {size: None for quantity in variants for size in self._sizes(quantity, cells)}
@@ -220,14 +223,16 @@ class _HeadlineWriter:
                 filter(None, (quantity.step if len(variants) > 1 else "", describe(cell, differing=self.differing)))
             )
 
-        return Headline(subject, [*_missing(missing, place), *_worst_and_best(values, place, is_whole=not missing)])
+        return Headline(
+            subject, [*_missing(missing, place), *_worst_and_best(values, place, has_all_values=not missing)]
+        )
 
 
 def _missing(
-    lacking: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
+    absences: Sequence[tuple[Quantity, Absence]], place: Callable[[Cell, Quantity], str]
 ) -> Iterator[HeadlineLine]:
     """Yield a line per reason for missing values, with the conditions; conditions without any value come first."""
-    ordered = sorted(lacking, key=lambda pair: -pair[1].count / pair[1].total)
+    ordered = sorted(absences, key=lambda pair: -pair[1].count / pair[1].total)
     for reason in dict.fromkeys(absence.reason for _, absence in ordered):
         places = [
             f"{place(absence.cell, quantity)} ({absence.share})"
@@ -238,15 +243,18 @@ def _missing(
 
 
 def _worst_and_best(
-    values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, is_whole: bool
+    values: Sequence[tuple[Cell, Estimate]], place: Callable[[Cell, Quantity], str], *, has_all_values: bool
 ) -> list[HeadlineLine]:
     """Return the worst and the best of values that are sorted from worst to best, or only one if all are equal."""
     worst, best = (wording.value(values[index][1]) for index in (0, -1))
     if worst == best and len(values) > 1:
-        return [HeadlineLine("in all conditions" if is_whole else "in all others", worst, "", "")]
+        return [HeadlineLine("in all conditions" if has_all_values else "in all others", worst, "", "")]
     end_names = ("least", "most") if values[0][1].value < values[-1][1].value else ("most", "least")
     lines = [_line_of_value(values, text, place) for text in dict.fromkeys((worst, best))]
-    return [replace(line, which=end if len(values) > 1 else "") for line, end in zip(lines, end_names, strict=False)]
+    return [
+        replace(line, extreme=end_name if len(values) > 1 else "")
+        for line, end_name in zip(lines, end_names, strict=False)
+    ]
 
 
 def _line_of_value(
@@ -262,22 +270,22 @@ def _line_of_value(
 
 def _first_places(places: Sequence[str]) -> str:
     """Return the first places, and the number of further ones."""
-    more = len(places) - _MAX_PLACES
-    return "; ".join((*places[:_MAX_PLACES], *([f"{more} more"] if more > 0 else [])))
+    more_count = len(places) - _MAX_PLACES
+    return "; ".join((*places[:_MAX_PLACES], *([f"{more_count} more"] if more_count > 0 else [])))
 
 
 def _subject(variants: Sequence[Quantity], protocol: str, has_topics: bool) -> str:
-    first = variants[0]
-    label = first.label if len(variants) == 1 else first.plain_label
-    names_protocol = has_topics or first.plain_label.startswith(protocol.upper())
+    first_variant = variants[0]
+    label = first_variant.label if len(variants) == 1 else first_variant.plain_label
+    names_protocol = has_topics or first_variant.plain_label.startswith(protocol.upper())
     return label if names_protocol else f"{label} with {protocol.upper()}"
 
 
 def _existing_quantities(quantities: Sequence[Quantity], names: Sequence[str]) -> list[list[Quantity]]:
     """Return the quantities called `names`, or the first ones if none exists, with variants in other steps."""
     existing = [matching for name in names if (matching := _quantities_named(quantities, name))]
-    others = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
-    return existing or [_quantities_named(quantities, name) for name in list(others)[: len(names)]]
+    first_names = dict.fromkeys(plain_name(quantity.name) for quantity in quantities)
+    return existing or [_quantities_named(quantities, name) for name in list(first_names)[: len(names)]]
 
 
 def _quantities_named(quantities: Sequence[Quantity], name: str) -> list[Quantity]:

@@ -14,7 +14,14 @@ from fieldkit.core.errors import ConfigurationError
 from fieldkit.core.units import parse_distance
 from fieldkit.report.charts import Chart, HeatMap, Panel
 
-_DRAWN: Final = ("datagram_loss", "rtt_loss", "byte_loss", "one_way_median_s", "rtt_median_s", "added_delay_mean_s")
+_DEFAULT_NAMES: Final = (
+    "datagram_loss",
+    "rtt_loss",
+    "byte_loss",
+    "one_way_median_s",
+    "rtt_median_s",
+    "added_delay_mean_s",
+)
 """Quantities that are drawn by default."""
 _MAX_PANELS: Final = 12
 
@@ -47,22 +54,24 @@ def charts(
             factors with several values are needed.
     """
     flow, *factors = sweep
-    varied = [name for name in factors if len(set(repeats.column(name))) > 1]
-    if len(varied) == 1 and one_factor:
-        varied.append(flow)
-    if len(varied) < 2:
+    varied_factors = [name for name in factors if len(set(repeats.column(name))) > 1]
+    if len(varied_factors) == 1 and one_factor:
+        varied_factors.append(flow)
+    if len(varied_factors) < 2:
         return
-    all_axes = {name: _Axis(name, sweep[name], _labels(repeats, name, sweep[name])) for name in (flow, *varied)}
-    axes = [all_axes.pop(name) for name in varied[:2]]
-    names = (*_DRAWN, *(name for name in requested if name not in _DRAWN))
+    all_axes = {
+        name: _Axis(name, sweep[name], _labels(repeats, name, sweep[name])) for name in (flow, *varied_factors)
+    }
+    axes = [all_axes.pop(name) for name in varied_factors[:2]]
+    names = (*_DEFAULT_NAMES, *(name for name in requested if name not in _DEFAULT_NAMES))
     quantities = [quantity for quantity in repeats.quantities if quantity.name in names]
     cells = aggregate(repeats, (flow, *factors), quantities=quantities, words=())
     for quantity in quantities:
-        measured = [cell for cell in cells if quantity.name in cell.estimates]
-        if measured and (
-            quantity.name in requested or len({cell.estimates[quantity.name].value for cell in measured}) > 1
+        measured_cells = [cell for cell in cells if quantity.name in cell.estimates]
+        if measured_cells and (
+            quantity.name in requested or len({cell.estimates[quantity.name].value for cell in measured_cells}) > 1
         ):
-            yield _chart(quantity, measured, axes, list(all_axes.values()))
+            yield _chart(quantity, measured_cells, axes, list(all_axes.values()))
 
 
 def _labels(repeats: Repeats, name: str, text: str) -> dict[str | float | None, str]:
@@ -83,10 +92,10 @@ def _chart(quantity: Quantity, cells: Sequence[Cell], axes: Sequence[_Axis], oth
         _panel(title, quantity, group, axes=axes, scale=scale, limits=(min(values), max(values)))
         for title, group in list(groups.items())[:_MAX_PANELS]
     ]
-    omitted = len(groups) - len(panels)
+    omitted_count = len(groups) - len(panels)
     caption = "Estimates over the valid seeds; the table has their intervals."
-    if omitted:
-        caption += f" {omitted} more maps are left out."
+    if omitted_count:
+        caption += f" {omitted_count} more maps are left out."
     title = f"{scale.head(quantity.label)} over {axes[0].name} and {axes[1].name}"
     return Chart(f"map-{quantity.name}".replace(".", "-"), title, caption, panels)
 

@@ -67,17 +67,17 @@ def groups(cells: Sequence[Cell], evidence: Evidence) -> Iterator[RasterGroup]:
     differing = wording.differing(cells) - {"topology"}
     max_lines = min(MAX_LINES, max(1, MAX_REPEATS // max(1, len(cells))))
     for title, group in panels(cells).items():
-        drawn = {
+        packets_by_place = {
             wording.place(cell, differing=differing): _marked_packets(cell, evidence, max_lines) for cell in group
         }
-        for transfer in dict.fromkeys(name for lines in drawn.values() for name in lines):
-            marked = {place: lines.get(transfer, []) for place, lines in drawn.items()}
-            width = -(-max(len(line) for lines in marked.values() for line in lines) // MAX_COLUMNS)
+        for transfer in dict.fromkeys(name for lines in packets_by_place.values() for name in lines):
+            marked_lines = {place: lines.get(transfer, []) for place, lines in packets_by_place.items()}
+            width = -(-max(len(line) for lines in marked_lines.values() for line in lines) // MAX_COLUMNS)
             what = _MARK_MEANING[transfer[1]]
             yield RasterGroup(
                 title=", ".join(filter(None, (transfer[0], title))),
                 what=what if width == 1 else f"{what}; a column is {width} packets, marked if any of them is",
-                rasters=[_raster(place, lines, width, what) for place, lines in marked.items() if lines],
+                rasters=[_raster(place, lines, width, what) for place, lines in marked_lines.items() if lines],
             )
 
 
@@ -99,18 +99,18 @@ def _marked_packets(cell: Cell, evidence: Evidence, max_lines: int) -> dict[tupl
 def _raster(place: str, lines: Sequence[Mask], width: int, what: str) -> Raster:
     columns = [np.logical_or.reduceat(line, np.arange(0, len(line), width)) for line in lines]
     longest = max((length for line in lines for _, length in _runs(line)), default=0)
-    total, marked = sum(map(len, lines)), sum(int(line.sum()) for line in lines)
+    total, marked_count = sum(map(len, lines)), sum(int(line.sum()) for line in lines)
     return Raster(
         place=place,
         lines=len(lines),
         columns=max(map(len, columns)),
         lengths=[len(line) for line in columns],
         runs=[(number, *run) for number, line in enumerate(columns) for run in _runs(line)],
-        words=f"{place}: {len(lines)} repeats, {marked} of {total} {what}, at most {longest} in a row",
+        words=f"{place}: {len(lines)} repeats, {marked_count} of {total} {what}, at most {longest} in a row",
     )
 
 
-def _runs(marked: Mask) -> list[tuple[int, int]]:
+def _runs(mask: Mask) -> list[tuple[int, int]]:
     """Return the first column and the length of each run of marked columns."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], marked, [False])).astype(np.int8)))
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
     return [(int(start), int(stop - start)) for start, stop in edges.reshape(-1, 2)]

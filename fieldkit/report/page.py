@@ -31,7 +31,7 @@ _SVG: Final = "http://www.w3.org/2000/svg"
 _XLINK: Final = "http://www.w3.org/1999/xlink"
 _HREF: Final = f"{{{_XLINK}}}href"
 # The style is the same in all figures, and the page defines it.
-_DROPPED: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
+_REMOVED_TAGS: Final = frozenset((f"{{{_SVG}}}metadata", f"{{{_SVG}}}style"))
 # More than two decimals of a point are invisible, but make up half of the page's size.
 _GEOMETRY: Final = frozenset(("d", "x", "y", "width", "height", "transform"))
 _DECIMALS: Final = re.compile(r"(\.\d{2})\d+")
@@ -138,14 +138,14 @@ class _Panels:
     """Draws panels, each with unique ids."""
 
     def __init__(self) -> None:
-        self._drawn = 0
+        self._count = 0
 
     def __call__(self, panel: Panel) -> str:
-        self._drawn += 1
-        return inlined(figures.panel_svg(panel), f"p{self._drawn}-", panel.words)
+        self._count += 1
+        return inline_svg(figures.panel_svg(panel), f"p{self._count}-", panel.words)
 
 
-def inlined(document: str, prefix: str, words: str) -> str:
+def inline_svg(document: str, prefix: str, words: str) -> str:
     """Return an SVG document as an element of a page.
 
     Its colours become variables of the page, its width is flexible, and its ids start with `prefix` to be unique.
@@ -158,7 +158,7 @@ def inlined(document: str, prefix: str, words: str) -> str:
     root = ET.fromstring(document)  # noqa: S314 (made by matplotlib, so it is trusted)
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag in _DROPPED:
+            if child.tag in _REMOVED_TAGS:
                 parent.remove(child)
     for element in root.iter():
         for name, value in list(element.items()):
@@ -177,4 +177,4 @@ def _attribute(name: str, value: str, prefix: str) -> str:
         return f"#{prefix}{value.removeprefix('#')}"
     if name in _GEOMETRY:
         return _DECIMALS.sub(r"\1", value)
-    return theme.themed(_LOCAL_URL.sub(f"url(#{prefix}", value))
+    return theme.use_variables(_LOCAL_URL.sub(f"url(#{prefix}", value))

@@ -45,17 +45,22 @@ class Identities:
         kinds = sorted({_kind(cell) for cell in cells}, key=_by_scenario)
         backends = sorted({wording.text(cell, "backend") for cell in cells}, key=lambda name: (name != "field", name))
         # The first series with line of sight and the first without have fixed styles, even if the other is missing.
-        fixed, others = {str(scenario): rank for rank, scenario in enumerate(Scenario)}, count(len(Scenario))
-        self._kinds = {kind: fixed.pop(kind[0]) if kind[0] in fixed else next(others) for kind in kinds}
+        fixed_ranks, next_ranks = (
+            {str(scenario): rank for rank, scenario in enumerate(Scenario)},
+            count(len(Scenario)),
+        )
+        self._kinds = {
+            kind: fixed_ranks.pop(kind[0]) if kind[0] in fixed_ranks else next(next_ranks) for kind in kinds
+        }
         self._backends = {name: index for index, name in enumerate(backends)}
-        self._ambiguous = len({scenario for scenario, _ in kinds}) < len(kinds)
+        self._has_shared_scenario = len({scenario for scenario, _ in kinds}) < len(kinds)
 
     def of(self, cell: Cell) -> Identity:
         """Return the identity of the series of `cell`."""
         backend = wording.text(cell, "backend")
         parts = (
             wording.scenario(cell),
-            wording.procedure(cell) if self._ambiguous else "",
+            wording.procedure(cell) if self._has_shared_scenario else "",
             backend if len(self._backends) > 1 else "",
         )
         rank = self._kinds[_kind(cell)], self._backends[backend]
@@ -191,8 +196,8 @@ def axis_limits(points: Sequence[Point], unit: str) -> tuple[float, float]:
         low, high = min(values), max(values)
         margin = _MARGIN * (high - low) or 1.0
         return low - margin, high + margin
-    largest, highest = max(point.value for point in points), max(point.top for point in points)
-    top = min(highest, _MAX_LENGTH * largest) if largest > 0 else highest
+    largest_value, highest_top = max(point.value for point in points), max(point.top for point in points)
+    top = min(highest_top, _MAX_LENGTH * largest_value) if largest_value > 0 else highest_top
     return 0.0, max(1.08 * top, _MIN_TOP_PERCENT if unit == "%" else 0.0) or 1.0
 
 

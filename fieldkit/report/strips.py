@@ -50,16 +50,16 @@ class Strip:
         place: The part of its condition in which the cells of its group differ.
         colour: Colour of its series.
         marks: Marks in order of time.
-        left_out: Number of valid attempts without a mark.
-        others_left_out: Number of void and failed attempts without a mark.
+        omitted_count: Number of valid attempts without a mark.
+        omitted_other_count: Number of void and failed attempts without a mark.
     """
 
     cell: Cell
     place: str
     colour: Colour
     marks: Sequence[Mark]
-    left_out: int
-    others_left_out: int
+    omitted_count: int
+    omitted_other_count: int
 
 
 @dataclass(frozen=True)
@@ -87,17 +87,17 @@ def groups(cells: Sequence[Cell], identities: Identities, evidence: Evidence) ->
         for cell in group:
             rows = evidence.rows(cell)
             is_valid = evidence.repeats.texts["status"][rows] == Status.VALID
-            others = _evenly(rows[~is_valid], limits[1])
-            valid = _evenly(rows[is_valid], max(FEWEST_MARKS, limits[0] - len(others)))
-            kept = rows[np.isin(rows, np.concatenate((valid, others)))]
+            other_rows = _evenly(rows[~is_valid], limits[1])
+            valid_rows = _evenly(rows[is_valid], max(FEWEST_MARKS, limits[0] - len(other_rows)))
+            marked_rows = rows[np.isin(rows, np.concatenate((valid_rows, other_rows)))]
             strips.append(
                 Strip(
                     cell=cell,
                     place=wording.place(cell, differing=differing),
                     colour=identities.of(cell).style.colour,
-                    marks=[_mark(row, heights, evidence) for row in kept.tolist()],
-                    left_out=int(is_valid.sum()) - len(valid),
-                    others_left_out=int((~is_valid).sum()) - len(others),
+                    marks=[_mark(row, heights, evidence) for row in marked_rows.tolist()],
+                    omitted_count=int(is_valid.sum()) - len(valid_rows),
+                    omitted_other_count=int((~is_valid).sum()) - len(other_rows),
                 )
             )
         yield StripGroup(title, str(heights), strips)
@@ -108,17 +108,18 @@ class _Heights:
     """The scale of the marks' heights: the first measured loss, if any, and its value at full height."""
 
     loss: Quantity | None
-    full: float
+    full_height_loss: float
 
     def of(self, loss: float) -> float | None:
         if np.isnan(loss):
             return None
-        return min(1.0, max(0.0, loss / self.full)) if self.full > 0 else 0.0
+        return min(1.0, max(0.0, loss / self.full_height_loss)) if self.full_height_loss > 0 else 0.0
 
     def __str__(self) -> str:
         if self.loss is None:
             return ""
-        return f"{self.loss.label}, {f'full height {100 * self.full:.1f} %' if self.full > 0 else 'none'}"
+        height = f"full height {100 * self.full_height_loss:.1f} %" if self.full_height_loss > 0 else "none"
+        return f"{self.loss.label}, {height}"
 
 
 def _heights(group: Sequence[Cell], cells: Sequence[Cell]) -> _Heights:
@@ -134,8 +135,8 @@ def _evenly(rows: NDArray[np.int64], max_count: int) -> NDArray[np.int64]:
     """Return the rows, or `max_count` of them at equal distances."""
     if len(rows) <= max_count:
         return rows
-    chosen: NDArray[np.int64] = rows[np.linspace(0, len(rows) - 1, max_count).round().astype(np.int64)]
-    return chosen
+    evenly_spaced: NDArray[np.int64] = rows[np.linspace(0, len(rows) - 1, max_count).round().astype(np.int64)]
+    return evenly_spaced
 
 
 def _mark(row: int, heights: _Heights, evidence: Evidence) -> Mark:

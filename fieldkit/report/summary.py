@@ -67,7 +67,7 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
     repeats = evidence.repeats
     for status in (Status.VOID, Status.FAILED):
         if (rows := repeats.texts["status"] == status).any():
-            reasons = _counted(repeats.texts["reason"][rows].tolist())
+            reasons = _count_reasons(repeats.texts["reason"][rows].tolist())
             yield Caution(f"{format_count(int(rows.sum()), 'attempt')} {status}.", reasons)
     if invalid_cells := [cell for cell in cells if not cell.n_valid]:
         differing = wording.differing(cells)
@@ -75,28 +75,33 @@ def warnings(cells: Sequence[Cell], evidence: Evidence) -> Iterator[Caution]:
         yield Caution(f"No valid repeat in {format_count(len(invalid_cells), 'condition')}.", places)
     for caution in cautions(cells):
         yield Caution(f"{caution}.".replace(" %", "\N{NO-BREAK SPACE}%"))
-    if single := sum(cell.n_valid == 1 for cell in cells):
-        yield Caution(f"{single} of {len(cells)} conditions have a single valid repeat, and no intervals.")
+    if single_count := sum(cell.n_valid == 1 for cell in cells):
+        yield Caution(f"{single_count} of {len(cells)} conditions have a single valid repeat, and no intervals.")
     valid = repeats.where(repeats.texts["status"] == Status.VALID)
     columns = [texts for name, texts in valid.texts.items() if plain_name(name) == "one_way_withheld"]
-    withheld = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]
-    if withheld:
-        reasons = _counted([reason for row_reasons in withheld for reason in row_reasons if reason])
+    withheld_reasons = [reasons for reasons in zip(*columns, strict=True) if any(reasons)]
+    if withheld_reasons:
+        reasons = _count_reasons([reason for row_reasons in withheld_reasons for reason in row_reasons if reason])
         yield Caution(
-            f"One-way delay withheld, all or in part, in {format_count(len(withheld), 'valid repeat')}.", reasons
+            f"One-way delay withheld, all or in part, in {format_count(len(withheld_reasons), 'valid repeat')}.",
+            reasons,
         )
-    if marked := [reason for reason in valid.texts.get("marks_reason", ()) if reason]:
-        count = format_count(len(marked), "valid repeat")
-        yield Caution(f"{count} marked: conditions of the robots can explain differences.", _counted(marked))
+    if marked_reasons := [reason for reason in valid.texts.get("marks_reason", ()) if reason]:
+        count = format_count(len(marked_reasons), "valid repeat")
+        yield Caution(
+            f"{count} marked: conditions of the robots can explain differences.", _count_reasons(marked_reasons)
+        )
     yield from map(Caution, mixtures(repeats))
     if (version_count := len(np.unique(repeats.numbers["schema_version"]))) > 1:
         yield Caution(
             f"{version_count} versions of the tables: columns that an older version lacks are missing unless tables "
             "are rebuilt."
         )
-    yield from map(Caution, evidence.unread[:_MAX_LISTED])
-    if (more := len(evidence.unread) - _MAX_LISTED) > 0:
-        yield Caution(f"{more} further notes of this kind are not shown; fieldkit verify lists them for a trial.")
+    yield from map(Caution, evidence.limitations[:_MAX_LISTED])
+    if (more_count := len(evidence.limitations) - _MAX_LISTED) > 0:
+        yield Caution(
+            f"{more_count} further notes of this kind are not shown; fieldkit verify lists them for a trial."
+        )
 
 
 def _values(cells: Sequence[Cell], name: str) -> list[str]:
@@ -109,16 +114,16 @@ def _topologies(cells: Sequence[Cell]) -> str:
 
 
 def _distances(cells: Sequence[Cell]) -> str:
-    with_distance = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=wording.metres)
-    if not with_distance:
+    placed_cells = sorted((cell for cell in cells if cell.key["distance_m"] is not None), key=wording.metres)
+    if not placed_cells:
         return "distances unknown"
-    ends = list(dict.fromkeys(wording.distance(cell) for cell in (with_distance[0], with_distance[-1])))
+    ends = list(dict.fromkeys(wording.distance(cell) for cell in (placed_cells[0], placed_cells[-1])))
     return " to ".join(ends)
 
 
 def _start_text(repeats: Repeats) -> str:
-    started = repeats.numbers["started_utc_ns"]
-    known_starts = started[np.isfinite(started)]
+    starts_ns = repeats.numbers["started_utc_ns"]
+    known_starts = starts_ns[np.isfinite(starts_ns)]
     if not len(known_starts):
         return ""
     first, last = (utc(float(end)) for end in (known_starts.min(), known_starts.max()))
@@ -132,14 +137,16 @@ def utc(at_ns: float) -> str:
     return datetime.fromtimestamp(at_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
 
 
-def _counted(reasons: Sequence[str]) -> list[str]:
+def _count_reasons(reasons: Sequence[str]) -> list[str]:
     """Return the reasons with their counts, the most frequent first."""
-    counted = Counter(reason or "no reason given" for reason in reasons)
-    ordered = sorted(counted.items(), key=lambda pair: (-pair[1], pair[0]))
-    lines = [f"{reason} ({count})" for reason, count in ordered[:_MAX_REASONS]]
-    more = ordered[_MAX_REASONS:]
+    counts = Counter(reason or "no reason given" for reason in reasons)
+    ordered_reasons = sorted(counts.items(), key=lambda pair: (-pair[1], pair[0]))
+    lines = [f"{reason} ({count})" for reason, count in ordered_reasons[:_MAX_REASONS]]
+    remaining = ordered_reasons[_MAX_REASONS:]
     return (
-        [*lines, f"{format_count(len(more), 'other reason')} ({sum(count for _, count in more)})"] if more else lines
+        [*lines, f"{format_count(len(remaining), 'other reason')} ({sum(count for _, count in remaining)})"]
+        if remaining
+        else lines
     )
 
 
@@ -162,7 +169,7 @@ class Provenance:
         name: Its name.
         source: Its folder, or the table with its rows.
         has_evidence: True if its raw evidence is available.
-        began: Start of its first attempt, as text.
+        start_text: Start of its first attempt, as text.
         robots: Sender, receiver and relay.
         attempts: Numbers of attempts by status.
         seed: Its seed.
@@ -174,7 +181,7 @@ class Provenance:
     name: str
     source: Path
     has_evidence: bool
-    began: str
+    start_text: str
     robots: str
     attempts: str
     seed: str
@@ -200,12 +207,12 @@ def _provenance_of(name: str, source: Path, rows: list[int], evidence: Evidence)
     texts, numbers = evidence.repeats.texts, evidence.repeats.numbers
     first, plan = rows[0], evidence.plan(rows[0])
     relay = texts["relay"][first]
-    started = numbers["started_utc_ns"][rows]
+    starts_ns = numbers["started_utc_ns"][rows]
     return Provenance(
         name=name,
         source=source,
         has_evidence=plan is not None,
-        began=utc(float(np.nanmin(started))) if np.isfinite(started).any() else "",
+        start_text=utc(float(np.nanmin(starts_ns))) if np.isfinite(starts_ns).any() else "",
         robots=f"{texts['sender'][first]} to {texts['receiver'][first]}" + (f" by {relay}" if relay else ""),
         attempts=status_counts(Counter(texts["status"][rows])),
         seed="" if np.isnan(numbers["seed"][first]) else f"{numbers['seed'][first]:.0f}",

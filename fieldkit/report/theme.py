@@ -102,9 +102,9 @@ def format_of(path: Path, option: str) -> Format:
     Raises:
         ConfigurationError: The suffix is not one of `FORMATS`.
     """
-    for form in FORMATS:
-        if path.suffix == f".{form}":
-            return form
+    for file_format in FORMATS:
+        if path.suffix == f".{file_format}":
+            return file_format
     raise ConfigurationError(
         f"{option}: {path.name!r} has no known format", remedy=f"use the suffix .{', .'.join(FORMATS)}"
     )
@@ -143,13 +143,13 @@ CYCLE: Final[tuple[tuple[Colour, Marker], ...]] = (
 LINES: Final[tuple[Line, ...]] = ("solid", "dashed", "dotted", "dashdot")
 """Lines of backends, in order: the field backend is the first."""
 
-_NAME_OF: Final = {value: name for name, value in LIGHT.items()}
-_HEX: Final = re.compile("|".join(_NAME_OF))
+_NAMES: Final = {value: name for name, value in LIGHT.items()}
+_HEX: Final = re.compile("|".join(_NAMES))
 
 
-def themed(css: str) -> str:
+def use_variables(css: str) -> str:
     """Return CSS with each colour of the light theme replaced by the page's variable."""
-    return _HEX.sub(lambda match: f"var(--{_NAME_OF[match[0]]})", css)
+    return _HEX.sub(lambda match: f"var(--{_NAMES[match[0]]})", css)
 
 
 def variables(colours: Mapping[Colour, str]) -> str:

@@ -54,7 +54,7 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
     ]
     stops_s = [(activity.stop_ns - zero_ns) / 1e9 for activity in times.activities]
     stops_s += [float(np.max(series.x)) for panel in pings for series in panel.series if len(series.x)]
-    strips = [
+    panels = [
         _bars(times, zero_ns),
         *attempt_timing.flow_panels(evidence, plan, times, zero_ns),
         *pings,
@@ -67,8 +67,8 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
     yield Chart(
         name="timeline",
         title=f"Time line of {name}",
-        caption=f"Trial {plan.trial}, {outcome}. {times.clocks}",
-        panels=_stacked(strips, max(stops_s)),
+        caption=f"Trial {plan.trial}, {outcome}. {times.clock_note}",
+        panels=_stack(panels, max(stops_s)),
         is_stacked=True,
     )
     if times.transfers:
@@ -81,23 +81,23 @@ def charts(row: int, data: Evidence) -> Iterator[Chart]:
         )
 
 
-def _stacked(strips: Sequence[Panel], end_s: float) -> list[Panel]:
+def _stack(panels: Sequence[Panel], end_s: float) -> list[Panel]:
     """Return panels with a shared time axis, labelled in the lowest panel; points outside of it are removed."""
-    last, right_s = len(strips) - 1, (1 + _MARGIN) * end_s or 1.0
+    last_index, right_s = len(panels) - 1, (1 + _MARGIN) * end_s or 1.0
     return [
         replace(
             panel,
             is_strip=True,
             left=0.0,
             right=right_s,
-            x_label=_TIME if index == last else "",
-            series=[_within(series, right_s) for series in panel.series],
+            x_label=_TIME if index == last_index else "",
+            series=[_clip_series(series, right_s) for series in panel.series],
         )
-        for index, panel in enumerate(strips)
+        for index, panel in enumerate(panels)
     ]
 
 
-def _within(series: Series, right_s: float) -> Series:
+def _clip_series(series: Series, right_s: float) -> Series:
     """Return the points of a series from 0 to the end of the time axis."""
     x, y = (np.asarray(values, dtype=np.float64) for values in (series.x, series.y))
     if series.join == "steps":  # a value holds until the next one, so an early value applies from the start
@@ -110,12 +110,12 @@ def _within(series: Series, right_s: float) -> Series:
 def _bars(times: AttemptTimes, zero_ns: int) -> Panel:
     """Return a panel with a lane per activity name, the first at the top."""
     names = list(dict.fromkeys(activity.name for activity in times.activities))
-    last = len(names) - 1
+    last_index = len(names) - 1
     spans = [
         (activity, (activity.start_ns - zero_ns) / 1e9, (activity.stop_ns - zero_ns) / 1e9)
         for activity in times.activities
     ]
-    least_s = _MIN_BAR * max(stop for *_, stop in spans)
+    min_length_s = _MIN_BAR * max(stop for *_, stop in spans)
     return Panel(
         title="activities",
         x_label=_TIME,
@@ -123,7 +123,7 @@ def _bars(times: AttemptTimes, zero_ns: int) -> Panel:
         series=[],
         words="; ".join(f"{activity.name} from {start:.3f} to {stop:.3f} s" for activity, start, stop in spans),
         spans=[
-            Span(last - names.index(activity.name), start, max(stop, start + least_s), activity.colour)
+            Span(last_index - names.index(activity.name), start, max(stop, start + min_length_s), activity.colour)
             for activity, start, stop in spans
         ],
         lanes=list(reversed(names)),
@@ -156,62 +156,64 @@ def _packets(transfer: Transfer, fates: Fates, zero_ns: int) -> Panel:
 def _round_trips(name: str, role: Role, output: ping.Ping, times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the round-trip times, and the requests without a reply, by the time of sending."""
     clock_offset_ns = times.clock_offset_ns[role]
-    answered = [
+    answered_requests = [
         (reply.seq, reply.at_utc_ns - clock_offset_ns - zero_ns, reply.rtt_s)
         for reply in output.answers
         if reply.at_utc_ns is not None and reply.rtt_s is not None
     ]
-    lost = np.array(output.gaps)
-    seq, at_ns, rtt_s = np.array(answered).T if answered else np.empty((3, 0))
+    lost_numbers = np.array(output.gaps)
+    seq, at_ns, rtt_s = np.array(answered_requests).T if answered_requests else np.empty((3, 0))
     series = [Series("round trip", _ROUND_TRIP, at_ns / 1e9, 1e3 * rtt_s)]
-    if len(lost):
+    if len(lost_numbers):
         lost_s = (
-            estimate_send_times(lost, seq, at_ns / 1e9)
-            if answered
-            else _spread_over_job(lost, name, role, times, zero_ns)
+            estimate_send_times(lost_numbers, seq, at_ns / 1e9)
+            if answered_requests
+            else _spread_over_job(lost_numbers, name, role, times, zero_ns)
         )
         if lost_s is None:
             return
-        series.append(Series("no reply", _MARK, np.maximum(lost_s, 0.0), np.zeros(len(lost))))
-    elif not answered:
+        series.append(Series("no reply", _MARK, np.maximum(lost_s, 0.0), np.zeros(len(lost_numbers))))
+    elif not answered_requests:
         return
-    middle = f", median {1e3 * np.median(rtt_s):.2f} ms" if answered else ""
+    median_text = f", median {1e3 * np.median(rtt_s):.2f} ms" if answered_requests else ""
     yield Panel(
         title=f"round trips of {name}" if name else "round trips",
         x_label=_TIME,
         y_label="RTT [ms]",
         series=series,
-        words=f"{len(answered)} round trips{middle}; {len(lost)} without a reply",
-        top=None if answered else 1.0,
+        words=f"{len(answered_requests)} round trips{median_text}; {len(lost_numbers)} without a reply",
+        top=None if answered_requests else 1.0,
     )
 
 
 def _spread_over_job(
-    number: NDArray[np.int64], name: str, role: Role, times: AttemptTimes, zero_ns: int
+    lost_numbers: NDArray[np.int64], name: str, role: Role, times: AttemptTimes, zero_ns: int
 ) -> NDArray[np.float64] | None:
     """Return approximate send times of requests without any reply, spread evenly over the job; None if unknown."""
     if (span := times.jobs.get((role, step_prefixed(name, "ping")))) is None:
         return None
     start_s, stop_s = ((at_ns - zero_ns) / 1e9 for at_ns in span)
-    at_s: NDArray[np.float64] = start_s + (stop_s - start_s) * (number - number.min()) / len(number)
+    at_s: NDArray[np.float64] = start_s + (stop_s - start_s) * (lost_numbers - lost_numbers.min()) / len(lost_numbers)
     return at_s
 
 
 def estimate_send_times(
-    number: NDArray[np.int64], answered: NDArray[np.float64], at_s: NDArray[np.float64]
+    lost_numbers: NDArray[np.int64], answered_numbers: NDArray[np.float64], at_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return approximate send times of requests without a reply, interpolated by sequence number.
 
     Args:
-        number: Sequence numbers of the requests without a reply.
-        answered: Sequence numbers of answered requests, ascending.
+        lost_numbers: Sequence numbers of the requests without a reply.
+        answered_numbers: Sequence numbers of answered requests, ascending.
         at_s: Times of the replies to the answered requests.
     """
     step_s = (
-        (at_s[-1] - at_s[0]) / (answered[-1] - answered[0]) if len(answered) > 1 else 1.0
+        (at_s[-1] - at_s[0]) / (answered_numbers[-1] - answered_numbers[0]) if len(answered_numbers) > 1 else 1.0
     )  # default interval of ping
-    interpolated: NDArray[np.float64] = np.interp(number, answered, at_s)
-    steps_outside: NDArray[np.float64] = np.minimum(number - answered[0], 0) + np.maximum(number - answered[-1], 0)
+    interpolated: NDArray[np.float64] = np.interp(lost_numbers, answered_numbers, at_s)
+    steps_outside: NDArray[np.float64] = np.minimum(lost_numbers - answered_numbers[0], 0) + np.maximum(
+        lost_numbers - answered_numbers[-1], 0
+    )
     return interpolated + step_s * steps_outside
 
 
@@ -258,8 +260,8 @@ def _radio_panel(
 def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
     """Yield the distance between sender and receiver over time, if it changed."""
     changes = [(max(utc_ns - zero_ns, 0) / 1e9, metres) for utc_ns, metres in times.distances_m]
-    known_m = [metres for _, metres in changes if metres is not None]
-    if len(set(known_m)) < 2:
+    known_distances_m = [metres for _, metres in changes if metres is not None]
+    if len(set(known_distances_m)) < 2:
         return
     at_s, distance_m = zip(*((at, math.nan if metres is None else metres) for at, metres in changes), strict=True)
     yield Panel(
@@ -267,5 +269,5 @@ def _distance(times: AttemptTimes, zero_ns: int) -> Iterator[Panel]:
         x_label=_TIME,
         y_label="[m]",
         series=[Series("distance", _DISTANCE, at_s, distance_m, join="steps")],
-        words=f"{min(known_m):.1f} to {max(known_m):.1f} m",
+        words=f"{min(known_distances_m):.1f} to {max(known_distances_m):.1f} m",
     )

@@ -35,17 +35,19 @@ class Evidence:
     Attributes:
         repeats: The table.
         plans: Plans by the `source` of rows; only sources that are folders of trials have one.
-        unread: A sentence per plan that could not be read, and per trial whose evidence differs from its manifest.
-        changed: Folders of attempts whose evidence differs from the manifest and therefore counts as not available.
-        verified: The `source` of the trials whose evidence was compared with the manifest. The evidence of other
-            trials counts as not available.
+        limitations: A sentence per plan that could not be read, and per trial whose evidence differs from its
+            manifest.
+        changed_folders: Folders of attempts whose evidence differs from the manifest and therefore counts as not
+            available.
+        verified_sources: The `source` of the trials whose evidence was compared with the manifest. The evidence of
+            other trials counts as not available.
     """
 
     repeats: Repeats
     plans: Mapping[str, Plan]
-    unread: tuple[str, ...]
-    changed: frozenset[Path]
-    verified: frozenset[str]
+    limitations: tuple[str, ...]
+    changed_folders: frozenset[Path]
+    verified_sources: frozenset[str]
 
     @property
     def conditions(self) -> int:
@@ -67,27 +69,27 @@ class Evidence:
         """Return the rows of a cell's attempts in order of time."""
         return self._rows[tuple(cell.key[name] for name in DEFAULT_BY)]
 
-    def declared(self, cell: Cell) -> Set[str] | None:
+    def measured_columns(self, cell: Cell) -> Set[str] | None:
         """Return the columns that the steps of a cell's trials measure, or None if no plan is available."""
         key = tuple(cell.key[name] for name in DEFAULT_BY)
-        if key not in self._declared:
+        if key not in self._measured_columns:
             sources = dict.fromkeys(self.repeats.texts["source"][self.rows(cell)].tolist())
             plans = [self.plans[source] for source in sources if source in self.plans]
             steps = (placed.step for plan in plans for placed in plan.procedure.walk())
             names = frozenset(column.name for step in steps for column in step.output_columns())
-            self._declared[key] = names if plans else None
-        return self._declared[key]
+            self._measured_columns[key] = names if plans else None
+        return self._measured_columns[key]
 
     @cached_property
-    def _declared(self) -> dict[Key, Set[str] | None]:
+    def _measured_columns(self) -> dict[Key, Set[str] | None]:
         return {}
 
-    def valid(self, cell: Cell, name: str) -> NDArray[np.int64]:
+    def valid_rows(self, cell: Cell, name: str) -> NDArray[np.int64]:
         """Return the rows of a cell's valid repeats that have the column `name`, in order of time."""
         rows = self.rows(cell)
         is_valid = self.repeats.texts["status"][rows] == Status.VALID
-        chosen: NDArray[np.int64] = rows[is_valid & np.isfinite(self.repeats.numbers[name][rows])]
-        return chosen
+        selected_rows: NDArray[np.int64] = rows[is_valid & np.isfinite(self.repeats.numbers[name][rows])]
+        return selected_rows
 
     def observed(self, cell: Cell, quantity: Quantity) -> tuple[Numbers, NDArray[np.bool_]]:
         """Return the values of a cell's valid repeats in order of time, and a mask of the lower bounds among them."""
@@ -113,7 +115,7 @@ class Evidence:
         name = f"{step}.rtt_payload_bytes".removeprefix(".")
         if name not in self.repeats.numbers:
             return ""
-        sizes = np.unique(self.repeats.numbers[name][self.valid(cell, name)])
+        sizes = np.unique(self.repeats.numbers[name][self.valid_rows(cell, name)])
         return f"{' or '.join(f'{size:.0f}' for size in sizes)} bytes" if len(sizes) else ""
 
     def plan(self, row: int) -> Plan | None:
@@ -126,12 +128,12 @@ class Evidence:
         if (
             plan is None
             or name is None
-            or texts["source"][row] not in self.verified
+            or texts["source"][row] not in self.verified_sources
             or plan.trial != texts["trial"][row]
         ):
             return None
         folder = store.attempt_folder(Path(texts["source"][row]), name)
-        return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed else None
+        return AttemptEvidence(folder) if folder.is_dir() and folder not in self.changed_folders else None
 
     def pings(self, row: int, step: str = "") -> ping.Ping | None:
         """Return the output of ping in a row's attempt, optionally of a named step, or None if unavailable."""
@@ -157,33 +159,38 @@ def load_evidence(repeats: Repeats, attempt: str = "") -> Evidence:
         ConfigurationError: There is no such attempt, or there are several.
     """
     plans: dict[str, Plan] = {}
-    unread, changed = [], set[Path]()
+    limitations, changed_folders = [], set[Path]()
     for source in dict.fromkeys(repeats.texts["source"].tolist()):
         if (Path(source) / PLAN_FILE).is_file():
             try:
                 plans[source] = stored_plans.read_plan(Path(source))
             except FieldkitError as error:
-                unread.append(error.located)
-    first = [repeats.texts["source"][repeats.row(attempt)]] if attempt else []
-    chosen = _chosen(repeats, plans, first)
-    for source in chosen:
+                limitations.append(error.located)
+    required_sources = [repeats.texts["source"][repeats.row(attempt)]] if attempt else []
+    selected_sources = _choose_sources(repeats, plans, required_sources)
+    for source in selected_sources:
         try:
             if differences := verification.differences(Path(source)):
                 summary = verification.summarize(differences)
-                unread.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
-                changed |= {Path(source, *Path(name).parts[:2]) for name in differences}
+                limitations.append(f"{source}: evidence that differs from the manifest is left out: {summary}")
+                changed_folders |= {Path(source, *Path(name).parts[:2]) for name in differences}
         except FieldkitError as error:
-            unread.append(error.located)
-    if len(chosen) < len(plans):
-        unread.append(
-            f"Packets, replies and the time line are of {len(chosen)} of {len(plans)} trials, chosen evenly over the "
-            "conditions; all other figures are of all trials. To choose other trials: --where."
+            limitations.append(error.located)
+    if len(selected_sources) < len(plans):
+        limitations.append(
+            f"Packets, replies and the time line are of {len(selected_sources)} of {len(plans)} trials, chosen "
+            "evenly over the conditions; all other figures are of all trials. To choose other trials: --where."
         )
-    return Evidence(repeats, MappingProxyType(plans), tuple(unread), frozenset(changed), frozenset(chosen))
+    return Evidence(
+        repeats, MappingProxyType(plans), tuple(limitations), frozenset(changed_folders), frozenset(selected_sources)
+    )
 
 
-def _chosen(repeats: Repeats, plans: Mapping[str, Plan], first: Iterable[str]) -> list[str]:
-    """Return at most `MAX_TRIALS` sources with plans: `first`, one per condition, then a second one, and so on."""
+def _choose_sources(repeats: Repeats, plans: Mapping[str, Plan], required_sources: Iterable[str]) -> list[str]:
+    """Return at most `MAX_TRIALS` sources with plans.
+
+    `required_sources` come first, then one source per condition, then a second one per condition, and so on.
+    """
     if len(plans) <= MAX_TRIALS:
         return list(plans)
     condition_of = dict(zip(repeats.texts["source"].tolist(), repeats.keys(DEFAULT_BY), strict=True))
@@ -192,6 +199,6 @@ def _chosen(repeats: Repeats, plans: Mapping[str, Plan], first: Iterable[str]) -
     for source in plans:
         ranks[source] = counts[condition_of[source]]
         counts[condition_of[source]] += 1
-    ranks |= dict.fromkeys((source for source in first if source in plans), -1)
-    chosen = set(sorted(plans, key=lambda source: ranks[source])[:MAX_TRIALS])
-    return [source for source in plans if source in chosen]
+    ranks |= dict.fromkeys((source for source in required_sources if source in plans), -1)
+    selected_sources = set(sorted(plans, key=lambda source: ranks[source])[:MAX_TRIALS])
+    return [source for source in plans if source in selected_sources]

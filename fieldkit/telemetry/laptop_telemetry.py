@@ -1,4 +1,4 @@
-"""Queries of telemetry sources by the laptop, beside the steps of an attempt.
+"""Query telemetry sources from the laptop during the steps of an attempt.
 
 The laptop runs the same program as a robot: `poll` in telemetry.sh.
 """
@@ -32,7 +32,7 @@ def querying(cast: Cast, folder: Path) -> Iterator[None]:
         folder: Folder for the outputs.
     """
     with ExitStack() as stack:
-        started = []
+        processes = []
         for role, name, source in telemetry_queries.sources(cast, "laptop"):
             file = folder / source_readings.file(role, name, source)
             argv = _argv(source, stack.enter_context(credentials_file(source, os.environ)))
@@ -46,19 +46,19 @@ def querying(cast: Cast, folder: Path) -> Iterator[None]:
                     cwd=stack.enter_context(_temporary_folder()),
                     start_new_session=True,
                 )
-            started.append(process)
+            processes.append(process)
         try:
             yield
         finally:
-            for process in started:
+            for process in processes:
                 process.terminate()
-            for process in started:
-                _end(process)
+            for process in processes:
+                _wait_or_kill(process)
 
 
 def _argv(source: TelemetrySource, credentials: str | None, interval: str | None = None) -> tuple[str, ...]:
-    address, tested, every, *rest = source.poll_words("-", credentials)
-    words = (f"/proc/{os.getpid()}", "-", address, tested, interval or every, *rest)
+    address, tested_interface, source_interval, *remaining_words = source.poll_words("-", credentials)
+    words = (f"/proc/{os.getpid()}", "-", address, tested_interface, interval or source_interval, *remaining_words)
     return ("sh", "-c", SCRIPT.decode(), "job.sh", "poll", *words)
 
 
@@ -79,12 +79,12 @@ def query_once(source: TelemetrySource, environment: Mapping[str, str]) -> bytes
             output = b""
         finally:
             process.terminate()
-            _end(process)
+            _wait_or_kill(process)
     return output
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Wait for the end of a query that was requested to end, which ends the running command; else kill both."""
+def _wait_or_kill(process: "subprocess.Popen[bytes]") -> None:
+    """Wait until a terminated query has exited. After a timeout, kill it together with its running command."""
     with suppress(subprocess.TimeoutExpired):
         process.wait(_END_S)
         return

@@ -1,4 +1,4 @@
-"""Values in the output of one query of a telemetry source: of mmcli, batctl, snmpget, or at locations of the profile.
+"""Read values from an output of a telemetry source: mmcli, batctl, or any output with the locations of the profile.
 
 Outputs are not trusted: JSON may have any shape and any numbers. A value that is missing, or has another type, is
 absent, never 0.
@@ -51,7 +51,7 @@ def values(source: TelemetrySource, output: str) -> Values:
     """Return the values in one output of a source.
 
     Raises:
-        ValueError: The output has another format; the message is the predicate of a sentence.
+        ValueError: The output has another format; the message continues a sentence that begins with `its output`.
     """
     match source.kind:
         case "modemmanager":
@@ -59,29 +59,29 @@ def values(source: TelemetrySource, output: str) -> Values:
         case "batctl":
             return mesh_values(output)
         case "snmp":
-            return _located(source, dict(_SNMP_LINE.findall(output)))
+            return _values_at_locations(source, dict(_SNMP_LINE.findall(output)))
         case _:
-            return _located(source, output)
+            return _values_at_locations(source, output)
 
 
-def _located(source: TelemetrySource, output: str | Mapping[str, str]) -> Values:
+def _values_at_locations(source: TelemetrySource, output: str | Mapping[str, str]) -> Values:
     """Return the values at the locations of the profile, in text or in objects of SNMP."""
-    printed: object = None
-    located: dict[str, float | str] = {}
+    document: object = None
+    values_by_name: dict[str, float | str] = {}
     for name, location in source.values.items() if source.values is not None else ():
         if isinstance(output, str):
-            if location.path is not None and printed is None:
-                printed = program_output.parse_json(output)
+            if location.path is not None and document is None:
+                document = program_output.parse_json(output)
             extracted = (
-                program_output.search_json(printed, location.path)
+                program_output.search_json(document, location.path)
                 if location.path is not None
                 else program_output.search_text(output, location.expression or "")
             )
         else:
             extracted = _snmp_value(output, location)
         if (value := _value(name, extracted, location.factor)) is not None:
-            located[name] = value
-    return located
+            values_by_name[name] = value
+    return values_by_name
 
 
 def _snmp_value(objects: Mapping[str, str], location: Extraction) -> str | None:
@@ -93,7 +93,7 @@ def _snmp_value(objects: Mapping[str, str], location: Extraction) -> str | None:
 
 
 def _value(name: str, extracted: object, factor: float = 1) -> float | str | None:
-    """Return a value of a type that its column has; None for any other."""
+    """Return a value in the type of its column; None if it cannot be converted."""
     if isinstance(extracted, bool | list | dict) or extracted is None:
         return None
     if name in TEXTS:
@@ -110,7 +110,7 @@ def _value(name: str, extracted: object, factor: float = 1) -> float | str | Non
         except (TypeError, ValueError, OverflowError):
             return None
     number *= factor
-    # Drivers of modems and radios report 0 or a positive number for an unknown signal, as those of Wi-Fi.
+    # Drivers of modems and radios report 0 or a positive number for an unknown signal, as drivers of Wi-Fi do.
     is_power = name in {"signal_dbm", "noise_dbm"}
     return number if math.isfinite(number) and (number < 0 or not is_power) else None
 
@@ -125,7 +125,7 @@ def _documents(output: str) -> Iterator[object]:
                 continue
 
 
-def _at(document: object, *keys: str) -> object:
+def _value_at(document: object, *keys: str) -> object:
     for key in keys:
         document = document.get(key) if isinstance(document, dict) else None
     return document
@@ -140,33 +140,33 @@ def modem_values(output: str) -> Values:
     Raises:
         ValueError: There is no JSON of mmcli.
     """
-    modems = [modem for document in _documents(output) if isinstance(modem := _at(document, "modem"), dict)]
+    modems = [modem for document in _documents(output) if isinstance(modem := _value_at(document, "modem"), dict)]
     if not modems:
         raise ValueError("is not JSON of mmcli")
     merged: dict[str, object] = {}
     for modem in modems:
         for key, content in modem.items():
-            earlier = merged.get(key)
-            both = isinstance(earlier, dict) and isinstance(content, dict)
-            merged[key] = {**earlier, **content} if both else content  # type: ignore[dict-item]
-    technologies = _texts(_at(merged, "generic", "access-technologies"))
-    located = _modem_signal(_at(merged, "signal"), technologies)
-    cells = [dict(_cell_facts(text)) for text in _texts(_at(merged, "generic", "cell-info"))]
+            earlier_content = merged.get(key)
+            are_mappings = isinstance(earlier_content, dict) and isinstance(content, dict)
+            merged[key] = {**earlier_content, **content} if are_mappings else content  # type: ignore[dict-item]
+    technologies = _texts(_value_at(merged, "generic", "access-technologies"))
+    values_by_name = _modem_signal(_value_at(merged, "signal"), technologies)
+    cells = [dict(_cell_facts(text)) for text in _texts(_value_at(merged, "generic", "cell-info"))]
     serving = next((cell for cell in cells if cell.get("serving") == "yes"), {})
     channels = (f", {key.upper()} {serving[key]}" for key in _CHANNELS if key in serving)
     channel = next(channels, "")
     band = f"{serving.get('cell type') or '/'.join(technologies)}{channel}"
-    cell = serving.get("ci") or _at(merged, "location", "3gpp", "cid")
-    operator = _at(merged, "3gpp", "operator-code")
+    cell = serving.get("ci") or _value_at(merged, "location", "3gpp", "cid")
+    operator = _value_at(merged, "3gpp", "operator-code")
     for name, text in (("band", band), ("cell", cell)):
         if (value := _value(name, text)) is not None:
-            located[name] = value
+            values_by_name[name] = value
     known_operator = _value("cell", operator)
-    if "cell" in located and known_operator is not None:
-        located["cell"] = f"{known_operator} {located['cell']}"
+    if "cell" in values_by_name and known_operator is not None:
+        values_by_name["cell"] = f"{known_operator} {values_by_name['cell']}"
     if cells:
-        located["neighbours"] = float(sum(cell.get("serving") == "no" for cell in cells))
-    return located
+        values_by_name["neighbours"] = float(sum(cell.get("serving") == "no" for cell in cells))
+    return values_by_name
 
 
 def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | str]:
@@ -174,10 +174,10 @@ def _modem_signal(signal: object, technologies: list[str]) -> dict[str, float | 
         # Values of another technology are of an earlier connection, and have another meaning.
         if technologies and not names & set(technologies):
             continue
-        signal_dbm = _value("signal_dbm", _at(signal, key, power))
+        signal_dbm = _value("signal_dbm", _value_at(signal, key, power))
         if signal_dbm is None:
             continue
-        sinr_db = _value("sinr_db", _at(signal, key, ratio)) if ratio else None
+        sinr_db = _value("sinr_db", _value_at(signal, key, ratio)) if ratio else None
         return {"signal_dbm": signal_dbm} | ({} if sinr_db is None else {"sinr_db": sinr_db})
     return {}
 
@@ -216,7 +216,7 @@ def _mesh_ages(table: str) -> dict[str, list[float]]:
             nodes = None  # the header line of a table also begins with a bracket
         if isinstance(nodes, list):
             for node in nodes:
-                address, age_ms = _at(node, "neigh_address"), _at(node, "last_seen_msecs")
+                address, age_ms = _value_at(node, "neigh_address"), _value_at(node, "last_seen_msecs")
                 if isinstance(address, str) and isinstance(age_ms, int) and not isinstance(age_ms, bool):
                     ages.setdefault(address[:40], []).append(age_ms / 1e3)
             return ages

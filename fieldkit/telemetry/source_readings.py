@@ -44,9 +44,9 @@ class SourceReadings:
     """Readings of one source.
 
     Attributes:
-        values: Values of each run that gave any, in the order of time.
+        values: Values of each run with at least one value, in order of time.
         runs: Number of runs.
-        reasons: Number of the other runs by the reason why they gave none.
+        reasons: Number of the other runs by the reason why they have no value.
     """
 
     values: tuple[Values, ...]
@@ -55,7 +55,7 @@ class SourceReadings:
 
     @property
     def reason(self) -> str:
-        """Most frequent reason why runs gave no value; empty if all gave one."""
+        """Most frequent reason why runs have no value; empty if all have one."""
         return self.reasons.most_common(1)[0][0] if self.reasons else ""
 
 
@@ -79,7 +79,7 @@ def _content(path: Path) -> bytes:
 
 def parse(content: bytes, source: TelemetrySource) -> SourceReadings:
     """Return the readings in a file; an incomplete last run, which was being written at the end, is omitted."""
-    found: list[Values] = []
+    run_values: list[Values] = []
     reasons: Counter[str] = Counter()
     runs = position = 0
     while (head := _HEAD.match(content, position)) is not None:
@@ -88,18 +88,18 @@ def parse(content: bytes, source: TelemetrySource) -> SourceReadings:
         if position > len(content):
             break
         runs += 1
-        reason = _failure(head[2].decode(), output, source)
+        reason = _failure_reason(head[2].decode(), output, source)
         if not reason:
-            reason, values = _parsed(source, output.decode(errors="replace"))
+            reason, values = _parse_values(source, output.decode(errors="replace"))
             if values:
-                found.append(values)
+                run_values.append(values)
                 continue
         reasons[reason] += 1
-    return SourceReadings(tuple(found), runs, reasons)
+    return SourceReadings(tuple(run_values), runs, reasons)
 
 
-def _failure(code: str, output: bytes, source: TelemetrySource) -> str:
-    """Return the reason why a run has no output; empty if it has."""
+def _failure_reason(code: str, output: bytes, source: TelemetrySource) -> str:
+    """Return the reason why a run failed; empty if it succeeded."""
     no_program = f"{source.program} is not installed"
     # 128 + SIGXFSZ, which the limit of the output's size sends, and 128 + SIGKILL, which the time limit sends.
     reasons = {"0": "", "large": _TOO_LONG, "153": _TOO_LONG, "126": no_program, "127": no_program}
@@ -107,11 +107,13 @@ def _failure(code: str, output: bytes, source: TelemetrySource) -> str:
     reasons |= {"interface": f"its address {source.address} is reached over the interface under test"}
     if source.http is not None:
         reasons |= _CURL
-    said = printable(output, 120)
-    return reasons.get(code, f"{source.program} failed with exit code {code}" + (f": {said}" if said else ""))
+    error_text = printable(output, 120)
+    return reasons.get(
+        code, f"{source.program} failed with exit code {code}" + (f": {error_text}" if error_text else "")
+    )
 
 
-def _parsed(source: TelemetrySource, output: str) -> tuple[str, Values]:
+def _parse_values(source: TelemetrySource, output: str) -> tuple[str, Values]:
     """Return the values in an output, or the reason why there are none."""
     try:
         values = source_outputs.values(source, output)

@@ -1,7 +1,7 @@
 """Columns of the link of a robot whose profile has telemetry sources.
 
-A value that a source gives replaces that of `iw` or of the testbed, also if the source failed: the radio of the
-source is the one under test. All other columns remain.
+The columns of a source replace the columns of `iw` or of the testbed, because the source reports the radio under
+test. If the source failed, its columns are empty. All other columns remain.
 """
 
 from collections import Counter
@@ -66,8 +66,8 @@ def _role_columns(role: Role) -> tuple[Column, ...]:
 
 
 _COLUMNS: Final = {role: _role_columns(role) for role in link.ROLES}
-COLUMNS: Final = tuple(column for declared in _COLUMNS.values() for column in declared)
-_DECLARED: Final = {column.name: column for column in (*link.COLUMNS, *COLUMNS)}
+COLUMNS: Final = tuple(column for role_columns in _COLUMNS.values() for column in role_columns)
+_COLUMNS_BY_NAME: Final = {column.name: column for column in (*link.COLUMNS, *COLUMNS)}
 
 
 def of_role(role: Role) -> tuple[Column, ...]:
@@ -106,13 +106,13 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
         base: Columns from the robot's `iw` or from the testbed.
     """
     series: dict[str, _Series] = {}
-    used: list[str] = []
+    source_texts: list[str] = []
     notes: list[str] = []
     samples = 0
     for name, source in telemetry.sources.items():
         readings, reason = _read(evidence, role, name, source)
         samples += len(readings.values)
-        own = {
+        source_series = {
             quantity: _Series(
                 [values[quantity] for values in readings.values if quantity in values],
                 f"telemetry {name}: {reason or 'it does not report it'}",
@@ -120,35 +120,37 @@ def measure(role: Role, telemetry: TelemetrySection, evidence: AttemptEvidence, 
             for quantity in source.quantities
             if quantity not in series
         }
-        series |= own
-        if present := [quantity for quantity, of_quantity in own.items() if of_quantity.values]:
+        series |= source_series
+        if measured_quantities := [
+            quantity for quantity, quantity_series in source_series.items() if quantity_series.values
+        ]:
             mark = f", queries on the interface under test to {source.address}" if source.wired else ""
-            used.append(f"{name} ({source.kind}{mark}): {' '.join(present)}")
+            source_texts.append(f"{name} ({source.kind}{mark}): {' '.join(measured_quantities)}")
         if not readings.values:
             notes.append(f"telemetry {name} of the {role} gave no value: {reason or 'no query ended'}")
-    of_sources = _measured(role, series)
-    remaining = base.without(dict.fromkeys(of_sources.values, "") | dict(of_sources.missing))
+    source_columns = _measured(role, series)
+    remaining = base.without(dict.fromkeys(source_columns.values, "") | dict(source_columns.missing))
     if remaining.values:
-        used.append(f"others: {'testbed' if evidence.has(link_samples.FILE) else 'iw'}")
-    of_role_only = Measured.from_optional(
-        {f"{role}_link_source": "; ".join(used) or None, f"{role}_telemetry_samples": samples},
+        source_texts.append(f"others: {'testbed' if evidence.has(link_samples.FILE) else 'iw'}")
+    role_columns = Measured.from_optional(
+        {f"{role}_link_source": "; ".join(source_texts) or None, f"{role}_telemetry_samples": samples},
         "no source gave a value",
     )
-    others = Measured.all_missing(of_role(role), "no telemetry source of the profile gives it")
-    return TelemetryVerdict(of_sources | of_role_only | remaining | others, tuple(notes))
+    missing_columns = Measured.all_missing(of_role(role), "no telemetry source of the profile gives it")
+    return TelemetryVerdict(source_columns | role_columns | remaining | missing_columns, tuple(notes))
 
 
 def _measured(role: Role, series: Mapping[str, _Series]) -> Measured:
     """Return the columns of the sources' values; an impossible value is missing."""
     values: dict[str, Value] = {}
     missing: dict[str, str] = {}
-    for quantity, of_quantity in series.items():
-        for column, value in _columns(quantity, of_quantity.values).items():
+    for quantity, quantity_series in series.items():
+        for column, value in _columns(quantity, quantity_series.values).items():
             name = f"{role}_{column}"
             if value is None:
-                missing[name] = of_quantity.reason
-            elif _DECLARED[name].invalid_value_reason(cell(value)):
-                missing[name] = f"{of_quantity.reason.partition(':')[0]}: its value {cell(value)} is impossible"
+                missing[name] = quantity_series.reason
+            elif _COLUMNS_BY_NAME[name].invalid_value_reason(cell(value)):
+                missing[name] = f"{quantity_series.reason.partition(':')[0]}: its value {cell(value)} is impossible"
             else:
                 values[name] = value
     return Measured(values, missing)
@@ -167,27 +169,27 @@ def _columns(quantity: str, series: Sequence[float | str]) -> Mapping[str, Value
     """Return the columns of a quantity without the prefix of the role; None without a value."""
     numbers = [value for value in series if isinstance(value, float)]
     texts = [value for value in series if isinstance(value, str)]
-    middle, least = (median(numbers), min(numbers)) if numbers else (None, None)
+    median_value, minimum = (median(numbers), min(numbers)) if numbers else (None, None)
     match quantity:
         case "signal_dbm":
             last = numbers[-1] if numbers else None
-            return {"signal_median_dbm": middle, "signal_min_dbm": least, "signal_last_dbm": last}
+            return {"signal_median_dbm": median_value, "signal_min_dbm": minimum, "signal_last_dbm": last}
         case "sinr_db":
-            return {"sinr_median_db": middle, "sinr_min_db": least}
+            return {"sinr_median_db": median_value, "sinr_min_db": minimum}
         case "cell":
             roams = sum(before != after for before, after in pairwise(texts)) if texts else None
-            return {"cell": _in_order(texts), "roams": roams}
+            return {"cell": _join_distinct(texts), "roams": roams}
         case "band":
-            return {"band": _in_order(texts)}
+            return {"band": _join_distinct(texts)}
         case "neighbours":
-            return {"neighbours_min": None if least is None else round(least)}
+            return {"neighbours_min": None if minimum is None else round(minimum)}
         case _:  # noise_dbm, tx_rate_bit_s, rx_rate_bit_s
-            return {quantity: middle}
+            return {quantity: median_value}
 
 
-def _in_order(texts: Sequence[str]) -> str | None:
+def _join_distinct(texts: Sequence[str]) -> str | None:
     distinct = list(dict.fromkeys(texts))
     if not distinct:
         return None
-    more = f" and {len(distinct) - _MAX_TEXTS} more" if len(distinct) > _MAX_TEXTS else ""
-    return " / ".join(distinct[:_MAX_TEXTS]) + more
+    more_text = f" and {len(distinct) - _MAX_TEXTS} more" if len(distinct) > _MAX_TEXTS else ""
+    return " / ".join(distinct[:_MAX_TEXTS]) + more_text

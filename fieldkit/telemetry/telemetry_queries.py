@@ -21,7 +21,7 @@ def sources(cast: Cast, computer: str) -> Iterator[tuple[Role, str, TelemetrySou
             yield from ((role, name, source) for name, source in telemetry.at(computer).items())
 
 
-def of_robots(cast: Cast) -> Mapping[Role, Sequence[Sequence[str]]]:
+def queries_by_role(cast: Cast) -> Mapping[Role, Sequence[Sequence[str]]]:
     """Return the sources that each robot queries: their names and the words of `poll` in telemetry.sh."""
     by_role: dict[Role, list[Sequence[str]]] = {}
     for role, name, source in sources(cast, "robot"):

@@ -13,7 +13,7 @@ from fieldkit.config.schema import AfterValidator, Bool, Duration, Field, Int, N
 from fieldkit.measure.evidence import program_output
 
 MAX_OUTPUT_BYTES: Final = 1 << 16
-"""Maximum size of one output of a source; `QUERIED` in telemetry.sh. A longer output gives no value."""
+"""Maximum size of one output of a source; `MAX_OUTPUT` in telemetry.sh. A longer output has no value."""
 
 # mmcli prints the extended signal since version 1.6, JSON since 1.10, and the neighbouring cells since 1.20.
 _MODEM: Final = (
@@ -27,19 +27,19 @@ _MESH: Final = (
 )
 
 
-def _is_path(text: str) -> str:
-    if why := program_output.path_error(text):
-        raise schema.validation_error(f"{text!r} is not a valid JMESPath: {why}")
+def _require_path(text: str) -> str:
+    if reason := program_output.path_error(text):
+        raise schema.validation_error(f"{text!r} is not a valid JMESPath: {reason}")
     return text
 
 
-def _is_expression(text: str) -> str:
-    if why := program_output.expression_error(text):
-        raise schema.validation_error(f"{text!r} is not a regular expression (RE2) with one group: {why}")
+def _require_expression(text: str) -> str:
+    if reason := program_output.expression_error(text):
+        raise schema.validation_error(f"{text!r} is not a regular expression (RE2) with one group: {reason}")
     return text
 
 
-def _is_address(text: str) -> str:
+def _require_address(text: str) -> str:
     try:
         ipaddress.ip_address(text)
     except ValueError:
@@ -49,7 +49,7 @@ def _is_address(text: str) -> str:
     return text
 
 
-def _is_url(text: str) -> str:
+def _require_url(text: str) -> str:
     try:
         parts = urlsplit(text)
         host, has_user = parts.hostname or "", parts.username is not None or parts.password is not None
@@ -59,7 +59,7 @@ def _is_url(text: str) -> str:
         raise schema.validation_error(f"{text!r} is not a URL, such as http://192.168.8.1/api/signal")
     if has_user:
         raise schema.validation_error("a URL with a password would be stored with each trial; use credentials")
-    _is_address(host)
+    _require_address(host)
     return text
 
 
@@ -123,7 +123,7 @@ class Snmp(Strict):
         credentials: Community or user.
     """
 
-    address: Annotated[str, AfterValidator(_is_address)]
+    address: Annotated[str, AfterValidator(_require_address)]
     port: Annotated[Int, Field(gt=0, lt=65536)] = 161
     version: Annotated[str, Field(pattern="^(1|2c|3)$")] = "2c"
     credentials: CredentialsReference | None = None
@@ -146,7 +146,7 @@ class Http(Strict):
         credentials: Header or user for the request.
     """
 
-    url: Annotated[str, AfterValidator(_is_url)]
+    url: Annotated[str, AfterValidator(_require_url)]
     credentials: CredentialsReference | None = None
 
     @property
@@ -173,8 +173,8 @@ class Extraction(Strict):
         factor: Multiplier that gives the unit of the value: 1000000 if the output is in Mbit/s.
     """
 
-    path: Annotated[str, AfterValidator(_is_path)] | None = Field(default=None, alias="json")
-    expression: Annotated[str, AfterValidator(_is_expression)] | None = Field(default=None, alias="regex")
+    path: Annotated[str, AfterValidator(_require_path)] | None = Field(default=None, alias="json")
+    expression: Annotated[str, AfterValidator(_require_expression)] | None = Field(default=None, alias="regex")
     oid: Annotated[str, pattern_field(r"^\.?[0-9]+(\.[0-9]+){3,40}$", "a numeric OID")] | None = None
     factor: Number | Int = 1
 
@@ -217,7 +217,7 @@ class Values(Strict):
 
 
 QUANTITIES: Final = tuple(Values.model_fields)
-_OF_KIND: Final[Mapping[str, tuple[str, ...]]] = {
+_QUANTITIES_BY_KIND: Final[Mapping[str, tuple[str, ...]]] = {
     "modemmanager": ("signal_dbm", "sinr_db", "band", "cell", "neighbours"),
     "batctl": ("neighbours",),
 }
@@ -239,7 +239,7 @@ class TelemetrySource(Strict):
         command: Words of a command that prints the state of the radio. It must send nothing over the radio.
         values: Location of each value in the output of `snmp`, `http` or `command`.
         interval: Time between two queries, in whole seconds.
-        limit: A query that takes longer is killed and gives no value, in whole seconds.
+        limit: Time limit of a query, in whole seconds. A query that takes longer is killed and has no value.
         wired: Whether `snmp` or `http` reaches the radio itself by a cable on the interface under test. Without it, a
             source whose address is reached over this interface is not queried.
     """
@@ -259,7 +259,7 @@ class TelemetrySource(Strict):
     def _is_consistent(self) -> "TelemetrySource":
         if sum(getattr(self, kind) is not None for kind in KINDS) != 1:
             raise schema.validation_error(f"a source needs exactly one of {', '.join(KINDS)}")
-        if self.kind in _OF_KIND:
+        if self.kind in _QUANTITIES_BY_KIND:
             if self.values is not None:
                 raise schema.validation_error(f"the values of {self.kind} are known; omit values", "values")
         elif self.values is None or not list(self.values.items()):
@@ -292,7 +292,7 @@ class TelemetrySource(Strict):
     @property
     def quantities(self) -> tuple[str, ...]:
         """Names of the values that it gives."""
-        return _OF_KIND.get(self.kind) or tuple(name for name, _ in (self.values or Values()).items())
+        return _QUANTITIES_BY_KIND.get(self.kind) or tuple(name for name, _ in (self.values or Values()).items())
 
     @property
     def address(self) -> str | None:
@@ -337,9 +337,9 @@ class TelemetrySource(Strict):
             radio: The interface under test, over which nothing may be sent; `-` on another computer.
             credentials_file: As for `argv`.
         """
-        tested = "-" if self.wired else radio
+        tested_interface = "-" if self.wired else radio
         times = (f"{self.interval:.0f}", f"{self.limit:.0f}")
-        return (self.address or "-", tested, *times, *self.argv(credentials_file))
+        return (self.address or "-", tested_interface, *times, *self.argv(credentials_file))
 
 
 SourceName = Annotated[str, pattern_field(r"^[a-z][a-z0-9_]{0,19}$", "a short name in lower-case letters")]
@@ -348,7 +348,7 @@ SourceName = Annotated[str, pattern_field(r"^[a-z][a-z0-9_]{0,19}$", "a short na
 class TelemetrySection(ProfileSection):
     """[Sources](telemetry.md) of the state of the robot's radio, in addition to `iw`.
 
-    A source that fails gives no value. A value that several sources give is that of the first one.
+    A source that fails has no value. If several sources have a value, the value of the first source is used.
 
     Attributes:
         sources: The sources by name.

@@ -101,7 +101,7 @@ def covers(kind: str, column: str) -> bool:
 def markdown() -> str:
     """Return the table for `docs/evidence.md`."""
     lines = [
-        "| step | quantity | source | compared with | may differ by | else |",
+        "| step | quantity | source | compared with | permitted difference | otherwise |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for kind, check in rows():

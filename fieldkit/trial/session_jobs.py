@@ -1,8 +1,8 @@
 """Jobs that run on robots during a whole session, such as a bridge of topics.
 
-They run from before the first check until the end of the session, so the preflight checks, people and every trial of
-the session use the robot in the same state. They are normal jobs: `fieldkit abort` ends them, and a resumed session
-joins them. Packages add them by entry points (`plugins.SESSION_JOBS`).
+They run from before the first check until the end of the session, so that the preflight checks, operators and all
+trials of the session use the robot in the same state. They are normal jobs: `fieldkit abort` stops them, and a
+resumed session uses jobs that are still running. Packages add them by entry points (`plugins.SESSION_JOBS`).
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -21,25 +21,25 @@ from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Planned, Shells
 
 SessionJobs = Callable[[Cast, str], Iterable[Planned]]
-"""Returns the jobs of a session on the robots of a cast. The session is the second argument; the folder of each job
-must be named after it."""
+"""Function that returns the jobs of a session on the robots of a cast. The second argument is the ID of the session,
+which must be the name of the folder of each job."""
 
 _INSTALLS_S: Final = 30.0
 _GRACE_S: Final = 5
 
 
-def planned(cast: Cast, session: str) -> list[Planned]:
+def planned_jobs(cast: Cast, session: str) -> list[Planned]:
     """Return the jobs of a session.
 
     Args:
         cast: The robot in each role.
-        session: Identifies the run of fieldkit.
+        session: ID of the run of fieldkit.
     """
-    return [job for _, jobs_of_package in _by_package(cast, session) for job in jobs_of_package]
+    return [job for _, package_jobs in _by_package(cast, session) for job in package_jobs]
 
 
 def _by_package(cast: Cast, session: str) -> Iterator[tuple[str, Sequence[Planned]]]:
-    """Yield the name of each entry point with its jobs."""
+    """Yield the name of each entry point and its jobs."""
     for point in plugins.entry_points(plugins.SESSION_JOBS):
         session_jobs: SessionJobs = plugins.load(point)
         yield point.name, list(session_jobs(cast, session))
@@ -52,28 +52,28 @@ def running(cast: Cast, shells: Shells, session: str, *, sink: Sink) -> Iterator
     Args:
         cast: The robot in each role.
         shells: The robots.
-        session: Identifies the run of fieldkit.
-        sink: Receives the start of the jobs, and a note on each that did not exit successfully.
+        session: ID of the run of fieldkit.
+        sink: Receives the start of the jobs, and a note on each job that did not exit successfully.
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: A job did not start; the message has the end of its log.
+        RobotError: A job did not start. The message contains the end of the job's log.
     """
-    started: list[Planned] = []
+    started_jobs: list[Planned] = []
 
     def start(job: Planned) -> None:
         _start(cast, shells[job.role], job)
-        started.append(job)
+        started_jobs.append(job)
 
     try:
-        for name, jobs_of_package in _by_package(cast, session):
-            if jobs_of_package:
+        for name, package_jobs in _by_package(cast, session):
+            if package_jobs:
                 sink(PhaseStarted(f"start {name}"))
-                run_parallel(start, jobs_of_package)
+                run_parallel(start, package_jobs)
         yield
     finally:
-        errors = run_parallel(lambda job: _end(shells[job.role], job.job), started)
-        for job, error in zip(started, errors, strict=True):
+        errors = run_parallel(lambda job: _stop(shells[job.role], job.job), started_jobs)
+        for job, error in zip(started_jobs, errors, strict=True):
             if error:
                 sink(Note(f"the {job.job.name} on {cast[job.role].name} {error}"))
 
@@ -90,15 +90,15 @@ def _start(cast: Cast, shell: Shell, planned_job: Planned) -> None:
         ) from error
 
 
-def _end(shell: Shell, job: Job) -> str:
-    """Stop a job; return a description of what went wrong, empty if nothing did."""
+def _stop(shell: Shell, job: Job) -> str:
+    """Stop a job, and return a description of the problem, or an empty text if there was none."""
     try:
-        runs = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
+        was_running = any(f"{job.folder}/" in line for line in jobs.list_running(shell, Deadline.after(jobs.REPLY_S)))
         code = jobs.stop(shell, job, grace_s=_GRACE_S)
         evidence.discard(shell, job.folder.split("/")[-2])
     except TestbedLostError:
-        return ""  # it exited with its robot
+        return ""  # the job exited with its robot
     except FieldkitError as error:
         return f"was not stopped: {error.what}"
-    early = "" if runs else "early, "
+    early = "" if was_running else "early, "
     return f"exited {early}with exit code {code}" if code or early else ""

@@ -1,7 +1,7 @@
-"""Trials that a simulation reproduces: the same steps measure its evidence and the evidence of robots.
+"""Trials that a simulation reproduces. The steps that measure the evidence of robots also measure its evidence.
 
-The simulation writes captures of both ends and the output of ping as files of an attempt. Columns whose evidence it
-does not write are missing.
+The simulation writes captures of both ends and the output of ping as files of an attempt. Columns that need other
+evidence are missing.
 """
 
 import math
@@ -28,7 +28,7 @@ from fieldkit.trial.procedure import load_procedure
 from fieldkit.trial.request import TrialRequest, make_plan
 
 KINDS: Final = ("capture", "ping", "record", "transfer")
-"""Kinds of step that a simulation can reproduce; it reproduces only the size of a recording."""
+"""Kinds of step that a simulation can reproduce. Of a recording, it reproduces only the size."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +36,9 @@ class SimulatedRobot:
     """A robot of a simulation.
 
     Attributes:
-        name: Its name.
-        profile: Name of its robot profile.
-        address: Its IPv4 address in the captures.
+        name: Name of the robot.
+        profile: Name of the robot's profile.
+        address: IPv4 address of the robot in the captures.
     """
 
     name: str
@@ -48,15 +48,15 @@ class SimulatedRobot:
 
 @dataclass(frozen=True)
 class PlannedExchange:
-    """What the procedure sends under one protocol.
+    """Traffic of the procedure with one protocol: a transfer and a ping.
 
     Attributes:
         sender: Role that sends the file and the echo requests.
-        receiver: Role that receives them.
+        receiver: Role that receives the file and the echo requests.
         port: Port of the transfer.
         requests: Number of echo requests.
-        interval_s: Time between them.
-        payload_bytes: Their payload.
+        interval_s: Time between two echo requests in seconds.
+        payload_bytes: Payload of an echo request.
     """
 
     sender: Role
@@ -72,10 +72,10 @@ class SimulatedRepeat:
     """A repeat of a simulation.
 
     Attributes:
-        repeat: Its protocol and number.
-        status: Its status.
-        reason: The reason why it is not valid; empty if it is.
-        captures: Contents of the captures of sender and receiver; empty if the simulation has none.
+        repeat: Protocol and number of the repeat.
+        status: Status of the repeat.
+        reason: Reason why the repeat is not valid; empty if it is valid.
+        captures: Contents of the captures of sender and receiver; empty if the simulation has no captures.
         ping: Output of ping.
         values: Columns that the simulation provides without evidence.
     """
@@ -115,8 +115,8 @@ class SimulatedTrial:
         backend: str,
         seed: int,
     ) -> None:
-        loaded = load_procedure(procedure)
-        kinds = sorted({placed.kind for placed in loaded.walk()})
+        loaded_procedure = load_procedure(procedure)
+        kinds = sorted({placed.kind for placed in loaded_procedure.walk()})
         if other_kinds := set(kinds) - set(KINDS):
             raise ConfigurationError(
                 f"a simulation cannot reproduce the procedure {procedure}: it has {', '.join(sorted(other_kinds))}",
@@ -126,8 +126,8 @@ class SimulatedTrial:
             role: Robot(name=robot.name, address=robot.address, profile=load_profile(robot.profile))
             for role, robot in robots.items()
         }
-        request = TrialRequest(loaded, distance, topology, record_s=record_s, seed=seed)
-        # The time is only a part of the trial's name, which rows of simulations do not contain.
+        request = TrialRequest(loaded_procedure, distance, topology, record_s=record_s, seed=seed)
+        # The time is used only in the trial's name, which rows of simulations do not contain.
         self._plan = make_plan(request, backend=backend, cast=cast, now=datetime.fromtimestamp(0, UTC))
 
     @property
@@ -141,11 +141,11 @@ class SimulatedTrial:
         return self._plan.procedure.scenario
 
     def exchange(self, protocol: Protocol) -> PlannedExchange:
-        """Return what the procedure sends under a protocol.
+        """Return the traffic of the procedure with a protocol.
 
         Raises:
-            ConfigurationError: The procedure does not have exactly one transfer and one ping between the same
-                robots, or no capture of both.
+            ConfigurationError: The procedure does not have exactly one transfer and one ping between the same robots,
+                or the transfer is not captured on both robots.
         """
         transfers = [placed for placed in self._plan.procedure.walk() if isinstance(placed.step, TransferStep)]
         pings = [placed.step for placed in self._plan.procedure.walk() if isinstance(placed.step, PingStep)]
@@ -154,13 +154,13 @@ class SimulatedTrial:
             step = placed.step
             assert isinstance(step, TransferStep)
             ends = step.sender, step.receiver
-            captured = all(capture_around(placed.within, role) for role in ends)
-            if captured and ends == (ping_step.sender, ping_step.receiver):
+            is_captured = all(capture_around(placed.within, role) for role in ends)
+            if is_captured and ends == (ping_step.sender, ping_step.receiver):
                 payload_bytes = ping_step.payload_of(protocol)
                 return PlannedExchange(*ends, step.port, ping_step.count, ping_step.interval, payload_bytes)
         raise ConfigurationError(
             f"a simulation cannot reproduce the procedure {self._plan.procedure.name}",
-            remedy="it needs one transfer and one ping between two robots, and a capture of both around the transfer",
+            remedy="it needs one transfer and one ping between two robots, and captures on both around the transfer",
         )
 
     def row(self, simulated: SimulatedRepeat, identity: Mapping[str, Value]) -> Row:
@@ -192,7 +192,7 @@ class SimulatedTrial:
 
 
 def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]) -> str:
-    """Return a text on the columns whose values in evidence and simulation differ; empty if there are none."""
+    """Return a text on the columns with different values in evidence and simulation; empty if there are none."""
     same_names = {"received_bytes": "tcp_received_bytes", "sent_bytes": "tcp_unique_bytes"}
     pairs = list(known_values.items())
     pairs += [(same_names[name], value) for name, value in known_values.items() if name in same_names]
@@ -207,7 +207,7 @@ def differences(measured: Mapping[str, Value], known_values: Mapping[str, Value]
 
 
 def _goodput(row: Mapping[str, Value]) -> dict[str, Value]:
-    """Return the goodput as `rates` defines it; a first packet that is a whole datagram is not counted."""
+    """Return the goodput as defined in `rates`: if the first packet is a whole datagram, it is not counted."""
     received_bytes, completion_s = row.get("received_bytes"), row.get("completion_s")
     if not isinstance(received_bytes, int) or not isinstance(completion_s, float) or completion_s <= 0:
         return {}

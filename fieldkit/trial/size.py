@@ -1,4 +1,4 @@
-"""Estimate the disk space that the evidence of a trial needs."""
+"""Estimates of the disk space that the evidence of a trial needs."""
 
 from typing import Final
 
@@ -7,20 +7,23 @@ from fieldkit.steps.capabilities import ReservesSpace, UsesSpace
 from fieldkit.trial.plan import Plan
 
 SPARE: Final = 2.0
-"""Factor by which evidence may exceed the estimate, because repeats are repeated and segments are retransmitted."""
+"""Factor by which evidence may exceed the estimate, because attempts are repeated and segments are retransmitted."""
 
 RESERVE_BYTES: Final = 100 << 20
 """Bytes that a trial leaves free on every disk for other data."""
 
 FETCHED_BYTES_PER_S: Final = 2.5e6
-"""Assumed transfer rate of evidence: TCP over a good 802.11n link with one stream in 20 MHz has about 20 Mbit/s."""
+"""Assumed transfer rate of evidence. TCP over a good 802.11n link with one stream in 20 MHz has about 20 Mbit/s."""
 
-# Host state before and after, logs and the output of ping; about 20 kB on a robot with Wi-Fi.
+# Size of the host states before and after, logs, and the output of ping: about 20 kB on a robot with Wi-Fi.
 _TEXT_BYTES: Final = 100_000
 
 
 def evidence_bytes(plan: Plan, role: Role) -> int:
-    """Return the estimated bytes that one attempt leaves on the robot in `role`, times `SPARE`; 0 without a step."""
+    """Return the estimated number of bytes that one attempt leaves on the robot in `role`, times `SPARE`.
+
+    The result is 0 if no step uses the robot.
+    """
     if role not in plan.procedure.roles():
         return 0
     scene = plan.scenes()[0]
@@ -30,7 +33,7 @@ def evidence_bytes(plan: Plan, role: Role) -> int:
 
 
 def attempt_bytes(plan: Plan) -> int:
-    """Return the estimated bytes that one attempt leaves on the laptop, times `SPARE`."""
+    """Return the estimated number of bytes that one attempt leaves on the laptop, times `SPARE`."""
     return sum(evidence_bytes(plan, role) for role in plan.cast) + plan.lab_bytes
 
 
@@ -47,5 +50,5 @@ def reserve_bytes(plan: Plan, role: Role) -> int:
 
 
 def trial_bytes(plan: Plan) -> int:
-    """Return the estimated bytes that the whole trial leaves on the laptop, times `SPARE`."""
+    """Return the estimated number of bytes that the whole trial leaves on the laptop, times `SPARE`."""
     return attempt_bytes(plan) * plan.repeats * len(plan.protocols)

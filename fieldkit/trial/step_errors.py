@@ -1,4 +1,4 @@
-"""Errors in the code of a step kind: one line for the operator, and the traceback in a log that the line names."""
+"""Errors in the code of a step kind: a message for the operator, and a log with the traceback, which it names."""
 
 import errno
 import tempfile
@@ -19,11 +19,11 @@ _DISK_ERRORS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.
 
 
 class StepError(RobotError):
-    """A kind of step raised an exception that is not one of fieldkit's errors; another attempt would raise it again.
+    """A kind of step raised an exception other than fieldkit's errors. Another attempt would raise it again.
 
     Args:
-        what: The exception in one line.
-        traceback_text: Its traceback.
+        what: Description of the exception in one line.
+        traceback_text: Traceback of the exception.
     """
 
     def __init__(self, what: str, traceback_text: str) -> None:
@@ -32,16 +32,16 @@ class StepError(RobotError):
 
 
 class StepErrors:
-    """The exceptions that steps raised on the evidence of an attempt."""
+    """Exceptions that steps raised while the evidence of an attempt was measured."""
 
     def __init__(self) -> None:
         self.tracebacks: list[str] = []
 
     def add(self, what: str, error: Exception) -> str:
-        """Add an exception and return its line.
+        """Add an exception and return its description in one line.
 
         Args:
-            what: The action that failed: `the evidence of the step ping cannot be measured`.
+            what: The failed action, for example `the evidence of the step ping cannot be measured`.
             error: The exception.
         """
         self.tracebacks.append("".join(traceback.format_exception(error)))
@@ -50,12 +50,12 @@ class StepErrors:
 
 @contextmanager
 def during_attempt(kind: str) -> Iterator[None]:
-    """Run the body; convert an exception that a kind of step does not handle.
+    """Run the body, and convert exceptions that a kind of step does not handle.
 
-    Errors of fieldkit, of this machine's memory and disk, and interrupts pass through.
+    Errors of fieldkit, errors of this machine's memory and disk, and interrupts are not converted.
 
     Args:
-        kind: The kind of the outermost step in the body.
+        kind: Kind of the outermost step in the body.
 
     Raises:
         StepError: The body raised another exception.
@@ -73,10 +73,12 @@ def during_attempt(kind: str) -> Iterator[None]:
 
 @contextmanager
 def before_trial(what: str) -> Iterator[None]:
-    """Run the body, which calls a step before there is a folder for its errors; errors of fieldkit pass through.
+    """Run the body, which calls a step before the folder of an attempt exists, and convert exceptions of the step.
+
+    Errors of fieldkit are not converted.
 
     Args:
-        what: The action: `the commands of the step route cannot be derived`.
+        what: The failed action, for example `the commands of the step route cannot be derived`.
 
     Raises:
         ConfigurationError: The body raised another exception. The message names a file with the traceback.

@@ -1,4 +1,4 @@
-"""Packages of step kinds that do not ship with fieldkit; their versions and code hashes are part of a plan."""
+"""Packages of step kinds that do not ship with fieldkit. A plan contains their versions and code hashes."""
 
 import hashlib
 from collections.abc import Iterable
@@ -14,12 +14,12 @@ _HASH_DIGITS: Final = 16
 
 
 class StepPackage(Strict):
-    """The package that a kind of step comes from.
+    """The package that contains a kind of step.
 
     Attributes:
-        package: Its name.
-        version: Its version.
-        code_sha256: Hash over the Python files of its top-level module; empty if there are none.
+        package: Name of the package.
+        version: Version of the package.
+        code_sha256: Hash of the Python files of its top-level module; empty if there are no such files.
     """
 
     package: str
@@ -40,7 +40,7 @@ def packages_of_kinds(names: Iterable[str]) -> dict[str, StepPackage]:
 
 
 def _code_hash(module: str) -> str:
-    """Return the hash over the names and contents of the Python files of a module's top-level package."""
+    """Return the hash of the names and contents of the Python files of a module's top-level package."""
     spec = find_spec(module.partition(".")[0])
     if spec is None:
         return ""

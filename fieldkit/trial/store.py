@@ -1,4 +1,4 @@
-"""A trial's folder: file names, plan, and folders of attempts, which are synced before they are renamed."""
+"""A trial's folder: file names, plan, and folders of attempts. Folders are synced before they are renamed."""
 
 import shutil
 import tempfile
@@ -22,7 +22,7 @@ POSITIONS: Final = "positions-"
 
 
 def prepare(out: Path) -> None:
-    """Create the folder for trials; called before any robot is used.
+    """Create the folder for trials. This is done before robots are used.
 
     Raises:
         ConfigurationError: The folder cannot be created or written.
@@ -40,7 +40,7 @@ def create(out: Path, plan: Plan) -> Path:
     """Create the folder of a new trial and write its plan.
 
     Raises:
-        ConfigurationError: `out` cannot be written, or the trial exists.
+        ConfigurationError: `out` cannot be written, or the trial already exists.
     """
     folder = out / plan.trial
     content = schema.dump(plan).encode()
@@ -56,21 +56,21 @@ def create(out: Path, plan: Plan) -> Path:
 
 
 def attempt_folder(folder: Path, name: str) -> Path:
-    """Return the evidence folder of an attempt; `folder` is the trial's folder, `name` is `Attempt.folder`."""
+    """Return the evidence folder of an attempt. `folder` is the trial's folder, `name` is `Attempt.folder`."""
     return folder / REPEATS / name
 
 
 def open_attempt(folder: Path, repeat: RepeatId) -> Path:
-    """Return an empty folder for an attempt's evidence; remains of an interrupted attempt are removed."""
-    partial = _partial(folder, repeat)
+    """Create and return an empty folder for an attempt's evidence. Files of an interrupted attempt are removed."""
+    partial = _partial_folder(folder, repeat)
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
     return partial
 
 
 def reopen_attempt(folder: Path, repeat: RepeatId) -> Path:
-    """Return the folder of an attempt whose evidence is fetched again; partially fetched files are kept in it."""
-    partial = _partial(folder, repeat)
+    """Return the folder of an attempt whose evidence is fetched again. Partially fetched files are kept in it."""
+    partial = _partial_folder(folder, repeat)
     partial.mkdir(exist_ok=True)
     for path in partial.iterdir():
         if path.is_dir():
@@ -80,17 +80,17 @@ def reopen_attempt(folder: Path, repeat: RepeatId) -> Path:
     return partial
 
 
-def _partial(folder: Path, repeat: RepeatId) -> Path:
+def _partial_folder(folder: Path, repeat: RepeatId) -> Path:
     return attempt_folder(folder, f".{repeat}.partial")
 
 
 def is_partial(path: Path) -> bool:
-    """Return True if a file of an attempt's folder was not fetched completely."""
+    """Return True if a file in an attempt's folder was only partially fetched."""
     return path.name.startswith(".")
 
 
 def commit_attempt(partial: Path, name: str) -> Path:
-    """Sync an attempt's files to disk and give its folder the final name; partially fetched files are removed."""
+    """Sync an attempt's files to disk and rename its folder to `name`. Partially fetched files are removed."""
     for path in filter(is_partial, list(partial.iterdir())):
         path.unlink()
     files.sync((partial, *partial.rglob("*")))
@@ -100,8 +100,10 @@ def commit_attempt(partial: Path, name: str) -> Path:
     return final
 
 
-def unjournalled_attempt(folder: Path, names: Iterable[str]) -> Path | None:
-    """Return the committed folder of an attempt whose journal entry is missing after a kill, or None.
+def find_committed_attempt(folder: Path, names: Iterable[str]) -> Path | None:
+    """Return the folder of an attempt that was renamed before fieldkit was killed, or None if there is none.
+
+    The journal lacks the entry of such an attempt.
 
     Args:
         folder: The trial's folder.
@@ -119,7 +121,7 @@ def require_space(folder: Path, needed_bytes: int) -> None:
     free_bytes = files.free_bytes(folder)
     if free_bytes < needed_bytes:
         raise ConfigurationError(
-            f"{free_bytes >> 20} MiB are free on this machine, an attempt needs {needed_bytes >> 20} MiB",
+            f"{free_bytes >> 20} MiB are free on this machine, but an attempt needs {needed_bytes >> 20} MiB",
             where=str(folder),
             remedy=f"free some space, then: {shell_command('fieldkit', 'resume', folder)}",
         )

@@ -1,1 +1,1 @@
-"""Events of the network emulator EMANE (1.5): a run publishes them, or follows them."""
+"""Events of the network emulator EMANE (1.5): a run can publish or follow them."""

@@ -32,7 +32,7 @@ def _membership(group: str, device: str | None) -> bytes:
     return _MREQN.pack(socket.inet_aton(group), bytes(4), index)
 
 
-def _unusable(channel: str, device: str | None, error: OSError) -> ConfigurationError:
+def _channel_error(channel: str, device: str | None, error: OSError) -> ConfigurationError:
     where = channel if device is None else f"{channel} on {device}"
     return ConfigurationError(
         f"EMANE's event channel {where} cannot be used: {error.strerror}",
@@ -86,7 +86,7 @@ class EventPublisher:
         try:
             self._socket.sendto(datagram, self._address)
         except OSError as error:
-            raise _unusable(self._name, self._device, error) from error
+            raise _channel_error(self._name, self._device, error) from error
 
     def close(self) -> None:
         """Close the socket."""
@@ -114,13 +114,13 @@ class EventListener:
             self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, _membership(group, device))
         except OSError as error:
             self._socket.close()
-            raise _unusable(channel, device, error) from error
+            raise _channel_error(channel, device, error) from error
         except BaseException:
             self._socket.close()
             raise
 
     def receive(self, limit_s: float) -> Sequence[SerializedEvent] | None:
-        """Return the events of the next datagram; None if there is none until a time.
+        """Return the events of the next datagram, or None if none arrives before a time.
 
         Args:
             limit_s: The time, on the clock of `time.monotonic`.

@@ -115,7 +115,7 @@ class EventDatagram:
         """Return the encoded bytes.
 
         Raises:
-            ValueError: It is too large, or a number is invalid.
+            ValueError: The datagram is too large, or a number is invalid.
         """
         serializations = b"".join(
             bytes_field(
@@ -141,11 +141,11 @@ class EventDatagram:
         publisher = as_bytes(values[1])
         if len(publisher) != _UUID_BYTES:
             raise MalformedEventError(f"the publisher's identifier has {len(publisher)} bytes")
-        events = [_serialized(content) for field, content in fields(as_bytes(values[3])) if field == 1]
+        events = [_decode_event(content) for field, content in fields(as_bytes(values[3])) if field == 1]
         return EventDatagram(publisher, as_integer(values[2]), events)
 
 
-def _serialized(content: Value) -> SerializedEvent:
+def _decode_event(content: Value) -> SerializedEvent:
     values = fields_by_number(as_bytes(content), (1, 2, 3))
     return SerializedEvent(as_integer(values[1], 1 << 32), as_integer(values[2], 1 << 32), as_bytes(values[3]))
 
@@ -178,10 +178,10 @@ def decode_locations(content: bytes) -> list[NemLocation]:
     Raises:
         MalformedEventError: The bytes are not a `LocationEvent`, or a number is not finite.
     """
-    return [_location(as_bytes(value)) for field, value in fields(content) if field == 1]
+    return [_decode_location(as_bytes(value)) for field, value in fields(content) if field == 1]
 
 
-def _location(content: bytes) -> NemLocation:
+def _decode_location(content: bytes) -> NemLocation:
     values = fields_by_number(content, (1, 2))
     position = _three_numbers(as_bytes(values[2]))
     velocity = EmaneVelocity(*_three_numbers(as_bytes(values[3]))) if 3 in values else None

@@ -1,4 +1,4 @@
-"""Positions east, north, up of a reference point, and geodetic positions on WGS 84 (NIMA TR8350.2)."""
+"""Conversions between positions east, north, up of a reference point and geodetic positions on WGS 84 (TR8350.2)."""
 
 import math
 from typing import Final
@@ -34,7 +34,7 @@ class LocalFrame:
         """Return the geodetic position of a position east, north, up."""
         x, y, z = (
             self._origin_m[axis]
-            + sum(metres * unit[axis] for metres, unit in zip(position_m, self._axes, strict=True))
+            + sum(metres * local_axis[axis] for metres, local_axis in zip(position_m, self._axes, strict=True))
             for axis in range(3)
         )
         across_m = math.hypot(x, y)
@@ -45,7 +45,7 @@ class LocalFrame:
             if abs(latitude - before) < _CONVERGED_RAD:
                 break
         sin, cos = math.sin(latitude), math.cos(latitude)
-        # Valid at the poles as well as at the equator.
+        # This formula is valid at the poles as well as at the equator.
         height_m = across_m * cos + z * sin - _A_M * math.sqrt(1 - _E2 * sin * sin)
         return math.degrees(latitude), math.degrees(math.atan2(y, x)), height_m
 
@@ -54,7 +54,7 @@ class LocalFrame:
         ecef_m = _ecef_m(math.radians(place[0]), math.radians(place[1]), place[2])
         offset_m = [metres - origin_m for metres, origin_m in zip(ecef_m, self._origin_m, strict=True)]
         east_m, north_m, up_m = (
-            sum(metres * share for metres, share in zip(offset_m, unit, strict=True)) for unit in self._axes
+            sum(metres * component for metres, component in zip(offset_m, axis, strict=True)) for axis in self._axes
         )
         return east_m, north_m, up_m
 
@@ -83,9 +83,9 @@ def emane_velocity(velocity_m_s: Vector) -> EmaneVelocity:
 def velocity_m_s(velocity: EmaneVelocity) -> Vector:
     """Return a velocity as metres per second east, north, up."""
     azimuth, elevation = math.radians(velocity.azimuth_deg), math.radians(velocity.elevation_deg)
-    level_m_s = velocity.speed_m_s * math.cos(elevation)
+    horizontal_m_s = velocity.speed_m_s * math.cos(elevation)
     return (
-        level_m_s * math.sin(azimuth),
-        level_m_s * math.cos(azimuth),
+        horizontal_m_s * math.sin(azimuth),
+        horizontal_m_s * math.cos(azimuth),
         velocity.speed_m_s * math.sin(elevation),
     )

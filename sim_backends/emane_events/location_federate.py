@@ -39,7 +39,7 @@ class EmaneLocations:
 
     Attributes:
         step_ns: See `PhysicsFederate`.
-        limits_m_s2: See `PhysicsFederate`; unknown, as events may contain any location.
+        limits_m_s2: See `PhysicsFederate`; infinite, because events may contain any location.
         waited_s: Total time that it has waited, in seconds of wall time.
         path_losses_db: See `PhysicsFederate`. Like EMANE's receivers, it uses the forward loss in the events for a
             NEM, which is the path loss from the other NEM to this NEM, and ignores the reverse loss.
@@ -70,20 +70,20 @@ class EmaneLocations:
 
         Raises:
             FederateError: An agent has a command.
-            UnansweredError: There is no location of an agent in time.
+            UnansweredError: No location of an agent has arrived in time.
         """
         if commands:
             raise FederateError(
                 f"the physics emane does not move robots, and {', '.join(commands)} has a command",
                 remedy="remove the motion of the agents from the scenario",
             )
-        begun_s = time.monotonic()
+        start_s = time.monotonic()
         if self._started_s is None:
-            self._wait_for_all(begun_s + self._options.wait)
+            self._wait_for_all(start_s + self._options.wait)
             self._started_s = time.monotonic()
         while (events := self._listener.receive(self._started_s + to_ns / 1e9)) is not None:
             self._apply(events)
-        self.waited_s += time.monotonic() - begun_s
+        self.waited_s += time.monotonic() - start_s
         return dict(self._states)
 
     def close(self) -> None:

@@ -13,7 +13,7 @@ from sim_backends.federates.simulator_options import SimulatorOptions
 from sim_backends.world.obstacles import Real
 
 
-def _checked_channel(text: str) -> str:
+def _check_channel(text: str) -> str:
     split_channel(text)
     return text
 
@@ -49,7 +49,7 @@ class EmaneOptions(SimulatorOptions):
         wait: Maximum wait for the first location of each agent, if the run follows events.
     """
 
-    channel: Annotated[str, AfterValidator(_checked_channel)] = "224.1.2.8:45703"
+    channel: Annotated[str, AfterValidator(_check_channel)] = "224.1.2.8:45703"
     device: str | None = None
     nems: dict[str, Annotated[Int, Field(ge=1, le=MAX_NEM)]] = Field(default_factory=dict)
     reference: tuple[
@@ -68,7 +68,7 @@ class EmaneOptions(SimulatorOptions):
         """Return the NEM identifier of each agent.
 
         Raises:
-            ValueError: An agent has none, or two agents have the same.
+            ValueError: An agent has no identifier, or two agents have the same identifier.
         """
         names = list(agents)
         if not self.nems:

@@ -19,7 +19,7 @@ def varint_bytes(number: int) -> bytes:
     """Return a number as a varint.
 
     Raises:
-        ValueError: It is negative or above 2^64 - 1.
+        ValueError: The number is negative or above 2^64 - 1.
     """
     if not 0 <= number < 1 << 64:
         raise ValueError(f"{number} is not an unsigned integer of 64 bits")
@@ -52,36 +52,36 @@ def bytes_field(field: int, content: bytes) -> bytes:
 
 
 def fields(message: bytes) -> Iterator[tuple[int, Value]]:
-    """Yield the number and the value of each field; values of fixed size as bytes.
+    """Yield the number and the value of each field. Values of fixed size are returned as bytes.
 
     Raises:
         MalformedEventError: A field is longer than the message, or has a type that is not supported.
     """
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
+    offset = 0
+    while offset < len(message):
+        key, offset = _varint(message, offset)
         field, kind = key >> 3, key & 7
         if kind == VARINT:
-            number, at = _varint(message, at)
+            number, offset = _varint(message, offset)
             yield field, number
             continue
         if kind == BYTES:
-            size, at = _varint(message, at)
+            size, offset = _varint(message, offset)
         elif kind in {FIXED64, FIXED32}:
             size = 8 if kind == FIXED64 else 4
         else:
             raise MalformedEventError(f"field {field} has the type {kind}")
-        if size > len(message) - at:
+        if size > len(message) - offset:
             raise MalformedEventError(f"field {field} of {size} bytes is longer than its message")
-        yield field, message[at : at + size]
-        at += size
+        yield field, message[offset : offset + size]
+        offset += size
 
 
 def fields_by_number(message: bytes, required: tuple[int, ...]) -> dict[int, Value]:
-    """Return the fields of a message; the last one, if a field is repeated.
+    """Return the values of the fields of a message by number; the last value, if a field is repeated.
 
     Raises:
-        MalformedEventError: As for `fields`, or a required field is missing.
+        MalformedEventError: See `fields`; or a required field is missing.
     """
     values = dict(fields(message))
     missing = [field for field in required if field not in values]
@@ -125,10 +125,10 @@ def as_real(value: Value) -> float:
     return float(number)
 
 
-def _varint(message: bytes, at: int) -> tuple[int, int]:
+def _varint(message: bytes, offset: int) -> tuple[int, int]:
     number = 0
-    for shift, byte in enumerate(message[at : at + _MAX_VARINT_BYTES]):
+    for shift, byte in enumerate(message[offset : offset + _MAX_VARINT_BYTES]):
         number |= (byte & 0x7F) << 7 * shift
         if byte < 0x80:
-            return number & (1 << 64) - 1, at + shift + 1
+            return number & (1 << 64) - 1, offset + shift + 1
     raise MalformedEventError("a varint has no end")

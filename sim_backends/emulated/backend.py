@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 DEFAULT_SITE: Final = Path(__file__).with_name("default.yaml")
 
-# Measured on 2 cores: from the start of three robots until they publish topics.
+# Measured on 2 cores: time from the start of three robots until they publish topics.
 _START_S: Final = {RosChoice.BUILTIN: 0.5, RosChoice.DEBIAN: 1.0}
 
 
@@ -149,7 +149,7 @@ class EmulatedBackend:
     @property
     def lab_bytes(self) -> int:
         """Implement `Backend.lab_bytes`: fixed links have no transmission attempts to record."""
-        if not self._options.record_air or self._options.radio.fixed:
+        if not self._options.record_air or self._options.radio.is_fixed:
             return 0
         from sim_backends.emulated.medium.air_log import LIMIT_BYTES  # noqa: PLC0415 (random streams of numpy: 20 ms)
 

@@ -61,7 +61,7 @@ class RobotOptions(Strict):
     scripts: dict[ScriptName, str] = Field(default_factory=dict)
 
     def programs(self) -> set[str]:
-        """Return the programs that this machine must have for these variants, besides those that every lab needs."""
+        """Return the programs that these variants need on this machine, in addition to those that every lab needs."""
         programs = {"dropbear", "dropbearconvert"} if self.ssh == "dropbear" else set()
         if self.netcat is not None:
             programs.add(NETCATS[self.netcat])
@@ -155,13 +155,13 @@ class EmulatedOptions(Strict):
             fixes the links.
         links: The medium of each [further link](links.md) of the profiles, by the link's name, with the keys of
             `radio`: `{cell: {rate: 20Mbit/s, delay: 40ms, loss: 1%}}`.
-        late_bound: A repeat is void if a packet was delayed by the emulator itself by more than this in total, before
-            and after the radio model.
+        late_bound: Maximum additional delay of a packet by the emulator, before and after the radio model in total.
+            If it is exceeded, the repeat is void.
         record_air: True to write every transmission attempt and ACK to `air.pcap` and `air.csv` of each repeat;
             fixed links have none.
         boot: Time for which a robot that reboots is off before its programs start.
         mesh: Robots forward packets for each other, and a routing daemon on each finds the routes: [a mesh](mesh.md).
-        physics: The robots move [on the co-simulation](lab-cosim.md), by this physics: `kinematic`, `mujoco` or
+        physics: The robots move [on the co-simulation](lab-cosim.md), moved by this physics: `kinematic`, `mujoco` or
             `gazebo`. If only `network` is given, `kinematic`. `gazebo` refuses drones with an autopilot.
         network: The network of the co-simulation: `builtin` or `ns3`. If only `physics` is given, `builtin`.
         sync: The sync policy between physics and network: its name, or name and parameters. The default is
@@ -222,15 +222,15 @@ class EmulatedOptions(Strict):
 
     @schema.model_validator(mode="after")
     def _check_wifi(self) -> "EmulatedOptions":
-        excluded = {
+        excluded_options = {
             "physics": self.physics,
             "network": self.network,
             "mesh": self.mesh,
             "record_air": self.record_air,
             "links": self.links,
-            "radio": self.radio.fixed,
+            "radio": self.radio.is_fixed,
         }
-        for key, value in excluded.items():
+        for key, value in excluded_options.items():
             if self.has_linux_wifi and value:
                 name = "a fixed link (loss, delay, rate or jitter)" if key == "radio" else f"`{key}`"
                 raise schema.validation_error(f"`wifi: linux` cannot be combined with {name}", key)

@@ -131,8 +131,8 @@ class EmulatedLab:
         if before is None:
             return None
         now, bound_ns = self._running.medium.stats(), round(self._options.late_bound * 1e9)
-        packets = _new_counts(before.late, now.late)
-        windows = _new_counts(before.late_windows, now.late_windows)
+        packets = _new_counts(before.packet_lateness_counts, now.packet_lateness_counts)
+        windows = _new_counts(before.window_lateness_counts, now.window_lateness_counts)
         return LabLateness(
             bound_s=self._options.late_bound,
             packet_max_s=max(packets) / 1e9 if packets else None,
@@ -190,16 +190,16 @@ def overview(
     )
     channel.move(0, places_m)
     names = list(members)
-    pairs = [] if options.radio.fixed else list(combinations(range(len(names)), 2))
+    pairs = [] if options.radio.is_fixed else list(combinations(range(len(names)), 2))
     first, second = (np.array([places_m[names[pair[end]]] for pair in pairs]).reshape(-1, 3) for end in (0, 1))
     links = [
         LabLink(
             (names[first_index], names[second_index]),
             min(channel.snr_db(first_index, second_index), channel.snr_db(second_index, first_index)),
             channel.are_linked(first_index, second_index),
-            tuple(dict.fromkeys(crossing.obstacle for crossing in crossed)),
+            tuple(dict.fromkeys(crossing.obstacle for crossing in crossings)),
         )
-        for (first_index, second_index), crossed in zip(pairs, world.crossings(first, second), strict=True)
+        for (first_index, second_index), crossings in zip(pairs, world.crossings(first, second), strict=True)
     ]
     parts = sorted(world.parts, key=lambda part: part.shape.top_m)
     outlines = [Outline(part.material, part.shape.corners_m()) for part in parts]

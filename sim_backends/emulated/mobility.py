@@ -251,8 +251,8 @@ class Mobility:
             for start_ns, motion in self._motions:
                 states |= motion.at(now_ns - start_ns)
             states |= {
-                self._cast[role].name: self._self_steered_state(role, steered)
-                for role, steered in self._self_steered_motions().items()
+                self._cast[role].name: self._self_steered_state(role, motion)
+                for role, motion in self._self_steered_motions().items()
             }
             relay = places.relay(self._cast, placement)
             if self._laptop is not None:
@@ -279,10 +279,10 @@ class Mobility:
             if before is None or (before.position_m, before.velocity_m_s) != now:
                 self._track.append(TrackPoint(utc_ns, role, *now))
 
-    def _self_steered_state(self, role: Role, steered: RecordedMotion) -> State:
+    def _self_steered_state(self, role: Role, motion: RecordedMotion) -> State:
         """Return the state of a robot that steers itself; a ground robot is at the height of the ground."""
         flies = mavlink_of(self._cast[role].profile) is not None
-        return steered.state if flies else places.on_ground(steered.state, self._world)
+        return motion.state if flies else places.on_ground(motion.state, self._world)
 
     def _next_update_s(self, now_ns: int, states: Mapping[str, State]) -> float | None:
         remaining_ns = [

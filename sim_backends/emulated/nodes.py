@@ -175,8 +175,8 @@ class EmulatedRobot(Node):
 
     def build(self) -> None:
         """Give the robot its host name and its file system. Raises the errors of `open_radio`."""
-        shared = () if self._places_fd is None else (self._places_fd,)
-        _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared)
+        shared_fds = () if self._places_fd is None else (self._places_fd,)
+        _, (fd, *others) = self._worker.request({"do": "build", "robot": asdict(self.spec)}, descriptors=shared_fds)
         self._record = MotionRecord(fd)
         self.physics_fds = (fd, *others) if others else ()
 

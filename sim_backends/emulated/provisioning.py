@@ -232,12 +232,14 @@ def _prefix_length(interface: str) -> int:
     return 32 if interface == LOOPBACK_INTERFACE else NETWORK.prefixlen
 
 
-def _base(profile: RobotProfile, *, simulated: bool) -> Base | None:
+def _base(profile: RobotProfile, *, is_simulated: bool) -> Base | None:
     drive = drive_of(profile)
     if drive is None:
         return None
     limits = profile.limits
-    return Base(drive.topic, drive.type, limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s, simulated)
+    return Base(
+        drive.topic, drive.type, limits.max_speed_m_s, drive.acceleration_m_s2, drive.turn_rad_s, is_simulated
+    )
 
 
 def _ros2_spec(
@@ -327,7 +329,7 @@ def robot_spec(
         autopilot=mavlink.autopilot if mavlink else "px4",
         system=mavlink.system if mavlink else 1,
         boot_s=float(mavlink.boot_s) if mavlink else 0.0,
-        base=_base(robot.profile, simulated=options.is_cosimulated)
+        base=_base(robot.profile, is_simulated=options.is_cosimulated)
         if has_debian_ros1 or ros2_over_radio is not None
         else None,
         mesh_hello_s=None if options.mesh is None else options.mesh.hello,

@@ -56,8 +56,8 @@ def check(programs: Iterable[str] = (), *, needs_tun: bool = True) -> None:
         ConfigurationError: A permission or a program is missing.
     """
     package_of = PACKAGE_OF if namespaces.is_root() else PACKAGE_OF | ORDINARY_PACKAGE_OF
-    needed = dict.fromkeys((*package_of, *sorted(programs)))
-    missing = [program for program in needed if shutil.which(program, path=PATH) is None]
+    required_programs = dict.fromkeys((*package_of, *sorted(programs)))
+    missing = [program for program in required_programs if shutil.which(program, path=PATH) is None]
     if missing:
         packages = sorted({(package_of | VARIANT_PACKAGE_OF)[program] for program in missing})
         as_root = "" if namespaces.is_root() else "sudo "

@@ -98,7 +98,7 @@ def _network(options: EmulatedOptions) -> str:
     if name == BUILTIN:
         return name
     for is_set, key in (
-        (options.radio.fixed, "fixed links under radio"),
+        (options.radio.is_fixed, "fixed links under radio"),
         (options.radio.has_infrastructure, f"{', '.join(INFRASTRUCTURE)} under radio"),
         (options.record_air, "record_air"),
         (options.mesh is not None, "mesh"),

@@ -70,7 +70,7 @@ class EmulatedOracle:
 
     def lateness(self) -> Lateness:
         """Implement `Oracle.lateness`."""
-        windows = self._medium.stats().late_windows if self._has_windows else None
+        windows = self._medium.stats().window_lateness_counts if self._has_windows else None
         return Lateness(
             bound_ns=round(self._late_bound_s * 1e9), packets=self._media.lateness_counts(), windows=windows
         )
@@ -276,5 +276,5 @@ def _shell(
         private_key=running.private_key,
         patience_s=patience_s,
         notice=notice,
-        on_air=laptop is not None,
+        crosses_radio=laptop is not None,
     )

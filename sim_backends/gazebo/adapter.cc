@@ -31,7 +31,7 @@ class Federate
         }
     }
 
-    // Stop the robots at the end of the run, and restore the models. False if Gazebo did not do it.
+    // Stop the robots at the end of the run, and restore the models. Returns false if Gazebo has refused a request.
     bool Stop()
     try
     {
@@ -75,7 +75,7 @@ class Federate
         m_heartbeat.Send(0); // the first use of Gazebo Transport takes some time
         std::vector<Agent> agents = AgentsOf(hello, configuration.at("scenario").at("agents"), options);
         m_world = std::make_unique<LockStep>(std::move(options), std::move(agents), m_heartbeat);
-        m_world->Begin();
+        m_world->Start();
         welcome.step_ns = m_world->StepNs();
         welcome.configuration_hash = hello.configuration_hash;
         welcome.name = "gazebo";
@@ -108,7 +108,7 @@ class Federate
         int64_t step_ns = m_world->StepNs();
         if (!request.commands.empty())
         {
-            ApplyPending(request.from_ns); // earlier commands apply until then
+            ApplyPending(request.from_ns); // earlier commands are valid until this time
             m_pending.insert(m_pending.end(), request.commands.begin(), request.commands.end());
             m_pendingStep = (request.from_ns + step_ns - 1) / step_ns;
         }
@@ -133,7 +133,7 @@ class Federate
         return protocol::StatesBody(to_ns - to_ns % step_ns, states);
     }
 
-    // Apply the commands that wait for a step, if it is before a time or begins at it.
+    // Apply the pending commands, if their step starts at or before a time.
     void ApplyPending(int64_t to_ns)
     {
         if (m_pending.empty() || m_pendingStep > to_ns / m_world->StepNs())

@@ -19,7 +19,7 @@ struct Agent
     Vector antenna; // in the axes of the model, from its origin
     Vector start;   // start position of the model
     double start_yaw = 0;
-    protocol::Command command; // the command that applies now
+    protocol::Command command; // the current command
     Pose pose;
     Vector velocity;
     int64_t appears_ns = 0, disappears_ns = -1; // -1 for never
@@ -66,13 +66,13 @@ inline std::vector<Agent>
 AgentsOf(const protocol::Hello& hello, const Json& plans, const Options& options)
 {
     std::vector<Agent> agents;
-    for (const protocol::Agent& announced : hello.agents)
+    for (const protocol::Agent& hello_agent : hello.agents)
     {
         Agent agent;
-        agent.name = announced.name;
-        agent.flies = announced.flies;
-        agent.antenna.z = announced.antenna_m;
-        double heading = announced.start.heading_rad;
+        agent.name = hello_agent.name;
+        agent.flies = hello_agent.flies;
+        agent.antenna.z = hello_agent.antenna_m;
+        double heading = hello_agent.start.heading_rad;
         agent.start_yaw = std::isnan(heading) ? 0 : heading;
         auto model = options.models.find(agent.name);
         agent.model = model == options.models.end() ? agent.name : model->second;
@@ -82,7 +82,7 @@ AgentsOf(const protocol::Hello& hello, const Json& plans, const Options& options
             const auto& [x, y, z] = origin->second;
             agent.antenna = agent.antenna + Vector{x, y, z};
         }
-        const auto& position_m = announced.start.position_m;
+        const auto& position_m = hello_agent.start.position_m;
         Vector start{position_m[0], position_m[1], position_m[2]};
         agent.start = start - Pose::WithYaw(agent.start_yaw).Rotated(agent.antenna);
         agent.pose = agent.Start();

@@ -38,7 +38,7 @@ class Connection
         m_monitor.Wait(
             lock, [&] { return WorldMonitor::Unlocked(lock, [&] { return HasService(control); }); },
             [&] { return "the service " + control + " has not been found (" + ListWorlds() + ")"; });
-        m_monitor.is_there = [this, control] { return HasService(control); };
+        m_monitor.is_available = [this, control] { return HasService(control); };
         m_monitor.Wait(
             lock, [&] { return m_monitor.clock_ns >= 0; },
             [] { return std::string("its clock has not been received"); });
@@ -70,7 +70,7 @@ class Connection
         return publishers.empty() ? "" : publishers.front().PUuid();
     }
 
-    // Set which of the agents with a lifetime have a model now; the others must have one.
+    // Set for each agent with a lifetime whether it has a model now; the other agents must have one.
     void SetPresence()
     {
         for (Agent& agent : m_agents)
@@ -179,7 +179,7 @@ class Connection
         return request;
     }
 
-    // Publish a command to the agent with an index; false if that failed.
+    // Publish a command to the agent with an index; returns false if that failed.
     bool Publish(size_t agent, const msgs::Twist& twist)
     {
         return m_receivers[agent].publisher.Publish(twist);
@@ -192,10 +192,10 @@ class Connection
 
     // Wait until Gazebo has received all commands.
     //
-    // Messages to a topic and requests to a service have no common order. The plugin TriggeredPublisher answers a
-    // message that follows the commands on the same connection. Without the plugin, this sends one request more than
-    // there are agents: Gazebo's single receiving thread alternates between messages and requests, so it has then
-    // probably read all commands.
+    // Messages to a topic may overtake requests to a service. The plugin TriggeredPublisher answers a message that
+    // follows the commands on the same connection. Without the plugin, this sends one request more than there are
+    // agents. Gazebo's single receiving thread alternates between messages and requests, so it has probably read all
+    // commands when it has answered these requests.
     void Acknowledge()
     {
         if (m_usesFence)
@@ -227,7 +227,7 @@ class Connection
         transport::Node::Publisher publisher;
     };
 
-    // Several runs may start at a time, for example those of a shootout.
+    // Several runs may start at the same time, for example those of a shootout.
     void WaitForOtherRuns()
     {
         WorldLock world_lock(m_options.world);
@@ -325,7 +325,7 @@ class Connection
     bool m_usesFence = false;
     uint64_t m_passed = 0; // answers to messages of the fence
     transport::Node::Publisher m_fence;
-    transport::Node m_node; // last: its callbacks use the other members
+    transport::Node m_node; // declared last, because its callbacks use the other members
 };
 
 } // namespace fieldkit

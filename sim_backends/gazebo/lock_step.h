@@ -1,4 +1,4 @@
-// Lock-step with a world of Gazebo: the beginning of a run, steps, and the motion of robots.
+// Lock-step with a world of Gazebo: the start of a run, steps, and the motion of robots.
 
 #ifndef FIELDKIT_GAZEBO_LOCK_STEP_H
 #define FIELDKIT_GAZEBO_LOCK_STEP_H
@@ -35,8 +35,8 @@ class LockStep
         return m_stepNs;
     }
 
-    // Connect, stop the robots, reset the world, place the robots, and wait until they are at rest: this is time 0.
-    void Begin()
+    // Connect, stop the robots, reset the world, place the robots, and wait until they are at rest, which is time 0.
+    void Start()
     {
         m_connection.Open();
         Pause();
@@ -101,7 +101,7 @@ class LockStep
         AdvanceSteps(to_step);
     }
 
-    // Publish the command of each agent, and wait until Gazebo has received them all.
+    // Publish the command of each agent, and wait until Gazebo has received all commands.
     void SendCommands()
     {
         for (size_t i = 0; i < m_agents.size(); i++)
@@ -149,7 +149,7 @@ class LockStep
     }
 
   private:
-    // The step after which an agent gets a model, or loses it.
+    // The step after which the model of an agent is created or removed.
     struct Change
     {
         int64_t step;
@@ -159,32 +159,32 @@ class LockStep
 
     void AdvanceSteps(int64_t to_step)
     {
-        int64_t at = m_monitor.reached_ns / m_stepNs;
-        if (to_step <= at)
+        int64_t step = m_monitor.reached_ns / m_stepNs;
+        if (to_step <= step)
         {
             return;
         }
         int64_t period = StepsOf(m_options.control_period_s);
         std::vector<Pose> before = Poses();
-        int64_t before_at = at;
-        while (at < to_step)
+        int64_t before_step = step;
+        while (step < to_step)
         {
             int64_t next = to_step;
-            bool turned =
+            bool is_turning =
                 std::any_of(m_agents.begin(), m_agents.end(), [](const Agent& agent) { return agent.Turns(); });
-            if (turned)
+            if (is_turning)
             {
-                next = std::min(next, (at / period + 1) * period);
+                next = std::min(next, (step / period + 1) * period);
             }
-            if (m_options.velocity == "step" && next == to_step && next - at > 1)
+            if (m_options.velocity == "step" && next == to_step && next - step > 1)
             {
                 next--;
             }
             before = Poses();
-            before_at = at;
-            Step(next - at);
-            at = next;
-            if (turned && at % period == 0)
+            before_step = step;
+            Step(next - step);
+            step = next;
+            if (is_turning && step % period == 0)
             {
                 SendCommands(); // also when an agent has reached its direction, to stop its rotation
             }
@@ -192,17 +192,17 @@ class LockStep
         if (m_options.velocity == "window")
         {
             before = m_windowPoses;
-            before_at = m_windowAt;
+            before_step = m_windowEndStep;
         }
-        double spent_s = double((at - before_at) * m_stepNs) / 1e9;
+        double elapsed_s = double((step - before_step) * m_stepNs) / 1e9;
         for (size_t i = 0; i < m_agents.size(); i++)
         {
             Agent& agent = m_agents[i];
-            Vector moved = agent.AntennaAt(agent.pose) - agent.AntennaAt(before[i]);
-            agent.velocity = {moved.x / spent_s, moved.y / spent_s, moved.z / spent_s};
+            Vector motion = agent.AntennaAt(agent.pose) - agent.AntennaAt(before[i]);
+            agent.velocity = {motion.x / elapsed_s, motion.y / elapsed_s, motion.z / elapsed_s};
         }
         m_windowPoses = Poses();
-        m_windowAt = at;
+        m_windowEndStep = step;
     }
 
     // Restore the models if the last run in this world was killed. Gazebo ignores a request to remove a model that
@@ -434,7 +434,7 @@ class LockStep
         return names;
     }
 
-    // Robots may still move from an earlier run, and a new position keeps the velocity.
+    // Robots may still move because of an earlier run, and setting a position does not stop them.
     void ComeToRest(int64_t steps)
     {
         Step(steps);
@@ -445,10 +445,10 @@ class LockStep
             double largest = 0;
             for (size_t i = 0; i < m_agents.size(); i++)
             {
-                Vector moved = m_agents[i].pose.position - before[i].position;
-                double turned = std::remainder(m_agents[i].pose.Yaw() - before[i].Yaw(), 2 * M_PI);
-                largest =
-                    std::max({largest, std::fabs(moved.x), std::fabs(moved.y), std::fabs(moved.z), std::fabs(turned)});
+                Vector motion = m_agents[i].pose.position - before[i].position;
+                double turn = std::remainder(m_agents[i].pose.Yaw() - before[i].Yaw(), 2 * M_PI);
+                largest = std::max(
+                    {largest, std::fabs(motion.x), std::fabs(motion.y), std::fabs(motion.z), std::fabs(turn)});
             }
             if (largest < 1e-4)
             {
@@ -470,7 +470,7 @@ class LockStep
             lock, [&] { return m_monitor.pose_ns == 0; },
             [] { return std::string("no poses have arrived after a reset"); });
         m_nowNs = 0;
-        // Newer versions create the models and plugins again, which then subscribe again.
+        // Newer versions create the models and plugins again, so the plugins subscribe again.
         m_connection.SetPresence();
         m_connection.WaitForSubscribers(lock);
     }
@@ -534,7 +534,7 @@ class LockStep
     int64_t m_stepNs = 0;
     int64_t m_nowNs = -1; // Gazebo's time
     int64_t m_startNs = 0;
-    int64_t m_windowAt = 0; // step at which the last window has ended
+    int64_t m_windowEndStep = 0; // step at which the last window has ended
     std::vector<Pose> m_windowPoses;
     std::deque<Change> m_changes;
 };

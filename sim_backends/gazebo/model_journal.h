@@ -31,11 +31,11 @@ struct Restoration
     std::vector<InitialModel> initial; // models that the run may have removed
 };
 
-// Journal of the runs in one world of one process of Gazebo; a world that was started again has another journal.
+// Journal of the runs in one world of one process of Gazebo; if Gazebo is restarted, its worlds have new journals.
 class ModelJournal
 {
   public:
-    // The unique id of the process, which it draws when it starts, and the name of its world.
+    // `process` is the unique id that the process has generated at its start, and `world` is the name of its world.
     ModelJournal(const std::string& process, const std::string& world)
     {
         const char* base = std::getenv("XDG_CACHE_HOME");
@@ -85,18 +85,18 @@ class ModelJournal
         }
         std::error_code error;
         std::filesystem::create_directories(m_path.parent_path(), error);
-        std::filesystem::path unfinished = m_path;
-        unfinished += ".new";
-        std::ofstream stream(unfinished);
+        std::filesystem::path new_path = m_path;
+        new_path += ".new";
+        std::ofstream stream(new_path);
         stream << Json{{"created", restoration.created}, {"initial", initial}};
         stream.close();
-        if (!stream || std::rename(unfinished.c_str(), m_path.c_str()) != 0)
+        if (!stream || std::rename(new_path.c_str(), m_path.c_str()) != 0)
         {
             throw Refusal("the list of models " + m_path.string() + " cannot be written: " + std::strerror(errno));
         }
     }
 
-    // Delete the file: the models are restored.
+    // Delete the file, after the models have been restored.
     void Delete() const
     {
         std::error_code error;

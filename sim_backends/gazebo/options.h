@@ -83,8 +83,8 @@ struct Options
     // The topic of the commands to an agent, which is a model in Gazebo.
     std::string CommandTopic(const std::string& agent, const std::string& model) const
     {
-        auto special = command_topics.find(agent);
-        return Name(special == command_topics.end() ? command_topic : special->second, model);
+        auto agent_topic = command_topics.find(agent);
+        return Name(agent_topic == command_topics.end() ? command_topic : agent_topic->second, model);
     }
 };
 

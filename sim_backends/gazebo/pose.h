@@ -38,7 +38,7 @@ struct Pose
         return {v.x + w * a + y * c - z * b, v.y + w * b + z * a - x * c, v.z + w * c + x * b - y * a};
     }
 
-    // The vector in the axes of the model.
+    // A vector of the world, in the axes of the model.
     Vector InverseRotated(const Vector& v) const
     {
         return Pose{{}, w, -x, -y, -z}.Rotated(v);

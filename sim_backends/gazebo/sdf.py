@@ -22,8 +22,8 @@ Version = Literal["fortress", "garden"]
 VERSIONS: Final[tuple[Version, ...]] = get_args(Version)
 
 REAL_TIME_FACTOR: Final = 5.0
-"""Maximum real-time factor. A paused Gazebo also repeats its loop at this rate; a larger rate needs more processor
-time."""
+"""Maximum real-time factor. A paused Gazebo repeats its loop at the same rate, so a larger factor needs more
+processor time."""
 POSE_HZ: Final = 2000
 """Largest rate of poses in wall time; at the default of 60 Hz each window takes up to 17 ms."""
 _SLAB_M: Final = 0.1
@@ -86,25 +86,27 @@ def world_sdf(
 
     Args:
         world: The world.
-        robots: Its robots by name, which is also the name of the model.
+        robots: Its robots by name; the model of a robot has the same name.
         step_ns: Physics step.
         version: Names of the plugins.
     """
     root = Element("sdf", version="1.9")
     element = SubElement(root, "world", name=world.name)
     physics = SubElement(element, "physics", name="fieldkit", type="ignored")
-    _texts(physics, max_step_size=step_ns / 1e9, real_time_factor=REAL_TIME_FACTOR)
+    _add_texts(physics, max_step_size=step_ns / 1e9, real_time_factor=REAL_TIME_FACTOR)
     SubElement(element, "gravity").text = f"0 0 {-GRAVITY_M_S2}"
-    _plugin(element, version, "Physics", "physics")
-    _plugin(element, version, "UserCommands", "user-commands")
-    _texts(_plugin(element, version, "SceneBroadcaster", "scene-broadcaster"), dynamic_pose_hertz=POSE_HZ)
-    _add_fence(element, world, version)
+    _add_plugin(element, version, "Physics", "physics")
+    _add_plugin(element, version, "UserCommands", "user-commands")
+    _add_texts(_add_plugin(element, version, "SceneBroadcaster", "scene-broadcaster"), dynamic_pose_hertz=POSE_HZ)
+    _add_command_reply(element, world, version)
     sun = SubElement(element, "light", type="directional", name="sun")
-    _texts(sun, cast_shadows="true", pose="0 0 20 0 0 0", direction="-0.5 0.1 -0.9", diffuse="0.8 0.8 0.8 1")
+    _add_texts(sun, cast_shadows="true", pose="0 0 20 0 0 0", direction="-0.5 0.1 -0.9", diffuse="0.8 0.8 0.8 1")
     ground = _static_model(element, "ground_plane")
     for kind in ("collision", "visual"):
         geometry = SubElement(SubElement(ground, kind, name=kind), "geometry")
-        _texts(SubElement(geometry, "plane"), normal="0 0 1", size="{:g} {:g}".format(*(4 * m for m in world.area_m)))
+        _add_texts(
+            SubElement(geometry, "plane"), normal="0 0 1", size="{:g} {:g}".format(*(4 * m for m in world.area_m))
+        )
     for obstacle in world.obstacles:
         _add_obstacle(element, obstacle)
     for name, robot in robots.items():
@@ -123,25 +125,25 @@ def model_sdf(name: str, limits: DriveLimits | QuadrotorLimits, *, step_ns: int,
     return tostring(root, encoding="unicode")
 
 
-def _add_fence(world: Element, parent: World, version: Version) -> None:
+def _add_command_reply(parent: Element, world: World, version: Version) -> None:
     """Add a plugin that answers the message after the commands of a window; the answer proves their reception."""
-    plugin = _plugin(world, version, "TriggeredPublisher", "triggered-publisher")
+    plugin = _add_plugin(parent, version, "TriggeredPublisher", "triggered-publisher")
     kind = "ignition.msgs.Empty" if version == "fortress" else "gz.msgs.Empty"
     for tag, topic in (("input", "fence"), ("output", "passed")):
-        SubElement(plugin, tag, type=kind, topic=f"/world/{parent.name}/fieldkit/{topic}")
+        SubElement(plugin, tag, type=kind, topic=f"/world/{world.name}/fieldkit/{topic}")
 
 
-def _plugin(parent: Element, version: Version, name: str, file: str) -> Element:
+def _add_plugin(parent: Element, version: Version, name: str, file: str) -> Element:
     library, namespace = ("ignition-gazebo", "ignition::gazebo") if version == "fortress" else ("gz-sim", "gz::sim")
     return SubElement(parent, "plugin", filename=f"{library}-{file}-system", name=f"{namespace}::systems::{name}")
 
 
-def _texts(parent: Element, /, **values: float | str) -> None:
+def _add_texts(parent: Element, /, **values: float | str) -> None:
     for key, value in values.items():
         SubElement(parent, key).text = value if isinstance(value, str) else f"{value:.9g}"
 
 
-def _pose(parent: Element, position_m: Vector, angles_rad: Vector = _UPRIGHT) -> None:
+def _add_pose(parent: Element, position_m: Vector, angles_rad: Vector = _UPRIGHT) -> None:
     SubElement(parent, "pose").text = " ".join(f"{value:.9g}" for value in (*position_m, *angles_rad))
 
 
@@ -195,36 +197,36 @@ def _add_shape(
     """
     for kind in ("collision", "visual"):
         element = SubElement(link, kind, name=f"{name}-{kind}")
-        _pose(element, position_m, angles_rad)
+        _add_pose(element, position_m, angles_rad)
         geometry = SubElement(element, "geometry")
         if isinstance(shape, Cylinder):
-            _texts(SubElement(geometry, "cylinder"), radius=shape.radius_m, length=shape.height_m)
+            _add_texts(SubElement(geometry, "cylinder"), radius=shape.radius_m, length=shape.height_m)
         else:
-            _texts(SubElement(geometry, "box"), size=" ".join(f"{size:.9g}" for size in shape.size_m))
+            _add_texts(SubElement(geometry, "box"), size=" ".join(f"{size:.9g}" for size in shape.size_m))
         if kind == "collision" and frictions is not None:
             ode = SubElement(SubElement(SubElement(element, "surface"), "friction"), "ode")
-            _texts(ode, mu=frictions[0], mu2=frictions[1], fdir1="0 0 1")
+            _add_texts(ode, mu=frictions[0], mu2=frictions[1], fdir1="0 0 1")
 
 
 def _add_inertia(link: Element, mass_kg: float, size_m: Vector, position_m: Vector = (0.0, 0.0, 0.0)) -> None:
-    """Add the mass and the inertia of a homogeneous box of a size."""
+    """Add the mass and the inertia of a homogeneous box of this size."""
     x, y, z = (size * size * mass_kg / 12 for size in size_m)
     inertial = SubElement(link, "inertial")
-    _pose(inertial, position_m)
-    _texts(inertial, mass=mass_kg)
-    _texts(SubElement(inertial, "inertia"), ixx=y + z, iyy=x + z, izz=x + y, ixy=0.0, ixz=0.0, iyz=0.0)
+    _add_pose(inertial, position_m)
+    _add_texts(inertial, mass=mass_kg)
+    _add_texts(SubElement(inertial, "inertia"), ixx=y + z, iyy=x + z, izz=x + y, ixy=0.0, ixz=0.0, iyz=0.0)
 
 
 def _add_robot(world: Element, name: str, robot: SdfRobot, version: Version, step_ns: int) -> None:
     model = SubElement(world, "model", name=name)
-    _pose(model, robot.place_m, (0.0, 0.0, robot.heading_rad))
+    _add_pose(model, robot.place_m, (0.0, 0.0, robot.heading_rad))
     if isinstance(robot.limits, DriveLimits):
         _add_drive(model, robot.limits, version)
     else:
         _add_quadrotor(model, robot.limits, version, step_ns)
 
 
-def _chassis(limits: DriveLimits) -> _Chassis:
+def _chassis_of(limits: DriveLimits) -> _Chassis:
     """Return the geometry of the Husky, or the geometry of the TurtleBot scaled to the size of the body."""
     if limits.radius_m == HUSKY_A200.radius_m:
         return _HUSKY
@@ -234,7 +236,7 @@ def _chassis(limits: DriveLimits) -> _Chassis:
 
 
 def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
-    chassis = _chassis(limits)
+    chassis = _chassis_of(limits)
     size_m = (chassis.length_m, chassis.width_m, limits.height_m - chassis.clearance_m)
     link = SubElement(model, "link", name="chassis")
     wheels = [(side, end) for side in (1, -1) for end in ((1, -1) if chassis.base_m else (0,))]
@@ -249,10 +251,10 @@ def _add_drive(model: Element, limits: DriveLimits, version: Version) -> None:
         _add_casters(link, chassis)
     for side, end in wheels:
         _add_wheel(model, chassis, limits.friction, side, end)
-    plugin = _plugin(model, version, "DiffDrive", "diff-drive")
+    plugin = _add_plugin(model, version, "DiffDrive", "diff-drive")
     for side, end in wheels:
         SubElement(plugin, "left_joint" if side > 0 else "right_joint").text = _wheel_name(side, end)
-    _texts(
+    _add_texts(
         plugin,
         wheel_separation=chassis.track_m,
         wheel_radius=chassis.wheel_radius_m,
@@ -275,24 +277,24 @@ def _add_wheel(model: Element, chassis: _Chassis, friction: float, side: int, en
     name = _wheel_name(side, end)
     link = SubElement(model, "link", name=f"{name}-link")
     radius_m, width_m = chassis.wheel_radius_m, chassis.wheel_width_m
-    _pose(link, (end * chassis.base_m / 2, side * chassis.track_m / 2, radius_m), _WHEEL_AXIS)
+    _add_pose(link, (end * chassis.base_m / 2, side * chassis.track_m / 2, radius_m), _WHEEL_AXIS)
     _add_inertia(link, 0.05 * chassis.mass_kg, (1.7 * radius_m, 1.7 * radius_m, width_m))
     cylinder = Cylinder(_UPRIGHT, radius_m, width_m)
     _add_shape(link, "tire", cylinder, _UPRIGHT, frictions=(chassis.lateral_friction, friction))
     joint = SubElement(model, "joint", name=name, type="revolute")
-    _texts(joint, parent="chassis", child=f"{name}-link")
+    _add_texts(joint, parent="chassis", child=f"{name}-link")
     axis = SubElement(joint, "axis")
-    _texts(axis, xyz="0 0 1")
-    _texts(SubElement(axis, "limit"), lower=-1e16, upper=1e16)
+    _add_texts(axis, xyz="0 0 1")
+    _add_texts(SubElement(axis, "limit"), lower=-1e16, upper=1e16)
 
 
 def _add_casters(link: Element, chassis: _Chassis) -> None:
     radius_m = chassis.clearance_m / 2
     for number, end in enumerate((1, -1)):
         element = SubElement(link, "collision", name=f"caster-{number}")
-        _pose(element, (end * (chassis.length_m / 2 - radius_m), 0.0, radius_m))
-        _texts(SubElement(SubElement(element, "geometry"), "sphere"), radius=radius_m)
-        _texts(SubElement(SubElement(SubElement(element, "surface"), "friction"), "ode"), mu=0.0, mu2=0.0)
+        _add_pose(element, (end * (chassis.length_m / 2 - radius_m), 0.0, radius_m))
+        _add_texts(SubElement(SubElement(element, "geometry"), "sphere"), radius=radius_m)
+        _add_texts(SubElement(SubElement(SubElement(element, "surface"), "friction"), "ode"), mu=0.0, mu2=0.0)
 
 
 def _add_quadrotor(model: Element, limits: QuadrotorLimits, version: Version, step_ns: int) -> None:
@@ -302,6 +304,6 @@ def _add_quadrotor(model: Element, limits: QuadrotorLimits, version: Version, st
     centre_m = (0.0, 0.0, limits.height_m / 2)
     _add_inertia(link, limits.mass_kg, (edge_m, edge_m, limits.height_m), centre_m)
     _add_shape(link, "hull", Cylinder(_UPRIGHT, limits.radius_m, limits.height_m), centre_m)
-    plugin = _plugin(model, version, "VelocityControl", "velocity-control")
+    plugin = _add_plugin(model, version, "VelocityControl", "velocity-control")
     # The plugin sets the velocity before each step, and gravity reduces it within the step.
-    _texts(plugin, initial_linear=f"0 0 {GRAVITY_M_S2 * step_ns / 1e9:.9g}")
+    _add_texts(plugin, initial_linear=f"0 0 {GRAVITY_M_S2 * step_ns / 1e9:.9g}")

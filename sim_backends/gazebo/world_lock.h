@@ -15,7 +15,7 @@
 namespace fieldkit
 {
 
-// Only one process can have a name of an abstract socket, and the name is free when that process ends.
+// Only one process can have a name of an abstract socket, and the name is free when that process exits.
 class WorldLock
 {
   public:
@@ -29,7 +29,7 @@ class WorldLock
         name.copy(m_address.sun_path + 1, sizeof m_address.sun_path - 1); // abstract: the first byte is 0
     }
 
-    // Take the lock until the process ends; false if another process has it.
+    // Take the lock until the process exits; returns false if another process has it.
     bool Take()
     {
         if (m_socket < 0)

@@ -24,13 +24,13 @@ Seconds(int64_t time_ns)
 {
     char text[40];
     std::snprintf(text, sizeof text, "%.9f", static_cast<double>(time_ns) / 1e9);
-    std::string whole(text);
-    whole.erase(whole.find_last_not_of('0') + 1);
-    if (whole.back() == '.')
+    std::string digits(text);
+    digits.erase(digits.find_last_not_of('0') + 1);
+    if (digits.back() == '.')
     {
-        whole.pop_back();
+        digits.pop_back();
     }
-    return whole + " s";
+    return digits + " s";
 }
 
 class WorldMonitor
@@ -49,8 +49,8 @@ class WorldMonitor
         }
     }
 
-    // Checks, without the lock, whether the world is still there; empty before the connection.
-    std::function<bool()> is_there;
+    // Checks, without the lock, whether the world still exists; empty before the connection.
+    std::function<bool()> is_available;
 
     int64_t reached_ns = -1; // time that the run has reached; -1 before its start
 
@@ -58,7 +58,8 @@ class WorldMonitor
     std::mutex mutex;
     std::condition_variable changed;
     int64_t clock_ns = -1, pose_ns = -1;
-    int64_t awaited_ns = -1; // time whose poses are awaited: earlier messages do not notify; -1: all messages do
+    // Time of the awaited poses: messages of earlier times do not notify. -1: all messages notify.
+    int64_t awaited_ns = -1;
     int repeated_clocks = 0;
     std::vector<Pose> poses;
     std::set<std::string> present; // models that have a pose
@@ -116,26 +117,27 @@ class WorldMonitor
         }
     }
 
-    // Fail with the world's name and its last time; the coordinator adds the request.
+    // Throw a refusal with the world's name and its last time; the coordinator adds the request.
     [[noreturn]] void Fail(const std::string& what) const
     {
         std::string last = reached_ns >= 0 ? ", whose last time is " + Seconds(reached_ns) : ", which has not started";
         throw Refusal("Gazebo world '" + m_options.world + "'" + last + ": " + what);
     }
 
-    // Wait until a condition holds, with the lock. Progress of the clock extends the deadline.
-    template <typename Condition> void Wait(Lock& lock, Condition holds, const std::function<std::string()>& what)
+    // Wait, with the lock, until a condition is true. Progress of the clock extends the deadline. `what` returns the
+    // text of the error for a timeout.
+    template <typename Condition> void Wait(Lock& lock, Condition is_true, const std::function<std::string()>& what)
     {
-        auto span = std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(m_options.timeout_s));
-        auto limit = Clock::now() + span, check = Clock::now() + std::chrono::milliseconds(500);
+        auto timeout = std::chrono::duration_cast<Clock::duration>(std::chrono::duration<double>(m_options.timeout_s));
+        auto limit = Clock::now() + timeout, check = Clock::now() + std::chrono::milliseconds(500);
         int64_t progress_ns = clock_ns;
-        while (!holds())
+        while (!is_true())
         {
             auto now = Clock::now();
             if (clock_ns != progress_ns)
             {
                 progress_ns = clock_ns;
-                limit = now + span;
+                limit = now + timeout;
             }
             if (now >= limit)
             {
@@ -151,7 +153,7 @@ class WorldMonitor
             if (now >= check)
             {
                 check = now + std::chrono::milliseconds(500);
-                if (is_there && !Unlocked(lock, is_there))
+                if (is_available && !Unlocked(lock, is_available))
                 {
                     Fail("it has disappeared, or is suspended" + LastMessage());
                 }

@@ -1,4 +1,4 @@
-"""The limits of an agent, and its model at its start."""
+"""Limits of agents, and their models at the start of a run."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimi
     """Return the limits of an agent: the limits in the configuration, otherwise the limits of its profile.
 
     Raises:
-        ConfigurationError: The configuration has other limits than its kind of robot.
+        ConfigurationError: The limits in the configuration are not those of its kind of robot.
     """
     if body is not None:
         values: dict[str, Any] = {
@@ -36,7 +36,7 @@ def agent_limits(agent: AgentStart, body: Mapping[str, Any] | None) -> DriveLimi
 
 
 def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world: World | None) -> Model:
-    """Return an agent at its start; a robot on wheels is upright on the ground below it."""
+    """Return the model of an agent at its start; a robot on wheels has the slope of the ground below it."""
     e, n, u = agent.start.position_m
     place_m, heading_rad = (e, n, u - agent.antenna_m), agent.start.heading_rad or 0.0
     if isinstance(limits, QuadrotorLimits):
@@ -45,5 +45,5 @@ def agent_model(agent: AgentStart, limits: DriveLimits | QuadrotorLimits, world:
     east, north = Ground(world, math.inf).surface(e, n).grade
     forward, left = east * cos + north * sin, north * cos - east * sin
     roll_rad = math.asin(left / math.hypot(1.0, forward, left))
-    upright = quaternion(heading_rad, -math.atan(forward), roll_rad)
-    return Model(place_m, upright, agent.antenna_m, limits.friction, chassis(agent.profile, limits))
+    orientation = quaternion(heading_rad, -math.atan(forward), roll_rad)
+    return Model(place_m, orientation, agent.antenna_m, limits.friction, chassis(agent.profile, limits))

@@ -18,7 +18,7 @@ class Wheels:
 
     Attributes:
         axles_m: Positions of the axles, forward of the middle; each has a wheel on both sides.
-        track_m: Distance of the wheels on both sides.
+        track_m: Distance between the left and the right wheels.
         turning_track_m: Difference of the speeds of the two sides per yaw rate, as assumed by the robot's controller.
         radius_m: Radius of a wheel.
         width_m: Width of a wheel.
@@ -45,7 +45,7 @@ class Chassis:
         inertia_kg_m2: Moments of inertia about its axes.
         boxes: Its shape.
         wheels: Its wheels.
-        caster_m: Lowest point of a caster without friction; None if it has none.
+        caster_m: Lowest point of a caster without friction; None for a robot without a caster.
     """
 
     mass_kg: float
@@ -100,9 +100,9 @@ HUSKY: Final = Chassis(
 )
 """Clearpath Husky A200: `husky_description/urdf/husky.urdf.xacro` (github.com/husky/husky), with its centre of mass
 in the plane of symmetry. Its controller multiplies the track by 1.875 (`husky_control/config/control.yaml`), because
-the wheels slide sideways when it turns: with equal friction in all directions, on a base a and a track b, the yaw
-rate is b^2 / (a^2 + b^2) = 0.554 of the yaw rate of rolling wheels. The torque of its motors is not published; ours
-is twice the friction of a wheel, so that friction is the limit.
+the wheels slide sideways when it turns: with equal friction in all directions, a wheelbase a and a track b, the yaw
+rate is b^2 / (a^2 + b^2) = 0.554 of the yaw rate of rolling wheels. The torque of its motors is not published; this
+value is twice the friction of a wheel, so that friction is the limit.
 """
 
 BURGER: Final = Chassis(
@@ -123,15 +123,15 @@ BURGER: Final = Chassis(
 )
 """ROBOTIS TurtleBot3 Burger: `turtlebot3_description/urdf/turtlebot3_burger.urdf.xacro`
 (github.com/ROBOTIS-GIT/turtlebot3) with the mass of the laser scanner; the stall torque of its motors (XL430-W250,
-e-Manual). Its centre of mass is not published; ours is in the middle of its body, because the robot would fall over
-with the centre of mass of the URDF, which is above the axle.
+e-Manual). Its centre of mass is not published; here it is in the middle of its body, because the robot would fall
+over with the centre of mass of the URDF, which is above the axle.
 """
 
 CASTER_RADIUS_M: Final = 0.01
 
 
 def chassis(profile: str, limits: DriveLimits) -> Chassis:
-    """Return the robot on wheels of a kind; an unknown kind is a TurtleBot3 Burger scaled to its size."""
+    """Return the chassis of a profile; an unknown profile has that of a TurtleBot3 Burger, scaled to its size."""
     if profile == "husky":
         return HUSKY
     factor = limits.radius_m / TURTLEBOT3_BURGER.radius_m

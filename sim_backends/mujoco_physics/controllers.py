@@ -10,14 +10,14 @@ from typing import Final, Protocol
 from sim_backends.mujoco_physics.chassis import Wheels
 from sim_backends.mujoco_physics.mjcf import quaternion
 from sim_backends.physics.body import Velocity
-from sim_backends.physics.differential_drive import checked_twist
+from sim_backends.physics.differential_drive import require_twist
 from sim_backends.physics.quadrotor import FlightTarget, Quadrotor, VelocityController
 from sim_backends.physics.robot_limits import DriveLimits, QuadrotorLimits
 
 TICK_NS: Final = 10_000_000
 """Period of the controllers: PX4's velocity controller runs at 100 Hz."""
 _UPRIGHT: Final = 0.1
-"""If the cosine of a quadrotor's tilt is below this value, no thrust holds its height, and the minimum is used."""
+"""If the cosine of a quadrotor's tilt is below this value, thrust cannot keep its height, and the minimum is used."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Controller(Protocol):
     """A controller on board."""
 
     def command(self, command: object) -> None:
-        """Follow a new command from the next tick on.
+        """Set the command that is followed after the next tick.
 
         Raises:
             ConfigurationError: The command does not suit the robot.
@@ -68,9 +68,9 @@ class WheelController:
     """Changes forward speed and yaw rate within their limits, like ROS's `diff_drive_controller`.
 
     Args:
-        limits: Its limits.
+        limits: Limits of the robot.
         wheels: Its wheels.
-        motors: Indices of the motors, first the left ones.
+        motors: Indices of its motors, first the left ones.
     """
 
     def __init__(self, limits: DriveLimits, wheels: Wheels, motors: range) -> None:
@@ -78,21 +78,21 @@ class WheelController:
         self._wheels = wheels
         self._motors = motors
         self._target = 0.0, 0.0
-        self._now = 0.0, 0.0
+        self._current = 0.0, 0.0
 
     def command(self, command: object) -> None:
         """Implement `Controller.command`."""
-        twist, limits = checked_twist(command), self._limits
+        twist, limits = require_twist(command), self._limits
         self._target = _clamp(twist.forward_m_s, limits.speed_m_s), _clamp(twist.turn_rad_s, limits.turn_rad_s)
 
     def tick(self, registers: Registers, elapsed_s: float) -> bool:
         """Implement `Controller.tick`."""
-        if self._now == self._target:
+        if self._current == self._target:
             return False
         limits, wheels = self._limits, self._wheels
-        speed_m_s = _approached(self._now[0], self._target[0], limits.acceleration_m_s2 * elapsed_s)
-        turn_rad_s = _approached(self._now[1], self._target[1], limits.turn_acceleration_rad_s2 * elapsed_s)
-        self._now = speed_m_s, turn_rad_s
+        speed_m_s = _step_towards(self._current[0], self._target[0], limits.acceleration_m_s2 * elapsed_s)
+        turn_rad_s = _step_towards(self._current[1], self._target[1], limits.turn_acceleration_rad_s2 * elapsed_s)
+        self._current = speed_m_s, turn_rad_s
         half_m_s = turn_rad_s * wheels.turning_track_m / 2
         count = len(self._motors) // 2
         for index, motor in enumerate(self._motors):
@@ -101,11 +101,11 @@ class WheelController:
 
 
 class FlightController:
-    """Controls the velocity of a quadrotor, by the law of the built-in physics.
+    """Controls the velocity of a quadrotor with the control law of the built-in physics.
 
     Args:
-        limits: Its limits.
-        body: Index of its body, of its target attitude, of its velocity, and of its thrust.
+        limits: Limits of the quadrotor.
+        body: Index of its body.
         mocap: Index of its target attitude.
         dof: Index of its velocity.
         motor: Index of its thrust.
@@ -113,29 +113,29 @@ class FlightController:
 
     def __init__(self, limits: QuadrotorLimits, body: int, mocap: int, dof: int, motor: int) -> None:
         self._limits = limits
-        self._law = VelocityController(limits)
+        self._velocity_law = VelocityController(limits)
         self._quadrotor = Quadrotor(limits, (0.0, 0.0, 0.0))
         self._indices = body, mocap, dof, motor
         self._target = Velocity()
         self._is_powered = True
-        self._held_rad: float | None = None
+        self._hold_yaw_rad: float | None = None
         self._max_lean_rad = limits.tilt_rate_rad_s * limits.lag_s
         self._max_turn_rad = limits.yaw_rate_rad_s * limits.lag_s
 
     def command(self, command: object) -> None:
         """Implement `Controller.command`."""
         if isinstance(command, FlightTarget):
-            self._law = VelocityController(command.limits_within(self._limits))
+            self._velocity_law = VelocityController(command.limits_within(self._limits))
             self._target, self._is_powered = command.velocity, command.powered
         else:
-            self._law, self._is_powered = VelocityController(self._limits), True
+            self._velocity_law, self._is_powered = VelocityController(self._limits), True
             self._target = self._quadrotor.target(command)
-        self._held_rad = self._target.yaw_rad
+        self._hold_yaw_rad = self._target.yaw_rad
 
     def tick(self, registers: Registers, elapsed_s: float) -> bool:  # noqa: ARG002 (see Controller)
         """Implement `Controller.tick`."""
         limits, (body, mocap, dof, motor) = self._limits, self._indices
-        # Axes x and z of the body, in components east, north, up; then velocity and wanted thrust in the same order.
+        # Components east, north, up of the axes x and z of the body, of its velocity, and later of the target thrust.
         x_e, _, z_e, x_n, _, z_n, _, _, z_u = registers.xmat[9 * body : 9 * body + 9]
         v_e, v_n, v_u = registers.qvel[dof : dof + 3]
         drag_n_s_m = limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)
@@ -147,21 +147,21 @@ class FlightController:
         )
         targets, first = registers.mocap_quat, 4 * mocap
         if not self._is_powered:
-            # With its present attitude as the target, the attitude control applies no torque except damping.
+            # If the target is the present attitude, the attitude control applies no torque except damping.
             registers.ctrl[motor] = 0.0
             for index in range(4):
                 targets[first + index] = registers.xquat[4 * body + index]
             return True
-        f_e, f_n, f_u = self._law.thrust_m_s2((v_e, v_n, v_u), self._target)
+        f_e, f_n, f_u = self._velocity_law.thrust_m_s2((v_e, v_n, v_u), self._target)
         yaw_rad = math.atan2(x_n, x_e)
-        if self._held_rad is None:
-            self._held_rad = yaw_rad
+        if self._hold_yaw_rad is None:
+            self._hold_yaw_rad = yaw_rad
         cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
         forward, left = f_e * cos + f_n * sin, f_n * cos - f_e * sin
         pitch_rad = math.atan2(z_e * cos + z_n * sin, z_u)
         roll_rad = math.asin(_clamp(z_e * sin - z_n * cos, 1.0))
         targets[first], targets[first + 1], targets[first + 2], targets[first + 3] = quaternion(
-            yaw_rad + _clamp(math.remainder(self._held_rad - yaw_rad, math.tau), self._max_turn_rad),
+            yaw_rad + _clamp(math.remainder(self._hold_yaw_rad - yaw_rad, math.tau), self._max_turn_rad),
             pitch_rad + _clamp(math.atan2(forward, f_u) - pitch_rad, self._max_lean_rad),
             roll_rad + _clamp(-math.atan2(left, math.hypot(forward, f_u)) - roll_rad, self._max_lean_rad),
         )
@@ -173,5 +173,5 @@ def _clamp(value: float, limit: float) -> float:
     return max(-limit, min(value, limit))
 
 
-def _approached(now: float, target: float, limit: float) -> float:
+def _step_towards(now: float, target: float, limit: float) -> float:
     return target if abs(target - now) <= limit else now + math.copysign(limit, target - now)

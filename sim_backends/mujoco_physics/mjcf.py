@@ -1,7 +1,7 @@
 """The model of a run in MJCF, MuJoCo's XML: world, robots, motors and sensors.
 
-Names are numbers of agents, because names of agents may have any characters. The sensors of an agent are, in this
-order, the position and velocity of its antenna and the direction of its nose: 9 numbers.
+Elements are named by the numbers of agents, because names of agents may have any characters. The sensors of an agent
+are, in this order, the position and velocity of its antenna and its forward direction: 9 numbers.
 """
 
 import math
@@ -20,7 +20,7 @@ from sim_backends.world.world import World
 
 SENSED_NUMBERS: Final = 9
 WHEEL_PER_S: Final = 40.0
-"""Natural frequency of the speed control of a wheel, critically damped: 0.05 s behind its set-point."""
+"""Natural frequency of the speed control of a wheel, which is critically damped, and lags its set-point by 0.05 s."""
 ATTITUDE_RATE_PER_S: Final = 30.0
 """Bandwidth of the control of a quadrotor's turning rates."""
 _CONTACT: Final = {"solref": "0.01 1", "solimp": "0.9 0.95 0.001"}
@@ -28,13 +28,14 @@ _CONTACT: Final = {"solref": "0.01 1", "solimp": "0.9 0.95 0.001"}
 _GRIP: Final = {"solref": "0.003 1.6", "solimp": "0.1 0.1 0.001"}
 """Softness of contacts with the ground; a Husky compresses its tires by 0.3 mm."""
 _GRIP_SLIP: Final = "0.3 1"
-"""Softness of their friction. MuJoCo's contacts repel a sliding body in proportion to its speed; with a stiffer
-friction, the wheels of a robot that turns would hop (documentation of MuJoCo, "Computation", convex relaxation)."""
+"""Softness of the friction of these contacts. MuJoCo's contacts repel a sliding body in proportion to its speed; if
+the friction were stiffer, the wheels of a robot that turns would hop (documentation of MuJoCo, "Computation", convex
+relaxation)."""
 _BODY_FRICTION: Final = 0.3
 """Friction of a robot that has fallen over; our estimate."""
 _IMPEDANCE_RATIO: Final = 10_000.0
-"""Ratio of softness across and along a contact; it keeps a robot from creeping down a slope: 0.02 mm/s at 20 degrees.
-"""
+"""Ratio of softness across and along a contact. It limits the sliding of a robot at rest down a slope of 20 degrees
+to 0.02 mm/s."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Model:
     """A robot in the model.
 
     Attributes:
-        place_m: Its position at time 0: its lowest point, metres east, north, up.
+        place_m: Position of its lowest point at time 0, metres east, north, up.
         quaternion: Its orientation at time 0.
         antenna_m: Height of its antenna above its position.
         friction: Coefficient of friction of its tires.
@@ -157,8 +158,8 @@ class _Document:
             for along_m, up_m in ((-long_m / 2, 0.0), (long_m / 2, 0.0), (long_m / 2, high_m)):
                 corners_m += (along_m, across_m, up_m)
         _add(self._meshes, "mesh", name=name, vertex=_text(corners_m))
-        position, turned = _text((*ramp.centre_m, 0.0)), _text(quaternion(math.radians(ramp.yaw_deg)))
-        _add(self._bodies, "geom", name=name, type="mesh", mesh=name, pos=position, quat=turned)
+        position, rotation = _text((*ramp.centre_m, 0.0)), _text(quaternion(math.radians(ramp.yaw_deg)))
+        _add(self._bodies, "geom", name=name, type="mesh", mesh=name, pos=position, quat=rotation)
 
     def _add_vehicle(self, body: ET.Element, name: str, chassis: Chassis, friction: float) -> None:
         _add_inertia(body, chassis.mass_kg, chassis.centre_m, chassis.inertia_kg_m2)
@@ -184,11 +185,11 @@ class _Document:
         size = _text((wheels.radius_m, wheels.width_m / 2, wheels.radius_m))
         _add(wheel, "geom", name=name, type="ellipsoid", size=size, mass=repr(wheels.mass_kg))
         self._add_grip(name, friction)
-        # The motor also accelerates the robot: its share is a mass at the radius of the wheel.
+        # The motor also accelerates the robot. Its share of the robot's mass acts at the radius of the wheel.
         count = 2 * len(wheels.axles_m)
         inertia_kg_m2 = (chassis.mass_kg / count + wheels.mass_kg) * wheels.radius_m**2
         stiffness, damping = inertia_kg_m2 * WHEEL_PER_S**2, 2 * inertia_kg_m2 * WHEEL_PER_S
-        # The activation is the integral of the speed's set-point, so the motor also holds the wheel at its angle.
+        # The activation is the integral of the set-point of the speed, so the motor also controls the wheel's angle.
         _add(
             self._motors,
             "general",
@@ -219,7 +220,7 @@ class _Document:
         """Add a quadrotor: a thrust along its axis, and torques towards the attitude of a body without mass."""
         inertia_kg_m2, centre_m = quadrotor_inertia_kg_m2(limits), (0.0, 0.0, limits.height_m / 2)
         _add_inertia(body, limits.mass_kg, centre_m, inertia_kg_m2)
-        # A cylinder that turns on a plane gets wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
+        # A cylinder that turns on a plane has wrong contacts, 0.4 m deep, in MuJoCo 4.0.1.
         half_axes_m = (limits.radius_m, limits.radius_m, limits.height_m / 2)
         shape = f"{name}b"
         _add(body, "geom", name=shape, type="ellipsoid", size=_text(half_axes_m), pos=_text(centre_m))
@@ -247,8 +248,8 @@ class _Document:
 def _add_shape(parent: ET.Element, shape: Shape, **attributes: str) -> None:
     position = _text(shape.centre_m)
     if isinstance(shape, Box):
-        size, turned = _text(edge_m / 2 for edge_m in shape.size_m), _text(quaternion(shape.yaw_rad))
-        _add(parent, "geom", type="box", size=size, pos=position, quat=turned, **attributes)
+        size, rotation = _text(edge_m / 2 for edge_m in shape.size_m), _text(quaternion(shape.yaw_rad))
+        _add(parent, "geom", type="box", size=size, pos=position, quat=rotation, **attributes)
     else:
         size = _text((shape.radius_m, shape.height_m / 2))
         _add(parent, "geom", type="cylinder", size=size, pos=position, **attributes)

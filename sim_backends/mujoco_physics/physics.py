@@ -33,11 +33,11 @@ from sim_backends.world.motion import Lifetime, State
 from sim_backends.world.world import World
 
 _LONGEST_STEP_NS: Final = 1_000_000
-"""Longest step of MuJoCo: with longer ones, tires that slide sideways hop."""
+"""Longest step of MuJoCo; with longer steps, tires that slide sideways would hop."""
 
 
-_CARRIES: Final = 0.5
-"""Minimum vertical component of the normal of a contact that carries a robot."""
+_MIN_SUPPORT_NORMAL: Final = 0.5
+"""Minimum vertical component of the normal of a contact that supports a robot."""
 _PARKED_M: Final = 10_000.0
 """Distance east and north at which absent agents are parked; the rounding error there is at most 1 um."""
 _PARKED_APART_M: Final = 10.0
@@ -60,8 +60,8 @@ class SensedStates(Mapping[str, State]):
     def __getitem__(self, name: str) -> State:
         state = self._cache.get(name)
         if state is None:
-            begin = self._rows[name] * SENSED_NUMBERS
-            e, n, u, v_e, v_n, v_u, x_e, x_n, _ = self._numbers[begin : begin + SENSED_NUMBERS]
+            first = self._rows[name] * SENSED_NUMBERS
+            e, n, u, v_e, v_n, v_u, x_e, x_n, _ = self._numbers[first : first + SENSED_NUMBERS]
             state = self._cache[name] = State((e, n, u), (v_e, v_n, v_u), math.atan2(x_n, x_e))
         return state
 
@@ -82,9 +82,8 @@ class SensedStates(Mapping[str, State]):
 class MujocoPhysics:
     """Moves the agents of a run in MuJoCo.
 
-    Its time is a number of steps. A command applies at the first step that is not before the time at which it was
-    given. The result does not depend on how the time is divided into calls. Agents that are absent are parked far
-    away from the others.
+    Its time is a number of steps. A command applies from the first step at or after the time of the command. The
+    result does not depend on how the time is divided into calls. Absent agents are parked far away from the others.
 
     Args:
         hello: The run: agents, step, and configuration with `world` and `robots`, both optional.
@@ -123,15 +122,15 @@ class MujocoPhysics:
         self._stops = [Velocity() if isinstance(limit, QuadrotorLimits) else Twist() for limit in limits]
         self._active = set(range(len(robots)))
         self._due: set[int] = set()
-        self._ticked_steps = [-self._tick_steps] * len(robots)
-        self._use(mujoco.MjData(self.model))
+        self._last_tick_steps = [-self._tick_steps] * len(robots)
+        self._use_data(mujoco.MjData(self.model))
         lifetimes = {self._rows[name]: lifetime for name, lifetime in hello.lifetimes.items() if name in self._rows}
         self._absent = {row for row, lifetime in lifetimes.items() if lifetime.appears_ns >= self.step_ns}
         self._changes = sorted(_changes(lifetimes, self.step_ns), reverse=True)
         for row in self._absent:
-            self._place(row, parked=True)
+            self._place(row, is_parked=True)
         mujoco.mj_step1(self.model, self.data)
-        self._pending: dict[str, Any] = {}
+        self._pending_commands: dict[str, Any] = {}
         self._commands_step = 0
         self._last_to_ns = 0
         self._step = 0
@@ -145,11 +144,11 @@ class MujocoPhysics:
             FederateError: The simulation has become unstable.
         """
         if commands:
-            self._pending |= commands
+            self._pending_commands |= commands
             self._commands_step = -(-self._last_to_ns // self.step_ns)
         self._last_to_ns = to_ns
         step = to_ns // self.step_ns
-        if self._pending and self._commands_step <= step:
+        if self._pending_commands and self._commands_step <= step:
             self._advance_steps(self._commands_step)
             self._apply_commands()
         if step != self._step:
@@ -161,16 +160,16 @@ class MujocoPhysics:
             return self._rows
         return {name: row for name, row in self._rows.items() if row not in self._absent}
 
-    def _place(self, row: int, *, parked: bool) -> None:
+    def _place(self, row: int, *, is_parked: bool) -> None:
         """Place an agent at its start, or far away on flat ground, at rest."""
         first = int(self.model.jnt_qposadr[self.model.body(f"a{row}").jntadr[0]])
         pose = self.model.qpos0[first : first + 7].copy()
-        if parked:
+        if is_parked:
             pose[:3] = (_PARKED_M + _PARKED_APART_M * row, _PARKED_M, _PARKED_UP_M)
         self._set_pose(row, pose)
 
     def _set_pose(self, row: int, pose: Sequence[float]) -> None:
-        """Set position and quaternion of an agent at rest."""
+        """Set position and quaternion of an agent, and stop it."""
         model, data = self.model, self.data
         body = model.body(f"a{row}")
         first = int(model.jnt_qposadr[body.jntadr[0]])
@@ -181,7 +180,7 @@ class MujocoPhysics:
         """Place the agents that appear at the present step, and park those that disappear."""
         while self._changes and self._changes[-1].step <= self._step:
             _, row, appears = self._changes.pop()
-            self._place(row, parked=not appears)
+            self._place(row, is_parked=not appears)
             if appears:
                 self._absent.discard(row)
                 continue
@@ -192,7 +191,7 @@ class MujocoPhysics:
         mujoco.mj_step1(self.model, self.data)
 
     def put(self, name: str, place_m: Vector, heading_rad: float) -> None:
-        """Put an agent at a place, at rest and without a command; it may overlap something.
+        """Put an agent at a place, at rest and without a command. Whether it overlaps something is not checked.
 
         Args:
             name: The agent.
@@ -205,7 +204,7 @@ class MujocoPhysics:
         start = State((e, n, u + agent.antenna_m), heading_rad=heading_rad)
         robot = agent_model(replace(agent, start=start), self._limits[row], self._world)
         self._set_pose(row, (*robot.place_m, *robot.quaternion))
-        self._pending.pop(name, None)
+        self._pending_commands.pop(name, None)
         self._controllers[row] = self._controller(row, robot, self._limits[row])
         if isinstance(robot.body, Chassis):
             motor = model.actuator(f"a{row}l0").id
@@ -235,36 +234,38 @@ class MujocoPhysics:
         """Return True if a contact of a shape pushes it up."""
         contacts = self.data.contact
         for (first, second), frame in zip(contacts.geom.tolist(), contacts.frame.tolist(), strict=True):
-            # The normal, the first axis of the frame, leads from the first shape to the second.
-            if (second == shape and frame[2] > _CARRIES) or (first == shape and frame[2] < -_CARRIES):
+            # The normal is the first axis of the frame, and points from the first shape to the second.
+            if (second == shape and frame[2] > _MIN_SUPPORT_NORMAL) or (
+                first == shape and frame[2] < -_MIN_SUPPORT_NORMAL
+            ):
                 return True
         return False
 
     def run_controllers(self) -> None:
-        """Let the controllers that are due at the present step set their motors."""
+        """Run the controllers that are due at the present step; they set their motors."""
         step = self._step
         rows = self._due if step % self._tick_steps else self._active
         if not rows:
             return
         self._due = set()
         for row in tuple(rows):
-            elapsed = min(step - self._ticked_steps[row], self._tick_steps)
-            self._ticked_steps[row] = step
-            if not self._controllers[row].tick(self._registers, elapsed * self.step_ns / 1e9):
+            elapsed_steps = min(step - self._last_tick_steps[row], self._tick_steps)
+            self._last_tick_steps[row] = step
+            if not self._controllers[row].tick(self._registers, elapsed_steps * self.step_ns / 1e9):
                 self._active.discard(row)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "MujocoPhysics":
         other = object.__new__(type(self))
         memo[id(self)] = other
-        members = {name: value for name, value in vars(self).items() if name not in _OF_MUJOCO}
+        members = {name: value for name, value in vars(self).items() if name not in _MUJOCO_MEMBERS}
         vars(other).update(copy.deepcopy(members, memo), model=self.model)
         data = mujoco.MjData(self.model)
         mujoco.mj_copyData(data, self.model, self.data)
-        other._use(data)
+        other._use_data(data)
         return other
 
-    def _use(self, data: Any) -> None:  # noqa: ANN401 (of MuJoCo)
-        """Use a state of the simulation; views of its arrays are made once, because reading an attribute is slow."""
+    def _use_data(self, data: Any) -> None:  # noqa: ANN401 (of MuJoCo)
+        """Use a state of the simulation. Views of its arrays are created once, because reading attributes is slow."""
         self.data = data
         self._sensors = memoryview(data.sensordata)
         arrays = data.ctrl, data.qvel, data.xmat, data.xquat, data.mocap_quat, data.xfrc_applied
@@ -283,7 +284,7 @@ class MujocoPhysics:
         return FlightController(limits, body.id, int(target.mocapid[0]), velocity, model.actuator(f"a{row}").id)
 
     def _apply_commands(self) -> None:
-        commands, self._pending = self._pending, {}
+        commands, self._pending_commands = self._pending_commands, {}
         for name, command in commands.items():
             if name not in self._rows:
                 remedy = did_you_mean(name, self._rows, f"agents: {', '.join(self._rows)}")
@@ -296,17 +297,17 @@ class MujocoPhysics:
             self._due.add(row)
 
     def _advance_steps(self, step: int) -> None:
-        """Advance to a step; controllers tick at multiples of their period, and when they get a command."""
+        """Advance to a step; controllers run at multiples of their period, and when they receive a command."""
         if self._step >= step:
             return
         while self._step < step:
             self.run_controllers()
-            until = min(step, self._changes[-1].step) if self._changes else step
+            next_step = min(step, self._changes[-1].step) if self._changes else step
             if self._active:
-                until = min(until, (self._step // self._tick_steps + 1) * self._tick_steps)
-            self._integrate((until - self._step) * self._substeps)
-            self._step = until
-            if self._changes and self._changes[-1].step <= until:
+                next_step = min(next_step, (self._step // self._tick_steps + 1) * self._tick_steps)
+            self._integrate((next_step - self._step) * self._substeps)
+            self._step = next_step
+            if self._changes and self._changes[-1].step <= next_step:
                 self._change_presence()
         numbers = self._sensors.tolist()
         if _WARNINGS or not math.isfinite(sum(numbers)):
@@ -322,7 +323,7 @@ class MujocoPhysics:
         mujoco.mj_step1(model, data)
 
     def _raise_unstable(self, numbers: Sequence[float]) -> None:
-        """Raise the error that names time and agent."""
+        """Raise the error for an unstable simulation, with the time and the agent."""
         text = _WARNINGS[0] if _WARNINGS else "a state is not finite"
         _WARNINGS.clear()
         name = next(
@@ -360,7 +361,7 @@ def _changes(lifetimes: Mapping[int, Lifetime], step_ns: int) -> Iterator[_Prese
             yield _PresenceChange(-(-lifetime.disappears_ns // step_ns), row, appears=False)
 
 
-_OF_MUJOCO: Final = {"model", "data", "_sensors", "_registers"}
+_MUJOCO_MEMBERS: Final = {"model", "data", "_sensors", "_registers"}
 
 
 _WARNINGS: Final[list[str]] = []

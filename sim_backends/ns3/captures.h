@@ -47,23 +47,23 @@ class IpCaptures
         }
     }
 
-    // A packet of the coordinator enters, as one datagram.
+    // Record that a packet of the coordinator enters, as one datagram.
     void Enter(uint64_t id, const std::string& flow, int64_t number)
     {
-        auto found = m_flows.find(flow);
-        if (found != m_flows.end())
+        auto entry = m_flows.find(flow);
+        if (entry != m_flows.end())
         {
-            m_datagrams[id] = {&found->second, static_cast<uint16_t>(number + 1)};
+            m_datagrams[id] = {&entry->second, static_cast<uint16_t>(number + 1)};
         }
     }
 
-    // A connection from a port of a station carries a flow.
+    // Record that a connection from a port of a station carries a flow.
     void Connect(Ipv4Address source, uint16_t port, const std::string& flow)
     {
-        auto found = m_flows.find(flow);
-        if (found != m_flows.end())
+        auto entry = m_flows.find(flow);
+        if (entry != m_flows.end())
         {
-            m_connections[{m_addresses.at(source), port}] = found->second.port;
+            m_connections[{m_addresses.at(source), port}] = entry->second.port;
         }
     }
 
@@ -122,7 +122,7 @@ class IpCaptures
         Write(station, bytes, packet->GetSize());
     }
 
-    // Replace the listener's port of the connection with this other end.
+    // Replace the port of the listener of a connection, which is identified by its other end.
     void RenamePort(std::vector<uint8_t>& bytes, std::pair<Ipv4Address, uint16_t> end, size_t at) const
     {
         auto connection = m_connections.find(end);

@@ -84,7 +84,7 @@ class Channel
         return OpenDb(start, end) + m_obstacles.LossDb(start, end);
     }
 
-    // Count one more or one fewer reason why two stations cannot receive each other.
+    // Add `change` to the number of reasons why two stations cannot receive each other.
     void Cut(size_t a, size_t b, int change)
     {
         m_links[a * m_names.size() + b].cuts += change;
@@ -172,8 +172,8 @@ class Channel
         auto draws = RandomStream(m_seed, {"shadowing"}).First(3 * kWaves);
         for (int wave = 0; wave < kWaves; wave++)
         {
-            double rest = 1 - draws[wave];
-            double number = std::sqrt(1 / (rest * rest) - 1) / decorrelation_m;
+            double complement = 1 - draws[wave];
+            double number = std::sqrt(1 / (complement * complement) - 1) / decorrelation_m;
             double angle = 2 * M_PI * draws[kWaves + wave];
             m_waves.push_back({number * std::cos(angle), number * std::sin(angle), 2 * M_PI * draws[2 * kWaves + wave]});
         }

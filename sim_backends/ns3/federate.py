@@ -51,8 +51,8 @@ def command() -> str:
     Raises:
         ConfigurationError: ns-3 or the compiler is not installed, or the program cannot be compiled.
     """
-    installed = version()
-    return shlex.join((str(program(installed).path()), installed))
+    ns3_version = version()
+    return shlex.join((str(program(ns3_version).path()), ns3_version))
 
 
 NS3: Final = ProgramFederate(

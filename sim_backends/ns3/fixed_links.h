@@ -62,7 +62,7 @@ class FixedLinks : public SimpleChannel
         }
     }
 
-    // Count one more or one fewer reason why two stations cannot receive each other.
+    // Add `change` to the number of reasons why two stations cannot receive each other.
     void Cut(size_t a, size_t b, int change)
     {
         LinkOf(a, b).cuts += change;
@@ -119,7 +119,7 @@ class FixedLinks : public SimpleChannel
         int cuts = 0;
         int64_t free_ns = 0; // end of the last transmission
         int64_t last_ns = 0; // last arrival
-        int64_t off_ns = -1; // when the transmitter was switched off
+        int64_t off_ns = -1; // time at which the transmitter was switched off
         std::deque<int64_t> starts_ns; // start times of the transmissions of queued packets
     };
 
@@ -130,7 +130,7 @@ class FixedLinks : public SimpleChannel
         uint16_t protocol = 0;
         Mac48Address destination, source;
         size_t from = 0, to = 0;
-        std::vector<size_t> receivers; // its final receivers, including those behind the relay
+        std::vector<size_t> receivers; // its final receivers, including those to which the relay forwards it
         PacketIdentity identity;
         DelayParts parts;
     };
@@ -140,7 +140,7 @@ class FixedLinks : public SimpleChannel
         return m_links[from * m_stations->size() + to];
     }
 
-    // The identity of a packet of the coordinator, as in sim_backends/network/ip.py; others are numbered.
+    // The identity of a packet of the coordinator, as in sim_backends/network/ip.py; packets of ns-3 are numbered.
     PacketIdentity IdentityOf(Ptr<const Packet> packet, size_t station)
     {
         IdTag tag;
@@ -164,12 +164,12 @@ class FixedLinks : public SimpleChannel
         const std::string& from = (*m_stations)[hop.from].name;
         const std::string& to = (*m_stations)[hop.to].name;
         auto key = std::make_tuple(hop.from, hop.to, purpose, hop.identity.first);
-        auto found = m_streams.find(key);
-        if (found == m_streams.end())
+        auto stream = m_streams.find(key);
+        if (stream == m_streams.end())
         {
-            found = m_streams.emplace(key, RandomStream(seed, {from, to, purpose, hop.identity.first, "0"})).first;
+            stream = m_streams.emplace(key, RandomStream(seed, {from, to, purpose, hop.identity.first, "0"})).first;
         }
-        return found->second.Draw(static_cast<uint64_t>(hop.identity.second));
+        return stream->second.Draw(static_cast<uint64_t>(hop.identity.second));
     }
 
     bool IsOff(size_t station) const

@@ -114,7 +114,7 @@ struct LinkCounters
     double rate_bit_s = NAN; // rate of the last attempt
 };
 
-// Follows the frames of all stations by ns-3's traces.
+// Follows the frames of all stations with ns-3's traces.
 class FrameTracker
 {
   public:
@@ -123,7 +123,7 @@ class FrameTracker
     // Station whose access point forwards a frame before it acknowledges it, as it does without aggregates.
     size_t relay = kNoStation;
 
-    // Called with the id of a packet of which a frame is lost, and the reason.
+    // Called when a frame is lost, with the id of its packet and the reason.
     std::function<void(uint64_t, const std::string&)> on_lost;
 
     // Add the next station, which has no Wi-Fi.
@@ -173,7 +173,7 @@ class FrameTracker
                     m_busy[station].Add(start.GetNanoSeconds(), (start + duration).GetNanoSeconds());
                 }
             }));
-        // It is passed to the host in the order of sequence numbers, possibly after its acknowledgement.
+        // A frame is passed to the host in the order of sequence numbers, possibly after its acknowledgement.
         mac->TraceConnectWithoutContext("MacRx", Callback<void, Ptr<const Packet>>([this, station](Ptr<const Packet> packet) {
                                             Received(station, packet);
                                         }));
@@ -290,12 +290,12 @@ class FrameTracker
     void Transmitted(size_t station, Ptr<const Packet> packet, const WifiTxVector& settings)
     {
         FrameTag tag;
-        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
-        if (found == m_frames.end())
+        auto entry = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (entry == m_frames.end())
         {
             return;
         }
-        HopFrame& frame = found->second;
+        HopFrame& frame = entry->second;
         bool is_first = frame.first_ns < 0;
         if (is_first)
         {
@@ -314,16 +314,16 @@ class FrameTracker
     void Received(size_t station, Ptr<const Packet> packet)
     {
         FrameTag tag;
-        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
-        if (found == m_frames.end() || found->second.to != station)
+        auto entry = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (entry == m_frames.end() || entry->second.to != station)
         {
             return;
         }
-        Complete(found->second);
-        m_last[station] = {NowNs(), found->second.parts};
-        if (found->second.is_acknowledged)
+        Complete(entry->second);
+        m_last[station] = {NowNs(), entry->second.parts};
+        if (entry->second.is_acknowledged)
         {
-            m_frames.erase(found);
+            m_frames.erase(entry);
         }
     }
 
@@ -343,19 +343,19 @@ class FrameTracker
     void Acknowledged(Ptr<const Packet> packet)
     {
         FrameTag tag;
-        auto found = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
-        if (found != m_frames.end() && found->second.is_received)
+        auto entry = packet->PeekPacketTag(tag) ? m_frames.find(tag.number) : m_frames.end();
+        if (entry != m_frames.end() && entry->second.is_received)
         {
-            m_frames.erase(found);
+            m_frames.erase(entry);
         }
-        else if (found != m_frames.end() && found->second.to == relay)
+        else if (entry != m_frames.end() && entry->second.to == relay)
         {
             Lost(packet, "receiver not associated"); // the access point has neither forwarded it nor passed it to its host
-            m_frames.erase(found);
+            m_frames.erase(entry);
         }
-        else if (found != m_frames.end())
+        else if (entry != m_frames.end())
         {
-            found->second.is_acknowledged = true;
+            entry->second.is_acknowledged = true;
         }
     }
 
@@ -369,11 +369,11 @@ class FrameTracker
         FrameTag tag;
         if (mpdu->GetPacket()->PeekPacketTag(tag))
         {
-            auto found = m_frames.find(tag.number);
-            bool is_received = found != m_frames.end() && found->second.is_received;
-            if (found != m_frames.end() && found->second.to != kNoStation && is_unanswered)
+            auto entry = m_frames.find(tag.number);
+            bool is_received = entry != m_frames.end() && entry->second.is_received;
+            if (entry != m_frames.end() && entry->second.to != kNoStation && is_unanswered)
             {
-                m_links[{found->second.from, found->second.to}].failures++;
+                m_links[{entry->second.from, entry->second.to}].failures++;
             }
             m_frames.erase(tag.number);
             if (is_received) // only its acknowledgements were lost
@@ -390,7 +390,7 @@ class FrameTracker
     std::vector<Ptr<MobilityModel>> m_mobilities;
     std::map<std::pair<size_t, size_t>, LinkCounters> m_links; // by transmitter and receiver
     std::vector<Busy> m_busy;
-    std::vector<std::pair<int64_t, DelayParts>> m_last; // of each station: when it received a frame, and its parts
+    std::vector<std::pair<int64_t, DelayParts>> m_last; // time and parts of the last frame that each station received
     Ptr<ConstantSpeedPropagationDelayModel> m_delay = CreateObject<ConstantSpeedPropagationDelayModel>();
 };
 

@@ -1,7 +1,7 @@
 // The network federate of ns-3: docs/ns3.md. Standard input and output carry the protocol of docs/federates.md.
 //
 //     network VERSION                 serve one run
-//     network VERSION alone FILE      simulate the requests of a recorded run in one go, and print its processor time
+//     network VERSION alone FILE      simulate the requests of a recorded run, and print the processor time
 //     network VERSION losses          print the losses of links, for tests
 
 #include "fieldkit/handshake.h"
@@ -96,7 +96,7 @@ class Network
 
     // Prepare a request, and return its `to_ns`.
     //
-    // With `is_ahead`, the simulator has not reached the beginning of the window, and states are set in events.
+    // If `is_ahead`, the simulator has not reached the start of the window, and events set the states.
     int64_t Schedule(const std::string& body, bool is_ahead)
     {
         protocol::NetworkRequest request = protocol::ReadNetworkRequest(body);
@@ -159,7 +159,7 @@ class Network
         }
         for (const protocol::Packet& packet : request.packets)
         {
-            Enter(Accepted(packet));
+            Enter(CheckedPacket(packet));
         }
         return request.to_ns;
     }
@@ -201,7 +201,7 @@ class Network
         return m_outcomes.Drops();
     }
 
-    // Sum of the times of all arrivals, which changes if one of them changes.
+    // A checksum of the times of all arrivals.
     uint64_t checksum() const
     {
         return m_checksum;
@@ -323,7 +323,7 @@ class Network
         m_jammers = std::make_unique<Jammers>(m_stations, *m_channel, m_setup.noise_dbm);
     }
 
-    // A jammer, carried by an agent if it has no place.
+    // Add a jammer, which an agent carries if it has no position.
     void AddJammer(const Json& fault, const Json& place_m)
     {
         std::function<bool(Point&)> place;
@@ -550,8 +550,8 @@ class Network
         }
     }
 
-    // A packet between stations; it is refused if ns-3 cannot carry it.
-    CoordinatorPacket Accepted(const protocol::Packet& entering) const
+    // The packet as a packet between stations; throws a refusal if ns-3 cannot carry it.
+    CoordinatorPacket CheckedPacket(const protocol::Packet& entering) const
     {
         CoordinatorPacket packet;
         packet.id = entering.id;
@@ -627,12 +627,12 @@ class Network
 
     void Arrive(uint64_t id)
     {
-        auto found = m_pending.find(id);
-        if (found == m_pending.end())
+        auto entry = m_pending.find(id);
+        if (entry == m_pending.end())
         {
             return;
         }
-        const CoordinatorPacket& packet = found->second;
+        const CoordinatorPacket& packet = entry->second;
         int64_t now_ns = NowNs();
         DelayParts parts = WithinDelay(m_tracker.PartsNow(packet.destination), now_ns - packet.enters_ns);
         m_outcomes.Arrive(id, now_ns, m_stations[packet.destination].agent, parts);
@@ -641,11 +641,11 @@ class Network
         {
             WriteParts(packet, now_ns - packet.enters_ns, parts);
         }
-        m_pending.erase(found);
+        m_pending.erase(entry);
     }
 
     // The parts of a delay. A frame may have been queued before the TCP message that it completes, so each part is
-    // limited to the rest of the delay.
+    // limited to the remaining delay.
     static DelayParts WithinDelay(DelayParts parts, int64_t delay_ns)
     {
         parts.propagation_ns = std::min(parts.propagation_ns, delay_ns);

@@ -25,7 +25,7 @@ class Ns3Options(SimulatorOptions):
         delay_parts: File for the [parts of each delay](ns3.md#parts-of-the-delay); `{seed}` is replaced by the seed
             of the run.
         pcap: Beginning of the names of captures of 802.11 frames with radiotap, one per radio, for example
-            `air-{seed}-`; with an access point, their times have 1 s more.
+            `air-{seed}-`; with an access point, their time stamps are 1 s later.
     """
 
     standard: Literal["802.11a", "802.11g", "802.11n"] | None = None
@@ -36,7 +36,7 @@ class Ns3Options(SimulatorOptions):
 
     @override
     def unsupported(self, scenario: Mapping[str, Any]) -> Iterator[tuple[str, Location]]:
-        if RadioOptions.model_validate(scenario["radio"]).fixed:
+        if RadioOptions.model_validate(scenario["radio"]).is_fixed:
             for key in ("standard", "ampdu_bytes", "pcap"):
                 if getattr(self, key):
                     yield f"fixed links have no Wi-Fi; remove {key}", ("network", "options", key)
@@ -48,7 +48,7 @@ class Ns3Options(SimulatorOptions):
             yield from ((text, ("traffic", number, key)) for text, key in self._unsupported_traffic(traffic))
 
     def _unsupported_traffic(self, traffic: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        """Yield why traffic is not supported by ns-3's transports, with its key."""
+        """Yield each reason why ns-3's transports do not support some traffic, with the key."""
         if traffic["protocol"] in {"ros1", "ros1-udp"}:
             yield "ns-3 has no ROS 1; set network.transports: builtin", "protocol"
         elif traffic["protocol"] == "topic":
@@ -67,7 +67,7 @@ class Ns3Options(SimulatorOptions):
         """Return `link` with the parameters of fixed links, or `jammers` with a position (or None) per fault."""
         scenario = configuration["scenario"]
         radio = RadioOptions.model_validate(scenario["radio"])
-        if radio.fixed:
+        if radio.is_fixed:
             return {"link": dataclasses.asdict(radio.link())}
         world = World.model_validate(configuration["world"])
         return {"jammers": [_jammer_m(fault, world) for fault in scenario["faults"]]}

@@ -1,4 +1,4 @@
-// Control of ns-3's simulator: the time of the next event, a run up to and including a time, reports while it computes.
+// Control of ns-3's simulator: time of the next event, run up to and including a time, heartbeats during a run.
 
 #ifndef FIELDKIT_SIMULATOR_H
 #define FIELDKIT_SIMULATOR_H

@@ -120,7 +120,7 @@ struct Station
     uint32_t agent = 0;
     double tx_power_dbm = 0;
     double sensitivity_dbm = 0;
-    int off = 0; // number of faults and absences that have switched it off
+    int off = 0; // number of reasons (faults, absence) why it is switched off
     Ptr<Node> node;
     Ptr<AgentMobility> mobility;
     Ptr<NetDevice> device;

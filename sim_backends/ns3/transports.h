@@ -28,7 +28,8 @@ struct CoordinatorPacket
     std::string protocol;
 };
 
-// Called with the id of a packet that has arrived or is dropped.
+// Functions that are called with the id of a packet that has arrived or is dropped.
+
 struct Fates
 {
     std::function<void(uint64_t)> arrive;
@@ -231,9 +232,9 @@ class TcpTransport
         auto socket = Socket::CreateSocket(source.node, TcpSocketFactory::GetTypeId());
         connection->sender = socket;
         socket->Bind();
-        Address own;
-        socket->GetSockName(own);
-        uint16_t port = InetSocketAddress::ConvertFrom(own).GetPort();
+        Address local;
+        socket->GetSockName(local);
+        uint16_t port = InetSocketAddress::ConvertFrom(local).GetPort();
         m_byEnd[{source.address, port}] = connection;
         if (on_connect)
         {

@@ -1,10 +1,10 @@
 """The physics federate of bodies in a world: each follows its course, and stops at a contact.
 
-Bodies move in time steps. A command takes effect at the first step that is not before the time at which it was given,
-and the motion does not depend on how the time is divided into calls. Two things make it fast. A course is evaluated
-only when a state is requested. Contacts are checked only between bodies in a neighbour list (Verlet, Phys. Rev. 159,
-98, 1967): a body that is farther from all obstacles and bodies than its top speed allows cannot touch anything until
-the list expires.
+Bodies move in time steps. A command takes effect at the first step at or after the time of the command,
+and the motion does not depend on how the time is divided into calls. Two measures make this fast. A course is
+evaluated only when a state is requested. Contacts are checked only between bodies in a neighbour list (Verlet, Phys.
+Rev. 159, 98, 1967): a body that is farther from all obstacles and bodies than its top speed allows cannot touch
+anything until the list expires.
 """
 
 import math
@@ -41,7 +41,7 @@ class Bodies:
     Attributes:
         step_ns: Time step.
         names: Names of the bodies, in order.
-        limits_m_s2: See `BodyLimits`; they hold from the last returned states on.
+        limits_m_s2: See `BodyLimits`; valid from the time of the last returned states.
         collisions: The starts of all contacts so far, in order of time.
 
     Raises:
@@ -205,17 +205,17 @@ class Bodies:
     def _move(self, step: int) -> None:
         """Move the bodies that are present up to a step."""
         while self._step < step:
-            until = step
+            end_step = step
             candidates: Mapping[str, ContactCandidates] = {}
             if self._any_moves:
                 candidates = self._current_neighbours().candidates
                 if not any(self._tracks[name].course.moves for name in candidates):
                     candidates = {}  # no candidate moves before its next command
-                until = self._step + 1 if candidates else min(step, self._list_step + self._horizon)
-            self._extend_courses(until)
+                end_step = self._step + 1 if candidates else min(step, self._list_step + self._horizon)
+            self._extend_courses(end_step)
             if candidates:
-                self._resolve_contacts(candidates, until)
-            self._step = until
+                self._resolve_contacts(candidates, end_step)
+            self._step = end_step
 
     def _change_steps_of(self, lifetime: Lifetime) -> Iterator[int]:
         """Yield the step in which a body appears, and the first step in which it has disappeared."""
@@ -224,13 +224,15 @@ class Bodies:
         if lifetime.disappears_ns is not None:
             yield -(-lifetime.disappears_ns // self.step_ns)
 
-    def _is_there(self, name: str) -> bool:
+    def _is_present(self, name: str) -> bool:
         lifetime = self._lifetimes.get(name)
         if lifetime is None:
             return True
         first_step = lifetime.appears_ns // self.step_ns
-        ended = lifetime.disappears_ns is not None and -(-lifetime.disappears_ns // self.step_ns) <= self._step
-        return first_step <= self._step and not ended
+        has_disappeared = (
+            lifetime.disappears_ns is not None and -(-lifetime.disappears_ns // self.step_ns) <= self._step
+        )
+        return first_step <= self._step and not has_disappeared
 
     def _update_present(self) -> None:
         """Add the bodies that appear at the present step, and remove those that disappear.
@@ -238,12 +240,12 @@ class Bodies:
         Raises:
             ConfigurationError: A body that appears overlaps another one.
         """
-        present = {name: body for name, body in self._bodies.items() if self._is_there(name)}
-        new = [name for name in present if name not in self._tracks]
-        added = {name: self._track(name, self._initial_pose(name), self._step) for name in new}
+        present = {name: body for name, body in self._bodies.items() if self._is_present(name)}
+        new_names = [name for name in present if name not in self._tracks]
+        new_tracks = {name: self._track(name, self._initial_pose(name), self._step) for name in new_names}
         self._present = present
-        self._use_tracks({name: added.get(name) or self._tracks[name] for name in present})
-        self._check_no_overlap(new)
+        self._use_tracks({name: new_tracks.get(name) or self._tracks[name] for name in present})
+        self._check_no_overlap(new_names)
         self._list_step = self._step
         self._neighbours = Neighbours(present, self._poses(), self._grounds, self._horizon * self._step_s)
 
@@ -267,8 +269,8 @@ class Bodies:
 
     def _resolve_contacts(self, candidates: Mapping[str, ContactCandidates], step: int) -> None:
         """Stop moving bodies at their contacts in the step that ends now, in order of their names."""
-        before_m = {name: self._tracks[name].pose(step - 1).place_m for name in candidates}
-        current_m = dict(before_m)
+        previous_m = {name: self._tracks[name].pose(step - 1).place_m for name in candidates}
+        current_m = dict(previous_m)
         tracks, touching = {}, {}
         for name in sorted(candidates):
             track = self._tracks[name]
@@ -283,21 +285,21 @@ class Bodies:
                 ),
             ]
             body, ground = self._bodies[name], candidates[name].ground
-            stop = move(body, before_m[name], pose.place_m, footprints, ground)
+            stop = move(body, previous_m[name], pose.place_m, footprints, ground)
             if stop is not None:
                 touching[name] = {contact.name: None for contact in stop.contacts}
-                pose = body.stopped(pose, stop, self._commands[name])
-            grounded = pose if ground is None and stop is None else self._on_ground(name, pose)
-            if stop is not None or grounded is not pose:
-                tracks[name] = self._track(name, grounded, step)
-            current_m[name] = grounded.place_m
+                pose = body.after_contact(pose, stop, self._commands[name])
+            ground_pose = pose if ground is None and stop is None else self._on_ground(name, pose)
+            if stop is not None or ground_pose is not pose:
+                tracks[name] = self._track(name, ground_pose, step)
+            current_m[name] = ground_pose.place_m
         self._record_collisions(touching, step)
         self._replace_tracks(tracks)
 
     def _record_collisions(self, touching: Mapping[str, Collection[str]], step: int) -> None:
         for name, names in touching.items():
-            new = [other for other in names if other not in self._touching.get(name, ())]
-            self.collisions += [Collision(step * self.step_ns, name, other) for other in new]
+            new_obstacles = [other for other in names if other not in self._touching.get(name, ())]
+            self.collisions += [Collision(step * self.step_ns, name, other) for other in new_obstacles]
         self._touching = touching
 
     def _replace_tracks(self, tracks: Mapping[str, Track]) -> None:
@@ -319,8 +321,8 @@ class Bodies:
 
     def _on_ground(self, name: str, pose: Pose) -> Pose:
         """Return a pose moved to the ground below it; the same object if it is on the ground or flies."""
-        grounded: Pose = self._bodies[name].on_surface(pose, self._grounds[name].surface(*pose.place_m[:2]))
-        return grounded
+        ground_pose: Pose = self._bodies[name].on_surface(pose, self._grounds[name].surface(*pose.place_m[:2]))
+        return ground_pose
 
     def _poses(self) -> dict[str, Pose]:
         return {name: track.pose(self._step) for name, track in self._tracks.items()}
@@ -333,14 +335,14 @@ class Bodies:
                 raise ConfigurationError(f"{name} starts at {place_m}", remedy="use finite coordinates in metres")
             self._check_free(name, place_m, self._grounds[name].obstacles)
 
-    def _check_no_overlap(self, new: Collection[str]) -> None:
+    def _check_no_overlap(self, new_names: Collection[str]) -> None:
         """Check that bodies that appear now overlap no other body."""
         places_m = {name: pose.place_m for name, pose in self._poses().items()}
-        names = [*(name for name in places_m if name not in new), *new]
+        names = [*(name for name in places_m if name not in new_names), *new_names]
         grid = CellGrid(2 * max((body.radius_m for body in self._present.values()), default=0.0))
         for number, name in enumerate(names):
             place_m = places_m[name]
-            others = [names[other] for other in grid.nearby_indices(place_m)] if name in new else []
+            others = [names[other] for other in grid.nearby_indices(place_m)] if name in new_names else []
             footprints = [cylinder_footprint(other, places_m[other], self._bodies[other]) for other in others]
             self._check_free(name, place_m, footprints)
             grid.add(number, place_m)

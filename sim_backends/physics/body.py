@@ -122,7 +122,7 @@ class Body(Protocol[PoseT]):
         """
         ...
 
-    def stopped(self, pose: PoseT, stop: ContactStop, command: object) -> PoseT:
+    def after_contact(self, pose: PoseT, stop: ContactStop, command: object) -> PoseT:
         """Return the pose after a contact.
 
         Args:

@@ -85,7 +85,7 @@ class ContactStop:
         """Return the part of a velocity that leads into none of the touched obstacles."""
         for contact in self.contacts:
             inward = sum(v * n for v, n in zip(velocity, contact.normal, strict=True))
-            velocity = _plus(velocity, contact.normal, -min(inward, 0.0))
+            velocity = _add(velocity, contact.normal, -min(inward, 0.0))
         for contact in self.contacts:
             if sum(v * n for v, n in zip(velocity, contact.normal, strict=True)) < -TOUCH_M:
                 return (0.0, 0.0, 0.0)  # a corner: the direction away from one side leads into the other
@@ -206,7 +206,7 @@ def move(
         # If sliding around a corner made the path longer than the intended one, it is shortened; in a corner,
         # to 0.
         place_m, retry_contacts = _move_in_pieces(
-            extent, from_m, _between(from_m, to_m, path_m / moved_m), footprints, edge
+            extent, from_m, _interpolate(from_m, to_m, path_m / moved_m), footprints, edge
         )
         contacts += retry_contacts
         if math.dist(from_m, place_m) > path_m:
@@ -219,12 +219,12 @@ def _move_in_pieces(
 ) -> tuple[Vector, list[Contact]]:
     """Return the position of a cylinder after a path, and its contacts."""
     pieces = max(math.ceil(2 * math.dist(from_m, to_m) / extent.radius_m), 1)
-    offset_m = _scaled(_minus(to_m, from_m), 1 / pieces)
+    offset_m = _scale(_subtract(to_m, from_m), 1 / pieces)
     place_m = from_m
     contacts: list[Contact] = []
     for number in range(1, pieces + 1):
         # Without a contact, the position is computed exactly as without this division into pieces.
-        next_m = _plus(place_m, offset_m) if contacts else _between(from_m, to_m, number / pieces)
+        next_m = _add(place_m, offset_m) if contacts else _interpolate(from_m, to_m, number / pieces)
         place_m, new_contacts = _push_out(extent, place_m, next_m, footprints, edge)
         contacts += new_contacts
     return place_m, contacts
@@ -241,12 +241,12 @@ def _push_out(
         for footprint in footprints:
             if overlaps(footprint, extent, place_m):
                 normal, depth_m = _exit_direction(footprint, extent, from_m, place_m)
-                place_m = _plus(place_m, normal, depth_m)
+                place_m = _add(place_m, normal, depth_m)
                 new_contacts.append(Contact(footprint.name, normal))
         if edge is not None and (edge_stop := edge.edge_stop(from_m, place_m)) is not None:
             name, stop_m = edge_stop
-            normal = _minus(stop_m, place_m)
-            new_contacts.append(Contact(name, _scaled(normal, 1 / math.hypot(*normal))))
+            normal = _subtract(stop_m, place_m)
+            new_contacts.append(Contact(name, _scale(normal, 1 / math.hypot(*normal))))
             place_m = stop_m
         if not new_contacts:
             return place_m, contacts
@@ -263,14 +263,17 @@ def _exit_direction(footprint: Footprint, extent: Extent, from_m: Vector, place_
     closest_e_m, closest_n_m = footprint.closest_m(place_m[0], place_m[1])
     east_m, north_m = place_m[0] - closest_e_m, place_m[1] - closest_n_m
     distance_m = math.hypot(east_m, north_m)
-    above, below = from_m[2] >= footprint.high_m - TOUCH_M, from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M
-    if extent.flies and above:
+    is_above, is_below = (
+        from_m[2] >= footprint.high_m - TOUCH_M,
+        from_m[2] + extent.height_m <= footprint.low_m + TOUCH_M,
+    )
+    if extent.flies and is_above:
         return (0.0, 0.0, 1.0), footprint.high_m - place_m[2]
-    if extent.flies and below:
+    if extent.flies and is_below:
         return (0.0, 0.0, -1.0), place_m[2] + extent.height_m - footprint.low_m
-    if above or below or not distance_m:
+    if is_above or is_below or not distance_m:
         path_m = math.dist(from_m, place_m)
-        return _scaled(_minus(from_m, place_m), 1 / (path_m or 1.0)), path_m
+        return _scale(_subtract(from_m, place_m), 1 / (path_m or 1.0)), path_m
     return (east_m / distance_m, north_m / distance_m, 0.0), footprint.reach_m + extent.radius_m - distance_m
 
 
@@ -280,17 +283,17 @@ def _horizontal_gap_m(footprint: Footprint, extent: Extent, place_m: Vector) -> 
     return to_centre_m - footprint.reach_m - extent.radius_m
 
 
-def _between(from_m: Vector, to_m: Vector, share: float) -> Vector:
-    return _plus(from_m, _minus(to_m, from_m), share)
+def _interpolate(from_m: Vector, to_m: Vector, share: float) -> Vector:
+    return _add(from_m, _subtract(to_m, from_m), share)
 
 
-def _plus(left: Vector, right: Vector, factor: float = 1.0) -> Vector:
+def _add(left: Vector, right: Vector, factor: float = 1.0) -> Vector:
     return left[0] + factor * right[0], left[1] + factor * right[1], left[2] + factor * right[2]
 
 
-def _minus(left: Vector, right: Vector) -> Vector:
-    return _plus(left, right, -1.0)
+def _subtract(left: Vector, right: Vector) -> Vector:
+    return _add(left, right, -1.0)
 
 
-def _scaled(vector: Vector, factor: float) -> Vector:
-    return _plus((0.0, 0.0, 0.0), vector, factor)
+def _scale(vector: Vector, factor: float) -> Vector:
+    return _add((0.0, 0.0, 0.0), vector, factor)

@@ -178,7 +178,7 @@ class DifferentialDrive:
     def course(self, pose: DrivePose, command: object, step_s: float) -> Arc:
         """Implement `Body.course`."""
         limits = self._limits
-        twist = checked_twist(command)
+        twist = require_twist(command)
         speed_m_s = _clamp(twist.forward_m_s, limits.speed_m_s)
         turn_rad_s = _clamp(twist.turn_rad_s, limits.turn_rad_s)
         max_m_s2 = self._acceleration_m_s2(pose, faster=speed_m_s > pose.speed_m_s)
@@ -218,16 +218,16 @@ class DifferentialDrive:
         grip_m_s2 = math.sqrt(max((limits.friction * normal_m_s2) ** 2 - sideways_m_s2**2, 0.0))
         return min(limits.acceleration_m_s2, grip_m_s2 - downhill_m_s2 if faster else grip_m_s2 + downhill_m_s2)
 
-    def stopped(self, pose: DrivePose, stop: ContactStop, command: object) -> DrivePose:
-        """Implement `Body.stopped`.
+    def after_contact(self, pose: DrivePose, stop: ContactStop, command: object) -> DrivePose:
+        """Implement `Body.after_contact`.
 
-        At a wall it slides on with the component of its velocity along the wall, limited to the same component of the
+        At a wall it continues with the component of its velocity along the wall, limited to the same component of the
         commanded velocity; a robot that heads straight into a wall stops.
         """
         heading: Vector = (math.cos(pose.heading_rad), math.sin(pose.heading_rad), 0.0)
         direction: Vector = stop.sliding_velocity(heading if pose.speed_m_s > 0 else (-heading[0], -heading[1], 0.0))
         share = math.hypot(*direction)
-        max_m_s = min(abs(pose.speed_m_s), abs(checked_twist(command).forward_m_s) * share)
+        max_m_s = min(abs(pose.speed_m_s), abs(require_twist(command).forward_m_s) * share)
         return pose._replace(
             place_m=stop.place_m,
             speed_m_s=math.copysign(max_m_s, pose.speed_m_s),
@@ -241,7 +241,7 @@ class DifferentialDrive:
         return math.hypot(limits.acceleration_m_s2, limits.speed_m_s * limits.turn_rad_s * stretch)
 
 
-def checked_twist(command: object) -> Twist:
+def require_twist(command: object) -> Twist:
     """Return a command to a robot on wheels; None means a twist of 0.
 
     Raises:
@@ -262,12 +262,12 @@ def _clamp(value: float, limit: float) -> float:
     return max(-limit, min(value, limit))
 
 
-def _approach(now: float, target: float, limit: float, step_s: float) -> tuple[float, int]:
+def _approach(value: float, target: float, limit: float, step_s: float) -> tuple[float, int]:
     """Return the rate at which a value approaches its target, and the number of whole steps; 0 and 0 at the target.
 
     A remainder that is less than a whole step at the limit is covered in one step at a smaller rate.
     """
-    difference = target - now
+    difference = target - value
     if abs(difference) <= _REACHED:
         return 0.0, 0
     steps = math.floor(abs(difference) / (limit * step_s) + 1e-9)

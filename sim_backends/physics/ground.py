@@ -22,7 +22,7 @@ _FLOOR: Final = Footprint("ground", lambda east_m, north_m: (east_m, north_m), 0
 
 
 @dataclass(frozen=True)
-class _Piece:
+class _Area:
     """An area of ground that is higher than its surroundings.
 
     Attributes:
@@ -61,7 +61,7 @@ class Ground:
     """
 
     def __init__(self, world: World | None, max_grade: float | None) -> None:
-        self._pieces = []
+        self._areas = []
         footprints: list[Footprint] = [] if max_grade is not None else [_FLOOR]
         for obstacle in world.obstacles if world is not None else ():
             if (
@@ -70,23 +70,23 @@ class Ground:
                 and math.hypot(*obstacle.grade) <= max_grade
             ):
                 nearest_m = rectangle(obstacle.centre_m, obstacle.size_m, math.radians(obstacle.yaw_deg))
-                self._pieces.append(_Piece(obstacle, nearest_m))
+                self._areas.append(_Area(obstacle, nearest_m))
             else:
                 footprints += [shape_footprint(part.obstacle, part.shape) for part in obstacle.parts()]
-        self.obstacles: Sequence[Footprint] = (*footprints, *map(self._side, self._pieces))
-        self._max_grade = max((math.hypot(*piece.obstacle.grade) for piece in self._pieces), default=0.0)
+        self.obstacles: Sequence[Footprint] = (*footprints, *map(self._side, self._areas))
+        self._max_grade = max((math.hypot(*area.obstacle.grade) for area in self._areas), default=0.0)
 
     def surface(self, east_m: float, north_m: float) -> Surface:
         """Return the ground at a point: the highest area there."""
-        pieces = [piece.obstacle for piece in self._pieces if piece.distance_m(east_m, north_m) <= _LEVEL_M / 1000]
-        highest = max(pieces, key=lambda area: area.height_m((east_m, north_m)), default=None)
+        areas = [area.obstacle for area in self._areas if area.distance_m(east_m, north_m) <= _LEVEL_M / 1000]
+        highest = max(areas, key=lambda area: area.height_m((east_m, north_m)), default=None)
         if highest is None:
             return Surface(0.0)
         return Surface(highest.height_m((east_m, north_m)), highest.grade)
 
     def edge_m(self, place_m: Vector) -> float:
         """Return the minimum distance to the edge of an area of ground."""
-        return min((piece.edge_m(place_m[0], place_m[1]) for piece in self._pieces), default=math.inf)
+        return min((area.edge_m(place_m[0], place_m[1]) for area in self._areas), default=math.inf)
 
     def edge_stop(self, from_m: Vector, to_m: Vector) -> tuple[str, Vector] | None:
         """Return the edge over which a body would drive, and the point where it stops; None if there is no edge."""
@@ -94,26 +94,26 @@ class Ground:
         drop_m = from_m[2] - self.surface(east_m, north_m).height_m
         if drop_m <= _LEVEL_M + self._max_grade * math.dist(from_m, to_m):
             return None
-        pieces_below = [
-            piece
-            for piece in self._pieces
-            if piece.distance_m(from_m[0], from_m[1]) <= _LEVEL_M
-            and abs(piece.obstacle.height_m((from_m[0], from_m[1])) - from_m[2]) <= _LEVEL_M
+        areas_below = [
+            area
+            for area in self._areas
+            if area.distance_m(from_m[0], from_m[1]) <= _LEVEL_M
+            and abs(area.obstacle.height_m((from_m[0], from_m[1])) - from_m[2]) <= _LEVEL_M
         ]
-        if not pieces_below:
+        if not areas_below:
             return None
-        nearest = min(pieces_below, key=lambda piece: piece.distance_m(east_m, north_m))
+        nearest = min(areas_below, key=lambda area: area.distance_m(east_m, north_m))
         return nearest.obstacle.name, (*nearest.nearest_m(east_m, north_m), up_m)
 
-    def _side(self, piece: _Piece) -> Footprint:
-        top_m = piece.obstacle.size_m[2]
-        return Footprint(piece.obstacle.name, piece.nearest_m, 0.0, 0.0, top_m, partial(self._wall_m, piece))
+    def _side(self, area: _Area) -> Footprint:
+        top_m = area.obstacle.size_m[2]
+        return Footprint(area.obstacle.name, area.nearest_m, 0.0, 0.0, top_m, partial(self._wall_m, area))
 
-    def _wall_m(self, piece: _Piece, east_m: float, north_m: float) -> float:
+    def _wall_m(self, area: _Area, east_m: float, north_m: float) -> float:
         """Return the height of the side of an area at one of its points; 0 if other ground leads up to it."""
-        height_m = piece.obstacle.height_m((east_m, north_m))
-        others = (
-            other for other in self._pieces if other is not piece and other.distance_m(east_m, north_m) <= _LEVEL_M
+        height_m = area.obstacle.height_m((east_m, north_m))
+        other_areas = (
+            other for other in self._areas if other is not area and other.distance_m(east_m, north_m) <= _LEVEL_M
         )
         lower_m = height_m - _LEVEL_M
-        return 0.0 if any(other.obstacle.height_m((east_m, north_m)) >= lower_m for other in others) else lower_m
+        return 0.0 if any(other.obstacle.height_m((east_m, north_m)) >= lower_m for other in other_areas) else lower_m

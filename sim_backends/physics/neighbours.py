@@ -18,15 +18,15 @@ _ROUNDING: Final = 1 + 1e-9
 
 
 class CellGrid:
-    """Numbers by the square cell of their position; nine cells contain all numbers within a given distance.
+    """Numbers at positions, grouped by square cells. The nine cells around a position contain all nearby numbers.
 
     Args:
-        within_m: This distance, horizontally, in metres.
+        distance_m: Horizontal distance within which numbers are nearby, in metres.
     """
 
-    def __init__(self, within_m: float) -> None:
+    def __init__(self, distance_m: float) -> None:
         # Cells may be larger than the distance. The minimum of 1 m keeps cell numbers finite for any finite position.
-        self._cell_m = max(within_m * _ROUNDING, 1.0)
+        self._cell_m = max(distance_m * _ROUNDING, 1.0)
         self._cells: defaultdict[tuple[int, int], list[int]] = defaultdict(list)
 
     def add(self, number: int, place_m: Vector) -> None:

@@ -7,11 +7,11 @@ from typing import Any, Final
 from sim_backends.world.motion import Motion, State, WayPoints
 
 STEP_NS: Final = 1_000_000
-"""The usual step of Gazebo and of ns-3 co-simulations, 1 ms."""
+"""The default step of Gazebo, also common in ns-3 co-simulations: 1 ms."""
 
 
 class Paths:
-    """Moves agents along given motions, in steps; commands have no effect.
+    """Moves agents along prescribed motions, in steps; commands have no effect.
 
     Args:
         motions: The motions; no two of them move the same agent.
@@ -38,7 +38,7 @@ class Paths:
         return self._states
 
     def limit_m_s2(self, name: str) -> float:
-        """Return the limit of an agent without a given limit; it is valid from the last returned states on."""
+        """Return the limit of an agent that is not listed; it is valid from the time of the last returned states."""
         waypoints = self._waypoints.get(name)
         return math.inf if waypoints is None else waypoints.limit_m_s2(self._at_ns)
 
@@ -54,13 +54,13 @@ class Paths:
 class PathLimits(Mapping[str, float]):
     """The maximum acceleration of each agent of `Paths`."""
 
-    def __init__(self, paths: Paths, given: Mapping[str, float]) -> None:
+    def __init__(self, paths: Paths, limits_m_s2: Mapping[str, float]) -> None:
         self._paths = paths
-        self._given = given
+        self._limits_m_s2 = limits_m_s2
 
     def __getitem__(self, name: str) -> float:
-        given = self._given.get(name)
-        return self._paths.limit_m_s2(name) if given is None else given
+        limits_m_s2 = self._limits_m_s2.get(name)
+        return self._paths.limit_m_s2(name) if limits_m_s2 is None else limits_m_s2
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._paths.names)

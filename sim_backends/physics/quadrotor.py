@@ -167,11 +167,11 @@ class VelocityController:
         v_e, v_n, v_u = velocity_m_s
         to_e, to_n, to_u = target.velocity_m_s
         gain_per_s, climb_per_s = limits.gains_per_s
-        a_e, a_n = _limited(gain_per_s * (to_e - v_e), gain_per_s * (to_n - v_n), limits.acceleration_m_s2)
+        a_e, a_n = _limit_length(gain_per_s * (to_e - v_e), gain_per_s * (to_n - v_n), limits.acceleration_m_s2)
         a_u = _clip_range(climb_per_s * (to_u - v_u), limits.climb_m_s2)
         drag_per_s = (limits.drag_n_s_m + limits.drag_n_s2_m2 * math.hypot(v_e, v_n, v_u)) / limits.mass_kg
         up = max(a_u + GRAVITY_M_S2 + drag_per_s * v_u, limits.thrust_n[0] / limits.mass_kg)
-        east, north = _limited(a_e + drag_per_s * v_e, a_n + drag_per_s * v_n, up * self._max_tilt_ratio)
+        east, north = _limit_length(a_e + drag_per_s * v_e, a_n + drag_per_s * v_n, up * self._max_tilt_ratio)
         return east, north, up
 
     def fly(self, pose: FlightPose, target: Velocity, step_s: float) -> FlightPose:
@@ -182,11 +182,11 @@ class VelocityController:
         cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
         forward, left = f_e * cos_yaw + f_n * sin_yaw, f_n * cos_yaw - f_e * sin_yaw
         share, limit = -math.expm1(-step_s / limits.lag_s), limits.tilt_rate_rad_s * step_s
-        pitch = _lagged(pitch, math.atan2(forward, f_u), share, limit)
-        roll = _lagged(roll, -math.atan2(left, math.hypot(forward, f_u)), share, limit)
+        pitch = _follow(pitch, math.atan2(forward, f_u), share, limit)
+        roll = _follow(roll, -math.atan2(left, math.hypot(forward, f_u)), share, limit)
         if target.yaw_rad is not None:
             error_rad = math.remainder(target.yaw_rad - yaw, math.tau)
-            yaw = _lagged(yaw, yaw + error_rad, share, limits.yaw_rate_rad_s * step_s)
+            yaw = _follow(yaw, yaw + error_rad, share, limits.yaw_rate_rad_s * step_s)
         # Actual thrust: its vertical component has the desired value, within the bounds of thrust.
         upright = math.cos(roll) * math.cos(pitch)
         f = _clip(f_u / upright, limits.thrust_n[0] / limits.mass_kg, limits.thrust_n[1] / limits.mass_kg)
@@ -205,19 +205,19 @@ class VelocityController:
         )
 
 
-def _lagged(now: float, target: float, share: float, limit: float) -> float:
-    return now + _clip(share * (target - now), -limit, limit)
+def _follow(value: float, target: float, share: float, limit: float) -> float:
+    return value + _clip(share * (target - value), -limit, limit)
 
 
-def _clip(value: float, minimum: float, limit: float) -> float:
-    return max(minimum, min(value, limit))
+def _clip(value: float, minimum: float, maximum: float) -> float:
+    return max(minimum, min(value, maximum))
 
 
 def _clip_range(value: float, limits: tuple[float, float]) -> float:
     return _clip(value, -limits[0], limits[1])
 
 
-def _limited(first: float, second: float, limit: float) -> tuple[float, float]:
+def _limit_length(first: float, second: float, limit: float) -> tuple[float, float]:
     """Return a vector, shortened to a maximum length if it is longer."""
     length = math.hypot(first, second)
     return (first, second) if length <= limit else (first * limit / length, second * limit / length)
@@ -269,8 +269,8 @@ class Quadrotor:
             return Glide(pose, target.velocity_m_s, step_s)
         return Flight(pose, autopilot, target, step_s)
 
-    def stopped(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:
-        """Implement `Body.stopped`: it keeps the component of its velocity along the obstacle.
+    def after_contact(self, pose: FlightPose, stop: ContactStop, command: object) -> FlightPose:
+        """Implement `Body.after_contact`: it keeps the component of its velocity along the obstacle.
 
         Without power it comes to rest in a level attitude on whatever supports it.
         """
@@ -304,7 +304,7 @@ class Quadrotor:
         east, north, up = command.velocity_m_s
         limits = self._limits
         return Velocity(
-            (*_limited(east, north, limits.speed_m_s), _clip_range(up, limits.climb_m_s)), command.yaw_rad
+            (*_limit_length(east, north, limits.speed_m_s), _clip_range(up, limits.climb_m_s)), command.yaw_rad
         )
 
 
@@ -312,6 +312,6 @@ def _is_steady(autopilot: VelocityController, pose: FlightPose, target: Velocity
     """Return True if a quadrotor will keep the target velocity permanently, except for rounding."""
     if math.dist(pose.velocity_m_s, target.velocity_m_s) > _REACHED:
         return False
-    later = autopilot.fly(pose, target, 1.0)
-    changes = (abs(first - second) for first, second in zip(later[2:], pose[2:], strict=True))
-    return max(changes) <= _REACHED and math.dist(later.velocity_m_s, pose.velocity_m_s) <= _REACHED
+    next_pose = autopilot.fly(pose, target, 1.0)
+    changes = (abs(first - second) for first, second in zip(next_pose[2:], pose[2:], strict=True))
+    return max(changes) <= _REACHED and math.dist(next_pose.velocity_m_s, pose.velocity_m_s) <= _REACHED

@@ -1,4 +1,4 @@
-"""Limits and sizes of the robots that the physics supports, and those robots by the name of their robot profile."""
+"""Limits and sizes of the robots that the physics supports, and the robots by the name of their profile."""
 
 import math
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ QOS_HEADER_BYTES: Final = HEADER_BYTES + 2
 """Headers of a QoS data frame: 9.2.4.5."""
 
 TYPICAL_FRAMES: Final = 16
-"""Number of frames per aggregate for which rate control compares modes. Our choice, between 1 and the window."""
+"""Number of frames per aggregate for which rate control compares modes. An assumption, between 1 and the window."""
 
 _DELIMITER_BYTES: Final = 4
 MAX_PPDU_NS: Final = 5_484_000
@@ -81,9 +81,9 @@ class BlockAckSession(Generic[Payload]):
         self._limits = limits
         self._next_sequence = 0
         # The next sequence number that the recipient passes up; decoded frames after it; numbers that were given up.
-        self._expected = 0
+        self._next_passed_up = 0
         self._frames_waiting: dict[int, Frame[Payload]] = {}
-        self._skipped: set[int] = set()
+        self._skipped_sequences: set[int] = set()
 
     @property
     def block_ack_bytes(self) -> int:
@@ -141,16 +141,16 @@ class BlockAckSession(Generic[Payload]):
 
     def skip(self, frames: Iterable[Frame[Payload]]) -> list[Frame[Payload]]:
         """Give up frames that were not received; return the frames that the recipient passes up now."""
-        self._skipped.update(frame.sequence for frame in frames if frame.sequence >= 0)
+        self._skipped_sequences.update(frame.sequence for frame in frames if frame.sequence >= 0)
         return self._pop_in_order()
 
     def _pop_in_order(self) -> list[Frame[Payload]]:
         frames = []
-        while self._expected in self._frames_waiting or self._expected in self._skipped:
-            if (frame := self._frames_waiting.pop(self._expected, None)) is not None:
+        while self._next_passed_up in self._frames_waiting or self._next_passed_up in self._skipped_sequences:
+            if (frame := self._frames_waiting.pop(self._next_passed_up, None)) is not None:
                 frames.append(frame)
-            self._skipped.discard(self._expected)
-            self._expected += 1
+            self._skipped_sequences.discard(self._next_passed_up)
+            self._next_passed_up += 1
         return frames
 
 

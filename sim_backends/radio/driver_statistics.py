@@ -144,14 +144,14 @@ def _station_sample(
     now_ns: int, channel: RadioChannel, meter: RadioMeter, peers: _Peers, link: tuple[int, int]
 ) -> StationSample:
     index, other = link
-    sent, reverse, peer = meter.link(index, other), meter.link(other, index), peers.get((other, index))
+    forward, reverse, peer = meter.link(index, other), meter.link(other, index), peers.get((other, index))
     return StationSample(
         station=channel.names[other],
         signal_dbm=decibel(channel.powers_mw(other, now_ns)[index]) if channel.are_linked(other, index) else None,
-        tx_rate_bit_s=sent.rate_bit_s,
+        tx_rate_bit_s=forward.rate_bit_s,
         rx_rate_bit_s=reverse.rate_bit_s,
-        tx_packets=sent.frames,
+        tx_packets=forward.frames,
         rx_packets=0 if peer is None else peer.delivered,
-        tx_retries=sent.retries,
-        tx_failures=sent.failures,
+        tx_retries=forward.retries,
+        tx_failures=forward.failures,
     )

@@ -67,7 +67,7 @@ class FirmwareRate(RateControl):
     def _select(self, now_ns: int) -> None:
         self._next_ns = now_ns + self._interval_ns
         usable_db = self._signal_to_noise_db(now_ns) - self._margin_db
-        self._mode_index = max(sum(required <= usable_db for required in self._required_db) - 1, 0)
+        self._mode_index = max(sum(mode_db <= usable_db for mode_db in self._required_db) - 1, 0)
         if self._frames:
             share = self._acknowledged / self._frames
             self._frames = self._acknowledged = 0

@@ -248,7 +248,7 @@ class FixedLinks(Generic[Payload]):
         return deliveries
 
     def log_losses(self, log: LossLog | None) -> None:
-        """Pass every loss from now on to `log`; None stops logging."""
+        """Pass every later loss to `log`; None stops logging."""
         self._log_loss = log
 
     def disturb(self, now_ns: int, off: Set[str], cut: Set[Pair]) -> None:

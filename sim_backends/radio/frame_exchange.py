@@ -268,18 +268,20 @@ class FrameExchange(Generic[Payload]):
         aggregate: Aggregate[Payload],
         transmission: Transmission,
     ) -> None:
-        decoded = aggregate.decoded_frames = self.reception.decode_frames(peer.receiver, transmission, aggregate)
+        decoded_frames = aggregate.decoded_frames = self.reception.decode_frames(
+            peer.receiver, transmission, aggregate
+        )
         self.reception.end(now_ns, transmission)
         if self.log is not None:
             for frame in aggregate.frames:
-                received = [peer.receiver] if frame in decoded else []
+                received = [peer.receiver] if frame in decoded_frames else []
                 size_bytes = frame.size_bytes + QOS_HEADER_BYTES
                 self.log(attempt_record(self._names, transmission, frame, received, size_bytes))
         if station.aggregate is not aggregate:
             return  # aborted: its radio was switched off
         assert peer.session is not None
-        self.delivery.pass_up(now_ns, station.index, peer, peer.session.receive(decoded))
-        self._await_response(now_ns, station, peer, transmission, is_decoded=bool(decoded))
+        self.delivery.pass_up(now_ns, station.index, peer, peer.session.receive(decoded_frames))
+        self._await_response(now_ns, station, peer, transmission, is_decoded=bool(decoded_frames))
 
     def _await_response(
         self,
@@ -330,7 +332,7 @@ class FrameExchange(Generic[Payload]):
         is_decoded = station.receiving is ack and self.reception.decodes(station.index, ack, "ack")
         self.reception.end(now_ns, ack)
         if self.log is not None:
-            self.log(control_record(self._names, ack, station.index, "ACK", decoded=is_decoded))
+            self.log(control_record(self._names, ack, station.index, "ACK", is_decoded=is_decoded))
         if exchange_id == station.exchange_id:
             self._finish_attempt(now_ns, station, peer, acknowledged=is_decoded)
 

@@ -229,11 +229,11 @@ def attempt_record(
 
 
 def control_record(
-    names: Sequence[str], transmission: Transmission, receiver: int, kind: ControlFrame, *, decoded: bool
+    names: Sequence[str], transmission: Transmission, receiver: int, kind: ControlFrame, *, is_decoded: bool
 ) -> TransmissionAttempt:
     """Return the log entry of a control frame for `receiver`."""
     name = names[receiver]
-    received = (name,) if decoded else ()
+    received = (name,) if is_decoded else ()
     return TransmissionAttempt(
         transmission.start_ns,
         transmission.end_ns,

@@ -1,7 +1,7 @@
 """Minstrel-HT: the rate control of Linux for radios of 802.11n and later whose driver is a SoftMAC.
 
 The algorithm is from `net/mac80211/rc80211_minstrel_ht.c` in Linux 5.14 and later. Modes form groups with equal
-width, guard interval and number of streams. Each mode has a smoothed_share share of acknowledged frames, updated
+width, guard interval and number of streams. Each mode has a smoothed share of acknowledged frames, updated
 every 50 ms. Three modes form the chain of a frame: the two with the highest expected throughput, and a robust one. At
 most every 20 ms a frame tries another mode once before the second mode of the chain.
 

@@ -127,10 +127,10 @@ class PacketDelivery(Generic[Payload]):
         transmitter: int,
         frame: Frame[Payload],
         received: Sequence[int],
-        addressed: Iterable[int],
+        addressed_stations: Iterable[int],
     ) -> None:
         """Count a broadcast on the link to each addressed station, and log its loss for stations that missed it."""
-        for index in addressed:
+        for index in addressed_stations:
             name = self._channel.names[index]
             is_linked, is_missed = self._channel.are_linked(transmitter, index), index not in received
             if is_linked:

@@ -52,8 +52,8 @@ def _reflection(sine: Floats, frequency_hz: float) -> NDArray[np.complex128]:
     """Return the reflection coefficient of the ground for a wave that arrives at an angle with this sine."""
     permittivity = GROUND.permittivity(frequency_hz)
     root = np.sqrt(permittivity - (1 - sine**2))
-    reflected: NDArray[np.complex128] = (permittivity * sine - root) / (permittivity * sine + root)
-    return reflected
+    reflection: NDArray[np.complex128] = (permittivity * sine - root) / (permittivity * sine + root)
+    return reflection
 
 
 def _length_m(start_m: Floats, end_m: Floats) -> Floats:

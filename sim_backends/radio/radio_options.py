@@ -124,7 +124,7 @@ class RadioOptions(Strict):
     jitter: Annotated[Duration, Field(le=60)] | None = None
 
     @property
-    def fixed(self) -> bool:
+    def is_fixed(self) -> bool:
         """True if every link is fixed."""
         return any(option is not None for option in (self.loss, self.delay, self.rate, self.jitter))
 
@@ -135,7 +135,7 @@ class RadioOptions(Strict):
 
     @schema.model_validator(mode="after")
     def _check_infrastructure(self) -> "RadioOptions":
-        if self.fixed and self.has_infrastructure:
+        if self.is_fixed and self.has_infrastructure:
             key = next(key for key in INFRASTRUCTURE if getattr(self, key))
             raise schema.validation_error(f"fixed links (loss, delay, rate or jitter) have no {key}", key)
         return self

@@ -144,12 +144,12 @@ class Minstrel(RateControl):
     def _rank(self) -> None:
         throughput = {mode: share / self._time_ns[mode] for mode, share in self._share.items()}
         # Among modes with almost no success, the slowest is tried first.
-        ranked = sorted(
+        ranked_modes = sorted(
             self._modes,
             key=lambda mode: (throughput[mode] if self._share[mode] >= _LOW_SHARE else 0, self._time_ns[mode]),
             reverse=True,
         )
-        self._best, self._second = ranked[:2]
+        self._best, self._second = ranked_modes[:2]
         reliable = [mode for mode in self._modes if self._share[mode] >= _HIGH_SHARE]
         self._robust = (
             max(reliable, key=throughput.__getitem__) if reliable else max(self._modes, key=self._share.__getitem__)

@@ -137,4 +137,4 @@ class RtsCts(Generic[Payload]):
 
     def _log(self, transmission: Transmission, receiver: int, kind: ControlFrame, *, is_decoded: bool) -> None:
         if self.log is not None:
-            self.log(control_record(self._names, transmission, receiver, kind, decoded=is_decoded))
+            self.log(control_record(self._names, transmission, receiver, kind, is_decoded=is_decoded))

@@ -1,1 +1,1 @@
-"""ROS 1 without its libraries: framing of TCPROS, a client of the master, a node."""
+"""ROS 1 without its libraries: framing of TCPROS, calls between nodes and their master, a node."""

@@ -25,7 +25,7 @@ def unpack_length(data: bytes) -> int:
     """Return the length at the start of a packet.
 
     Raises:
-        ValueError: It exceeds `MAX_BYTES`.
+        ValueError: The length exceeds `MAX_BYTES`.
     """
     (length,) = _LENGTH.unpack(data)
     if length > MAX_BYTES:
@@ -42,7 +42,7 @@ def unpack_header(payload: bytes) -> dict[str, str]:
     """Return the fields of a connection header.
 
     Raises:
-        ValueError: It is damaged.
+        ValueError: The header is damaged.
     """
     packets = PacketSplitter()
     packets.feed(payload)

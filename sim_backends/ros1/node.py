@@ -65,43 +65,45 @@ class RosPublisher:
         return len(self._streams)
 
     def accept(self, stream: socket.socket, header: Mapping[str, str]) -> None:
-        """Answer the connection header of a subscriber, and send it the messages from now on.
+        """Answer the connection header of a subscriber, and send it all later messages until it disconnects.
 
         Raises:
             ValueError: The subscriber expects another type.
         """
         if header.get("md5sum") not in {"*", self._kind.md5}:
             raise ValueError(f"the type of {header.get('topic')} is {self._kind.name}, not {header.get('type')}")
-        with self._lock:  # a subscriber that has the header must get every message that is published from now on
+        with self._lock:  # after the header, a subscriber must receive every message that is published
             stream.sendall(pack(pack_header(self._header)))
             self._streams.append(stream)
         # Subscribers send nothing more, so only the end of the stream can be read.
-        ended = select.poll()
-        ended.register(stream, select.POLLIN)
-        ended.poll()
+        poller = select.poll()
+        poller.register(stream, select.POLLIN)
+        poller.poll()
         self._disconnect(stream)
 
     def publish(self, message: bytes, deadline_s: float | None) -> int:
-        """Send a message to all subscribers, and return their number; one that does not read in time is disconnected.
+        """Send a message to all subscribers, and return their number.
+
+        A subscriber that does not read in time is disconnected.
 
         Raises:
-            TimeoutError: All of them were disconnected for this reason.
+            TimeoutError: No subscriber has received the message, because they did not read in time.
         """
         packet = pack(message)
-        sent, was_late = 0, False
+        sent_count, was_late = 0, False
         with self._lock:
             streams = tuple(self._streams)
         for stream in streams:
             try:
                 stream.settimeout(None if deadline_s is None else max(deadline_s - time.monotonic(), 0.001))
                 stream.sendall(packet)
-                sent += 1
+                sent_count += 1
             except OSError as error:
                 was_late |= isinstance(error, TimeoutError)
                 self._disconnect(stream)
-        if was_late and not sent:
+        if was_late and not sent_count:
             raise TimeoutError("the subscriber does not read")
-        return sent
+        return sent_count
 
     def _disconnect(self, stream: socket.socket) -> None:
         """Stop sending to a subscriber; the thread of `accept` closes its socket."""
@@ -143,15 +145,15 @@ class RosSubscriber:
     def update(self, publishers: Sequence[str]) -> None:
         """Connect to the new publishers in a list of URIs."""
         with self._lock:
-            new, self._publishers = set(publishers) - self._publishers, set(publishers)
-        for uri in new:
+            new_uris, self._publishers = set(publishers) - self._publishers, set(publishers)
+        for uri in new_uris:
             threading.Thread(target=self._receive, args=(uri,), daemon=True).start()
 
     def receive(self, deadline_s: float | None) -> bytes:
         """Return the next message.
 
         Raises:
-            TimeoutError: There was none in time.
+            TimeoutError: No message arrived in time.
         """
         try:
             return self._messages.get(timeout=None if deadline_s is None else max(deadline_s - time.monotonic(), 0))
@@ -159,7 +161,7 @@ class RosSubscriber:
             raise TimeoutError(f"no message on {self._topic}") from None
 
     def _receive(self, uri: str) -> None:
-        """Receive the messages of a publisher until it ends; nothing happens if it no longer exists."""
+        """Receive the messages of a publisher until it disconnects; does nothing if it no longer exists."""
         with suppress(OSError, ValueError):
             protocol = call(uri, "requestTopic", self._caller, self._topic, [["TCPROS"]])
             _, host, port = protocol
@@ -260,7 +262,7 @@ class RosNode:
         Args:
             topic: The topic.
             kind: Its type.
-            deadline_s: Time of `time.monotonic` until which to wait for the master.
+            deadline_s: Time until which this waits for the master, on the clock of `time.monotonic`.
 
         Raises:
             TimeoutError: No master answers.
@@ -271,7 +273,7 @@ class RosNode:
         return publisher
 
     def subscribe(self, topic: str, kind: RosMessageType, deadline_s: float) -> RosSubscriber:
-        """Return a subscriber to a topic; arguments and errors as for `publish`."""
+        """Return a subscriber to a topic. Arguments and errors are those of `publish`."""
         subscriber = self._subscribers[topic] = RosSubscriber(topic, kind, self._name)
         subscriber.update(self._register("registerSubscriber", topic, kind, deadline_s))
         return subscriber
@@ -298,7 +300,7 @@ class RosNode:
             threading.Thread(target=self._serve, args=(stream,), daemon=True).start()
 
     def _serve(self, stream: socket.socket) -> None:
-        """Send messages to a subscriber; a subscriber that violates TCPROS is disconnected."""
+        """Serve the connection of a subscriber; a subscriber that violates TCPROS is disconnected."""
         with stream, suppress(OSError, ValueError):
             stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             stream.settimeout(CALL_S)
@@ -344,7 +346,7 @@ class RosNode:
         self._server.shutdown()
         self._server.server_close()
         with suppress(OSError):
-            self._stream_server.shutdown(socket.SHUT_RDWR)  # ends the wait of `accept`
+            self._stream_server.shutdown(socket.SHUT_RDWR)  # so that `accept` returns
         self._stream_server.close()
 
 
@@ -352,7 +354,7 @@ def _address_towards(uri: str) -> str:
     """Return the address of this machine from which a URI is reached.
 
     Raises:
-        OSError: It cannot be reached.
+        OSError: The URI cannot be reached.
     """
     parts = urlsplit(uri)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

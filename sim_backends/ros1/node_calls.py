@@ -53,10 +53,10 @@ class RosNodeServer(SimpleXMLRPCServer):
 
 
 def call(uri: str, method: str, *arguments: object) -> Any:  # noqa: ANN401 (a value of XML-RPC)
-    """Return the value of a call of a master or node.
+    """Call a method of a master or node, and return the value of its answer.
 
     Raises:
-        OSError: It cannot be reached.
+        OSError: The master or node cannot be reached.
         MasterError: It refused the call, or its answer is not a valid answer in ROS.
     """
     try:

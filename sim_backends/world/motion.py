@@ -35,8 +35,8 @@ class Lifetime(NamedTuple):
     """The time in which a robot exists.
 
     Attributes:
-        appears_ns: Its beginning.
-        disappears_ns: Its end: the robot does not exist from this time on; None for never.
+        appears_ns: Time from which the robot exists.
+        disappears_ns: Time from which it no longer exists; None if it never disappears.
     """
 
     appears_ns: int = 0
@@ -57,7 +57,7 @@ class Motion(Protocol):
 
     @property
     def end_ns(self) -> int | None:
-        """Time in nanoseconds after which all robots stay at rest; None if it is unknown."""
+        """Time in nanoseconds after which all robots are at rest; None if it is unknown."""
         ...
 
     def at(self, time_ns: int) -> Mapping[str, State]:
@@ -165,7 +165,7 @@ def extrapolate(state: State, seconds: float) -> State:
     return State((e + seconds * v_e, n + seconds * v_n, u + seconds * v_u), velocity_m_s, heading_rad)
 
 
-class _Extrapolated(Mapping[str, State]):
+class _ExtrapolatedStates(Mapping[str, State]):
     """States extrapolated by some seconds, each computed on request."""
 
     def __init__(self, states: Mapping[str, State], seconds: float) -> None:
@@ -207,7 +207,7 @@ class DeadReckoned(Mapping[str, State]):
         steps = (now_ns - self.since_ns) // self.step_ns
         if steps != self._steps:
             self._steps = steps
-            self._current = _Extrapolated(self._states, steps * self.step_ns / 1e9) if steps else self._states
+            self._current = _ExtrapolatedStates(self._states, steps * self.step_ns / 1e9) if steps else self._states
         return self._current
 
     def __getitem__(self, name: str) -> State:

@@ -28,14 +28,14 @@ _STEPS: Final = 8
 """Number of steps of a ramp, for radio waves and for flying robots."""
 
 
-def _checked_material(name: str) -> str:
+def _require_material(name: str) -> str:
     if name not in MATERIALS:
         hint = did_you_mean(name, MATERIALS, f"materials: {', '.join(MATERIALS)}")
         raise schema.validation_error(f"there is no material {name!r}; {hint}")
     return name
 
 
-MaterialName = Annotated[str, AfterValidator(_checked_material)]
+MaterialName = Annotated[str, AfterValidator(_require_material)]
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class _Rectangular(_Obstacle):
     yaw_deg: Real = 0
 
     def _box(self, size_m: Vector, *, along_m: float = 0.0, across_m: float = 0.0, base_m: float = 0.0) -> Box:
-        """Return a box with parallel edges, shifted from the centre along them, its underside at `base_m`."""
+        """Return a box with parallel edges, shifted from the centre along them, with its underside at `base_m`."""
         yaw = math.radians(self.yaw_deg)
         east_m = self.centre_m[0] + along_m * math.cos(yaw) - across_m * math.sin(yaw)
         north_m = self.centre_m[1] + along_m * math.sin(yaw) + across_m * math.cos(yaw)
@@ -150,14 +150,17 @@ class Building(_Rectangular):
     def parts(self) -> Iterator[Part]:
         long_m, wide_m, high_m = self.size_m
         thickness = self.thickness
-        under_m = high_m - thickness
+        wall_height_m = high_m - thickness
         boxes = (
-            *(self._box((long_m, thickness, under_m), across_m=side * (wide_m - thickness) / 2) for side in (1, -1)),
             *(
-                self._box((thickness, wide_m - 2 * thickness, under_m), along_m=side * (long_m - thickness) / 2)
+                self._box((long_m, thickness, wall_height_m), across_m=side * (wide_m - thickness) / 2)
                 for side in (1, -1)
             ),
-            self._box((long_m, wide_m, thickness), base_m=under_m),
+            *(
+                self._box((thickness, wide_m - 2 * thickness, wall_height_m), along_m=side * (long_m - thickness) / 2)
+                for side in (1, -1)
+            ),
+            self._box((long_m, wide_m, thickness), base_m=wall_height_m),
         )
         yield from (Part(self.name, self.material, box) for box in boxes)
 

@@ -108,11 +108,11 @@ class Solids:
         """
         inside = np.zeros((self._count, len(start_m)))
         below_m, above_m = np.minimum(start_m, end_m), np.maximum(start_m, end_m)
-        for numbers, share, (low_m, high_m, *arrays) in self._kinds:
+        for indices, inside_share, (low_m, high_m, *arrays) in self._kinds:
             # Most paths are far from most shapes, which is faster to check with bounding boxes.
             candidates = ((above_m >= low_m) & (below_m <= high_m)).all(axis=-1).any(axis=-1)
             if candidates.any():
-                inside[numbers[candidates]] = share(start_m, end_m, *(array[candidates] for array in arrays))
+                inside[indices[candidates]] = inside_share(start_m, end_m, *(array[candidates] for array in arrays))
         depths: Floats = inside.T * np.linalg.norm(end_m - start_m, axis=1)[:, None]
         return depths
 

@@ -62,7 +62,7 @@ def wait_until_up(autopilot: Autopilot) -> None:
 
 
 def wait_until_down(autopilot: Autopilot) -> None:
-    wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+    wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
     assert autopilot.vehicle.body.on_ground
 
 

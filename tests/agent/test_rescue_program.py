@@ -99,7 +99,7 @@ def test_pilot_and_guard_are_killed_before_the_drone_lands(tmp_path: Path, firmw
             wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
         assert flight.fly(plan(tmp_path, port), threading.Event()) == 0
         assert [process.wait(60) for process in pair] == [-signal.SIGKILL] * 2
-        assert not autopilot.vehicle.armed
+        assert not autopilot.vehicle.is_armed
         assert autopilot.vehicle.body.on_ground
 
 
@@ -113,7 +113,7 @@ def test_drone_that_a_person_has_taken_over_is_not_commanded(
             wait_until(lambda: autopilot.vehicle.mode is Mode.LOITER, Deadline.after(60))
         autopilot.vehicle.change_mode(Mode.LOITER if firmware is PX4 else Mode.POSHOLD)
         assert flight.fly(plan(tmp_path, port), threading.Event()) == landing.TAKEN_OVER
-        assert autopilot.vehicle.armed
+        assert autopilot.vehicle.is_armed
         assert up_m(autopilot) > 0.5 * HEIGHT_M
     assert "nothing more is sent" in capfd.readouterr().err
 

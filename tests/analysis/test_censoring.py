@@ -96,7 +96,7 @@ def test_censored_repeats_do_not_make_an_expectation_hold() -> None:
     """The case of issue 21: in 3 of 10 repeats the link was down when the ping ended."""
     result = judge_text("rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8]))
     assert result.ruling is Ruling.OPEN
-    assert result.why == "in 3 of 10 repeats the timed event had not ended, so they give only lower bounds"
+    assert result.why == "in 3 of 10 repeats the timed event had not ended, so their values are only lower bounds"
     assert judge_text("every rtt_gap_s < 2 s", gaps([0.2] * 7, [2.3, 2.5, 2.8])).ruling is Ruling.FAILS
     assert judge_text("max rtt_gap_s < 2 s", gaps([0.2] * 7, [1.3])).ruling is Ruling.OPEN
     assert judge_text("rtt_gap_s < 2 s", gaps([], [5.0] * 4)).ruling is Ruling.FAILS
@@ -158,7 +158,7 @@ def rtt(medians_s: Sequence[OptionalValue], of_sent_s: Sequence[OptionalValue]) 
     [
         ([0.1] * 10, Ruling.HOLDS, ""),
         ([0.15] * 10, Ruling.HOLDS, ""),
-        ([0.3] * 10, Ruling.OPEN, "if lost items count as infinitely late, the interval extends beyond the bound"),
+        ([0.3] * 10, Ruling.OPEN, "if the delay of lost items is infinite, the interval extends beyond the bound"),
         (
             [None] + [0.1] * 9,
             Ruling.OPEN,

@@ -50,7 +50,7 @@ def warning(text: str, repeats: int) -> str:
         (
             "ip_loss < 2 % of all packets",
             20,
-            "needs at least 1498 packets per condition for 95 % confidence, if none is lost",
+            "needs at least 1498 packets per condition for 95 % confidence, even if no packet is lost",
         ),
         (
             "link_down_recovered > 90 %",

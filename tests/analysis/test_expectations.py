@@ -158,7 +158,7 @@ def test_a_perfect_link_meets_an_expectation_of_all_packets() -> None:
     assert ruling("ip_loss < 2 %", losses(0, 0, 0, 0, 0, 0)) is Ruling.OPEN, "a statement on other repeats"
     (few,) = judgements.judge([expectations.parse(gate, QUANTITIES)], [losses(0, 0, sent=100)])
     assert judgement_texts(few)[2:] == (
-        "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, at least 1498 are needed",
+        "0.00 %", "14.98 % or less", "undecided: 200 packets were sent, but at least 1498 are needed",
     )  # fmt: skip
 
 

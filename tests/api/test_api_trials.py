@@ -235,7 +235,7 @@ def test_paths_without_a_trial_are_rejected_as_by_commands(tmp_path: Path) -> No
         fieldkit.load(tmp_path)
     other = tmp_path / "other.csv"
     other.write_text("a,b\n1,2\n", encoding="utf-8")
-    with pytest.warns(UserWarning, match="kept as text"), pytest.raises(ConfigurationError, match="not a table of"):
+    with pytest.warns(UserWarning, match="read as text"), pytest.raises(ConfigurationError, match="not a table of"):
         fieldkit.load(other)
 
 
@@ -263,7 +263,7 @@ def test_notes_of_commands_are_warnings(tmp_path: Path) -> None:
     shutil.copytree(LOSSY, tmp_path / "1")
     (tmp_path / "2").mkdir()
     (tmp_path / "2" / "trial.yaml").touch()
-    with pytest.warns(UserWarning, match="is left out"):
+    with pytest.warns(UserWarning, match="is omitted"):
         fieldkit.load(tmp_path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

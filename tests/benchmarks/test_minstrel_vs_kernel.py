@@ -37,7 +37,7 @@ def test_tries_in_a_recording_follow_from_trace_and_chains(case: tuple[dict[str,
 def own(case: tuple[dict[str, Any], str]) -> tuple[list[SelectedFrame], list[list[SelectedFrame]]]:
     trace, text = case
     kernel = study.kernel_frames(text)
-    return kernel, [study.own_frames(trace, [frame.time_ns for frame in kernel], seed) for seed in SEEDS]
+    return kernel, [study.fieldkit_frames(trace, [frame.time_ns for frame in kernel], seed) for seed in SEEDS]
 
 
 def test_rates_and_goodput_are_those_of_the_kernel(case: tuple[dict[str, Any], str]) -> None:

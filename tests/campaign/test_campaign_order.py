@@ -36,7 +36,7 @@ def test_every_trial_occurs_once_in_blocks_within_the_walk(
     planned: set[PlannedTrial], seed: int, factor: float
 ) -> None:
     limit_m = factor * order.walk_m(order.shortest(sorted(planned, key=str)))
-    shuffled = order.shuffled(list(planned), seed=seed, limit_m=limit_m)
+    shuffled = order.shuffle(list(planned), seed=seed, limit_m=limit_m)
     assert Counter(shuffled) == Counter(planned)
     assert order.walk_m(shuffled) <= limit_m + 1e-5
     for depth in (1, 2, 3):
@@ -54,7 +54,7 @@ def test_every_trial_occurs_once_in_blocks_within_the_walk(
 def test_equal_seeds_give_equal_orders_for_any_input_order(planned: set[PlannedTrial], seed: int) -> None:
     forwards = sorted(planned, key=str)
     orders = {
-        order.shuffled(input_order, seed=seed, limit_m=1e9) for input_order in (forwards, tuple(reversed(forwards)))
+        order.shuffle(input_order, seed=seed, limit_m=1e9) for input_order in (forwards, tuple(reversed(forwards)))
     }
     assert len(orders) == 1
 
@@ -97,7 +97,7 @@ def every_first(limit: float) -> Iterator[PlannedTrial]:
         trial(feet, scenario, topology) for feet in (10, 20, 30, 40) for scenario in Scenario for topology in Topology
     ]
     limit_m = limit * order.walk_m(order.shortest(planned))
-    return (order.shuffled(planned, seed=seed, limit_m=limit_m)[0] for seed in range(320))
+    return (order.shuffle(planned, seed=seed, limit_m=limit_m)[0] for seed in range(320))
 
 
 def test_without_a_limit_each_of_16_trials_is_first_equally_often() -> None:
@@ -114,5 +114,5 @@ def test_within_three_times_the_shortest_walk_each_trial_is_first_sometimes() ->
 
 def test_the_shortest_walk_allows_only_sweeps() -> None:
     planned = [trial(feet, Scenario.LOS, Topology.MASTERLESS) for feet in (10, 20, 30, 40)]
-    shuffled = order.shuffled(planned, seed=3, limit_m=order.walk_m(order.shortest(planned)))
+    shuffled = order.shuffle(planned, seed=3, limit_m=order.walk_m(order.shortest(planned)))
     assert shuffled == order.shortest(planned)

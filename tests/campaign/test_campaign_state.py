@@ -121,9 +121,9 @@ def test_trials_start_are_placed_skipped_and_end(lawn: Path) -> None:
         started_plan.mkdir()
         (started_plan / "trial.yaml").touch()
     for opened in (journal, CampaignJournal(journal.folder)):
-        assert list(opened.ended()) == [str(first)]
-        assert opened.interrupted(second) is None, "it has no folder"
-        assert opened.interrupted(third) == started_plan
+        assert list(opened.end_entries()) == [str(first)]
+        assert opened.interrupted_folder(second) is None, "it has no folder"
+        assert opened.interrupted_folder(third) == started_plan
         assert opened.placing_s(99.0) == 30.0
     assert CampaignJournal(journal.folder / "none").placing_s(99.0) == 99.0
 
@@ -143,18 +143,18 @@ def test_a_campaign_continues_after_a_torn_journal(tmp_path_factory: pytest.Temp
     content = path.read_bytes()
     path.write_bytes(content[: max(0, len(content) - cut)])
     reopened = CampaignJournal(journal.folder)
-    complete = len(reopened.ended())
+    complete = len(reopened.end_entries())
     assert complete >= path.read_bytes().count(b"\n")
     with reopened.locked(campaign_plan):
         reopened.add(trials[-1], TrialProgress.ENDED, valid=1)
-    assert list(CampaignJournal(journal.folder).ended()) == [*map(str, trials[:complete]), str(trials[-1])]
+    assert list(CampaignJournal(journal.folder).end_entries()) == [*map(str, trials[:complete]), str(trials[-1])]
 
 
 def test_a_damaged_journal_and_a_second_process_are_rejected(lawn: Path) -> None:
     campaign_plan, journal = begin(lawn)
     with (
         journal.locked(campaign_plan),
-        pytest.raises(ConfigurationError, match="another fieldkit runs this campaign"),
+        pytest.raises(ConfigurationError, match="another fieldkit process runs this campaign"),
         CampaignJournal(journal.folder).locked(campaign_plan),
     ):
         raise AssertionError("two at once")
@@ -222,5 +222,5 @@ def test_trials_with_failed_repeats_remain_if_these_are_repeated(lawn: Path) -> 
     (journal.folder / "2").mkdir()
     (journal.folder / "2" / "trial.yaml").touch()
     for reopened in (journal, CampaignJournal(journal.folder)):
-        assert set(reopened.ended()) == {str(complete)}
-        assert reopened.interrupted(failed) == journal.folder / "2"
+        assert set(reopened.end_entries()) == {str(complete)}
+        assert reopened.interrupted_folder(failed) == journal.folder / "2"

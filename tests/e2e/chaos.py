@@ -172,7 +172,7 @@ class Chaos:
             if result.code not in {3, -9}:
                 self.tally.problems.append(f"exit code {result.code}: {result.err}")
             self.tally.stops.append(result.err.strip())
-            if "holds it since" in result.err and not self._trial_exists():
+            if "locked it at" in result.err and not self._trial_exists():
                 # fieldkit was killed after locking the robots and before creating its folder, so there is nothing to
                 # resume.
                 fieldkit(lab, "abort", "--yes")

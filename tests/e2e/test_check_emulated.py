@@ -137,7 +137,7 @@ def test_a_robot_locked_by_another_user_is_reported_and_not_disturbed(field_robo
     assert run.code == 3
     assert failed(run) == {("turtlebot-1", "lock")}, "a process of anna is no leftover"
     lock = findings_by_check(run)["turtlebot-1", "lock"]
-    assert "anna@one holds the robot for trial-a" in lock["detail"]
+    assert "anna@one has locked the robot for trial-a" in lock["detail"]
     assert lock["remedy"].endswith(": fieldkit abort")
     assert ("turtlebot-1", "topic /scan") not in findings_by_check(run)
     assert findings_by_check(run)["laptop", "network"]["status"] == "warn"

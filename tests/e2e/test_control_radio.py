@@ -73,12 +73,12 @@ def test_ssh_crosses_the_medium_like_the_packets_of_any_station(emulation: Emula
     def at_rest() -> bool:  # no packet is in flight on a hop or to the laptop
         samples.append(stats := emulation.medium.stats())
         hop = stats.links[last_hop, "laptop"]
-        return hop.sent == hop.delivered == stats.ports["laptop"].written
+        return hop.sent == hop.delivered == stats.ports["laptop"].delivered_packets
 
     wait_until(at_rest, Deadline.after(30))
     stats = samples[-1]  # a later one may be taken while a packet is in flight
-    assert stats.ports["laptop"].written > FETCHED_BYTES / 1500
-    assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].written)
+    assert stats.ports["laptop"].delivered_packets > FETCHED_BYTES / 1500
+    assert stats.links["turtlebot-1", "laptop"].sent == (0 if master else stats.ports["laptop"].delivered_packets)
     assert stats.links["turtlebot-1", emulation.robots[Role.RECEIVER].name].sent == 0
 
 

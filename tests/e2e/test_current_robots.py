@@ -26,7 +26,7 @@ def test_every_untried_profile_says_so() -> None:
     assert set(UNTRIED) <= set(NAMES)
     for name in UNTRIED:
         text = (ROOT / "robots" / f"{name}.yaml").read_text(encoding="utf-8")
-        assert "not tried on real hardware" in text, name
+        assert "not tested on real hardware" in text, name
         assert "Source" in text.partition("\nname:")[0], name
 
 

@@ -57,7 +57,7 @@ def test_connecting_and_each_repeat_take_few_sequential_round_trips(tmp_path: Pa
                 passed.append(slow.trips)
 
         robots = opened(
-            backend, cast, session=plan.session, what=plan.trial, seed=1, sink=sink, operator=Unattended()
+            backend, cast, session=plan.session, purpose=plan.trial, seed=1, sink=sink, operator=Unattended()
         )
         with robots as testbed:
             assert slow.trips <= TO_OPEN

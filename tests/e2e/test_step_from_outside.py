@@ -190,7 +190,7 @@ def test_the_package_of_a_step_is_part_of_the_trial(finished: tuple[Path, Fieldk
     with (installed / "route_step.py").open("a", encoding="utf-8") as module:
         module.write("\nCHANGED = True\n")
     changed = fieldkit("resume", str(folder))
-    assert "the code of the step route (route-step 1.0) has changed since the trial started" in changed.stdout
+    assert "the code of the step route (route-step 1.0) has changed since the trial was started" in changed.stdout
     installed.rename(lab / "elsewhere")
     result = fieldkit("rebuild", str(folder))
     assert (result.returncode, "mend" in result.stderr) == (2, False)

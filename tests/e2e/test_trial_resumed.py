@@ -88,7 +88,7 @@ def test_the_second_ctrl_c_stops_the_repeat_immediately(tmp_path: Path, untouche
     (row,) = rows(only_trial(tmp_path))
     assert (row["status"], row["reason"]) == ("void", "interrupted")
     (unfetched,) = only_trial(tmp_path).glob("repeats/*/sender-unfetched.txt")
-    assert "its files ended with it" in unfetched.read_text(encoding="utf-8")
+    assert "and was removed with the robot" in unfetched.read_text(encoding="utf-8")
 
 
 def test_kill_9_during_a_repeat_then_resume(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_kill_9_during_a_repeat_then_resume(tmp_path: Path) -> None:
     assert resumed.code == 0, resumed.err
     table = check_whole(tmp_path, REPEATS)
     assert [row["status"] for row in table] == ["valid", "void", "valid"]
-    assert table[1]["reason"] == "fieldkit was killed during it"
+    assert table[1]["reason"] == "fieldkit was killed during the attempt"
     second_run = resume(tmp_path)
     assert second_run.code == 0, second_run.err
     assert second_run.events("repeat_ended") == [], "nothing is redone"
@@ -115,7 +115,7 @@ def test_two_fieldkits_cannot_run_one_trial(tmp_path: Path) -> None:
     process = begin(tmp_path, "--record", "30s", until='"record"')
     second = resume(tmp_path)
     assert second.code == 2
-    assert "another fieldkit runs this trial" in second.err
+    assert "another fieldkit process runs this trial" in second.err
     for _ in range(2):
         process.send_signal(signal.SIGINT)
     process.terminate()

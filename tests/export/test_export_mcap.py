@@ -266,7 +266,7 @@ def test_replies_without_a_time_stamp_are_left_out_and_reported(trial: Path) -> 
     (warning,) = (
         message.content for message in of(read_messages, "/trial/log") if message.content["file"].endswith("ping.txt")
     )
-    assert warning["message"] == "3 replies have no time stamp and are left out"
+    assert warning["message"] == "3 replies have no time stamp and are omitted"
 
 
 def test_a_trial_without_an_ended_repeat_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

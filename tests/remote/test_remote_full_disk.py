@@ -113,7 +113,7 @@ def test_lock_that_cannot_be_renewed_is_reported_and_kept(shell: SmallShell) -> 
         with pytest.raises(RobotError, match=NO_SPACE):
             evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
         shell.run(("rm", ".fieldkit/fill"), deadline=Deadline.after(30))
-        with pytest.raises(RobotError, match="anna@one holds it"), locked({Role.SENDER: shell}, bert, sink=print):
+        with pytest.raises(RobotError, match="anna@one locked it"), locked({Role.SENDER: shell}, bert, sink=print):
             raise AssertionError("taken twice")
         evidence.begin(shell, FOLDER, "sender", "lo", need_kib=0, token="a")
 

@@ -247,7 +247,7 @@ def test_repeated_start_reports_that_the_job_ended_before_it_was_ready(shell: Lo
 def test_job_that_is_not_ready_in_time_is_killed_and_its_log_reported(shell: LocalShell) -> None:
     ignoring_signals = job("sh", "-c", "trap '' INT TERM; echo still looking; while :; do sleep 0.05; done")
     job_spec = replace(ignoring_signals, ready="log:up", ready_s=3)
-    with pytest.raises(RobotError, match="job job was not up in 3 s: still looking") as caught:
+    with pytest.raises(RobotError, match="job job was not ready within 3 s: still looking") as caught:
         jobs.start(shell, job_spec)
     assert FOLDER in caught.value.remedy
     assert jobs.stop(shell, job_spec) == jobs.KILLED
@@ -333,14 +333,14 @@ def test_job_that_a_reboot_interrupted_is_reported(shell: LocalShell) -> None:
         lambda: jobs.begin_wait(shell, job_spec, 5).end(30),
     ]
     for call in calls:
-        with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
+        with pytest.raises(RobotError, match="job job was interrupted: the robot rebooted"):
             call()
     assert jobs.list_running(shell, Deadline.after(30)) == ()
 
 
 def test_no_job_starts_in_a_folder_whose_jobs_were_stopped(shell: LocalShell) -> None:
     evidence.end_jobs(shell, FOLDER)
-    with pytest.raises(RobotError, match="comes too late"):
+    with pytest.raises(RobotError, match="cannot start: the jobs of"):
         jobs.run(shell, job("true"))
 
 
@@ -362,7 +362,7 @@ def test_job_that_starts_during_an_abort_does_not_run(
         wait_until(called.exists, Deadline.after(30))
         assert jobs.abort(shell, "bert@two", Deadline.after(30)).jobs == ()
         go.touch()
-        with pytest.raises(RobotError, match=f"comes too late: the jobs of {FOLDER} were ended by bert@two"):
+        with pytest.raises(RobotError, match=f"cannot start: the jobs of {FOLDER} were stopped by bert@two"):
             starting.result(30)
     # `start` returns as soon as the leader has an identity; the leader may then still be about to exit.
     wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(30))
@@ -408,7 +408,7 @@ def test_records_lost_in_a_power_failure_are_reported(shell: LocalShell, lost: s
         lambda: jobs.begin_wait(shell, job_spec, 5).end(30),
     ]
     for call in calls:
-        with pytest.raises(RobotError, match="job job was cut: the robot rebooted"):
+        with pytest.raises(RobotError, match="job job was interrupted: the robot rebooted"):
             call()
 
 

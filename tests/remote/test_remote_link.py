@@ -638,7 +638,9 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     clock: DeadlineClock,
     ends_by: str,
 ) -> None:
-    shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, on_air=True)
+    shell = server.shell(
+        connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, crosses_radio=True
+    )
     session = shell.begin(waiting.argv, deadline=soon())
     with shell.silence(SOON if ends_by == "the body" else HANGS_S):
         line.cut()
@@ -660,9 +662,9 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     shell.close()
 
 
-@pytest.mark.parametrize("on_air", [True, False])
-def test_timeout_of_a_link_over_the_radio_is_extended(server: Server, *, on_air: bool) -> None:
-    shell = server.shell(timing=QUICK, on_air=on_air)
+@pytest.mark.parametrize("crosses_radio", [True, False])
+def test_timeout_of_a_link_over_the_radio_is_extended(server: Server, *, crosses_radio: bool) -> None:
+    shell = server.shell(timing=QUICK, crosses_radio=crosses_radio)
     shell.run(("true",), deadline=soon())
 
     def user_timeout_ms() -> int:
@@ -672,14 +674,14 @@ def test_timeout_of_a_link_over_the_radio_is_extended(server: Server, *, on_air:
         return link._stream.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
 
     with shell.silence(30.0):
-        assert user_timeout_ms() == (31_000 if on_air else 1_000)
+        assert user_timeout_ms() == (31_000 if crosses_radio else 1_000)
     assert user_timeout_ms() == 1_000
     shell.close()
 
 
 def test_silence_lasts_until_the_latest_end(server: Server) -> None:
     """Steps that run at the same time share a shell: the end of one does not end the silence of another."""
-    shell = server.shell(timing=QUICK, on_air=True)
+    shell = server.shell(timing=QUICK, crosses_radio=True)
     shell.run(("true",), deadline=soon())
     connection = shell._connection
     link = connection._link

@@ -120,7 +120,7 @@ def test_field_backend_prompts_once_per_robot_and_run(password_server: Server, t
 
 def test_keyring_entry_is_user_at_host(memory: MemoryKeyring) -> None:
     memory.set_password("fieldkit", "duckie@192.168.4.1", SECRET)
-    assert passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
+    assert passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1") == SECRET
 
 
 @pytest.mark.parametrize("path", ["with", "without"])
@@ -132,7 +132,7 @@ def test_missing_keyring_entry_is_reported_with_a_command(
         program.touch(mode=0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigurationError, match=r"no password of duckie@192\.168\.4\.1") as caught:
-        passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1")
+        passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1")
     keyring_of = "keyring" if path == "with" else f"{shlex.quote(sys.executable)} -m keyring"
     assert caught.value.remedy == f"{keyring_of} set fieldkit duckie@192.168.4.1"
 
@@ -142,14 +142,14 @@ def test_missing_keyring_is_reported() -> None:
     keyring.set_keyring(keyring.backends.fail.Keyring())  # type: ignore[no-untyped-call]
     try:
         with pytest.raises(ConfigurationError, match="the keyring cannot be read"):
-            passwords.in_keyring("duckie", "192.168.4.1", "duckiedrone-1")
+            passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1")
     finally:
         keyring.set_keyring(before)
 
 
 def test_missing_terminal_is_reported() -> None:
     with pytest.raises(ConfigurationError, match="standard input is not a terminal") as caught:
-        passwords.at_terminal("duckie", "192.168.4.1", "duckiedrone-1")
+        passwords.read_from_terminal("duckie", "192.168.4.1", "duckiedrone-1")
     assert "keyring set fieldkit duckie@192.168.4.1" in caught.value.remedy
 
 

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import LinkError, RobotError
 from fieldkit.remote.drain import drain, wait_for_output
-from fieldkit.remote.link import SPARES, Channel, Link, UnfitServerError
+from fieldkit.remote.link import SPARE_CHANNELS, Channel, Link, UnfitServerError
 from fieldkit.remote.persistent_shells import PersistentShell, wait_for_start
 from fieldkit.remote.script import CALL, SCRIPT, SCRIPT_PATH
 from fieldkit.remote.shell import Completed
@@ -158,8 +158,8 @@ def test_held_command_reports_its_end_on_request(userland_robot: Robot) -> None:
     # It reads, or polls before it reads: proc_pid_syscall(5).
     wait_until(lambda: Path(f"/proc/{pid}/syscall").read_text().split()[0] in {"0", "7"}, soon())
     assert isinstance(session, SshSession)
-    assert session._running is not None
-    assert not session._running[1].eof_received, "no end was reported"
+    assert session._link_and_channel is not None
+    assert not session._link_and_channel[1].eof_received, "no end was reported"
     assert userland_robot.pid() != pid
     assert session.end(deadline=soon(), check=False).exit_code == 5
     assert userland_robot.pid() == pid
@@ -278,9 +278,9 @@ def test_opening_channels_are_awaited_before_a_measurement(
         with shell.silence(SOON):
             return opened.is_set()
 
-    shell = debian_robot.server.shell(on_air=True)
+    shell = debian_robot.server.shell(crosses_radio=True)
     shell.run(("true",), deadline=soon())
-    shell._connection._link.wait_until_opened(soon())  # type: ignore[union-attr]
+    shell._connection._link.wait_until_open(soon())  # type: ignore[union-attr]
     monkeypatch.setattr(owner, name, slowly)
     shell.run((*CALL, "left", ":"), deadline=soon())
     with ThreadPoolExecutor(1) as pool:
@@ -298,17 +298,17 @@ def test_nothing_is_opened_over_the_radio_during_a_measurement(debian_robot: Rob
         assert link is not None
         return len(link._spares)
 
-    shell = debian_robot.server.shell(on_air=True)
+    shell = debian_robot.server.shell(crosses_radio=True)
     shell.run(("true",), deadline=soon())
     with shell.silence(SOON):
-        assert opens_or_has() == SPARES
+        assert opens_or_has() == SPARE_CHANNELS
         shell.run(("true",), deadline=soon())
-        assert opens_or_has() == SPARES - 1
+        assert opens_or_has() == SPARE_CHANNELS - 1
         shell.run((*CALL, "left", ":"), deadline=soon())
-        assert opens_or_has() == SPARES - 2
+        assert opens_or_has() == SPARE_CHANNELS - 2
         assert shell._connection.shells._opener is None
     shell.run((*CALL, "left", ":"), deadline=soon())
-    assert opens_or_has() == SPARES
+    assert opens_or_has() == SPARE_CHANNELS
     assert shell._connection.shells._opener is not None
     shell.close()
 

@@ -45,7 +45,7 @@ def test_robot_is_locked_after_a_power_failure(place: Path, file_system: FileSys
         with image.repair().mounted(place / "disk") as mounted:
             robot = LocalShell(mounted, path, "turtlebot-1")
             with (
-                pytest.raises(RobotError, match="anna@one holds it"),
+                pytest.raises(RobotError, match="anna@one locked it"),
                 locked({Role.SENDER: robot}, BERT, sink=lambda _: None),
             ):
                 pass

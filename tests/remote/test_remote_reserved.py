@@ -35,7 +35,7 @@ def archive(*names: str, large: str = "") -> bytes:
 
 def fetch(data: bytes, into: Path, role: Role = Role.SENDER) -> None:
     shell = AnsweringRobot(into, data)
-    fetching.fetch(shell, "x", role, "lo", into, foreign=lambda name: OWNERS.refusal(role, name))
+    fetching.fetch(shell, "x", role, "lo", into, forbidden_reason=lambda name: OWNERS.refusal(role, name))
 
 
 def test_files_of_the_robot_are_accepted(tmp_path: Path) -> None:

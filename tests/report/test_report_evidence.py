@@ -76,7 +76,7 @@ def test_the_evidence_of_many_trials_is_limited(trial: Path, monkeypatch: pytest
         contents = build_contents(
             repeats, title="", repeat=f"{name}/udp-01", command=["fieldkit", "report", "trials"], paths=["trials"]
         )
-        assert contents.evidence.verified == {str(trial.parent / name)}
+        assert contents.evidence.verified_sources == {str(trial.parent / name)}
         assert any("of 1 of 2 trials" in warning.text for warning in contents.warnings)
         assert len(contents.evidence.plans) == 2
     text = page.render(replace(contents, max_trials=1), trial / "report.html")

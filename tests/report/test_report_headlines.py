@@ -27,7 +27,7 @@ def lines(rows: Sequence[RepeatRow], unmeasured: Sequence[str] = ()) -> dict[str
 
 
 def texts(headline: Headline) -> list[str]:
-    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
+    lines = (filter(None, (end.extreme, end.value, end.interval, end.place)) for end in headline.lines)
     return [" ".join(parts).replace("\N{NO-BREAK SPACE}", " ") for parts in lines]
 
 
@@ -131,7 +131,7 @@ def test_planned_repeats_without_an_attempt_are_not_run(tmp_path: Path) -> None:
         {source: plan.model_copy(update={"repeats": 5}) for source in evidence.plans},
         (),
         frozenset(),
-        evidence.verified,
+        evidence.verified_sources,
     )
     result = texts(next(iter(headlines(aggregate(evidence.repeats), other_evidence))))
     assert result[0] == "1 of 5 valid"

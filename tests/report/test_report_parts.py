@@ -158,7 +158,7 @@ def test_strip_of_many_repeats_keeps_all_void_ones(tmp_path: Path) -> None:
     ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
     assert len(strip.marks) == strips.MAX_MARKS
     assert sum(mark.status == "void" for mark in strip.marks) == 48
-    assert strip.left_out == 2400 - strips.MAX_MARKS
+    assert strip.omitted_count == 2400 - strips.MAX_MARKS
     assert strip.marks[-1].title == "udp-2400, void: no capture, UDP datagram loss 5.56 %"
 
 
@@ -169,7 +169,7 @@ def test_the_void_marks_of_a_page_are_limited(tmp_path: Path, monkeypatch: pytes
     cells = aggregate(evidence.repeats)
     ((strip,),) = (group.strips for group in strips.groups(cells, Identities(cells), evidence))
     assert sum(mark.status == "void" for mark in strip.marks) == 30
-    assert (strip.left_out, strip.others_left_out) == (0, 20)
+    assert (strip.omitted_count, strip.omitted_other_count) == (0, 20)
 
 
 @pytest.mark.parametrize(("loss", "expected"), [(0.0, "none"), (0.125, "full height 12.5 %")])
@@ -304,7 +304,7 @@ def test_iperf3_results_are_separate_charts_against_distance(tmp_path: Path) -> 
 
 def ends(headline: headlines.Headline) -> list[str]:
     """Return one text per end of a headline."""
-    lines = (filter(None, (end.which, end.value, end.interval, end.place)) for end in headline.lines)
+    lines = (filter(None, (end.extreme, end.value, end.interval, end.place)) for end in headline.lines)
     return [plain_text(" ".join(parts)) for parts in lines]
 
 

@@ -124,7 +124,7 @@ def test_a_link_to_another_folder_is_not_a_folder_of_the_trial(trial: Path, tmp_
 
 def test_evidence_in_too_deep_folders_is_rejected(trial: Path) -> None:
     (trial / "repeats/udp-01/a/b").mkdir(parents=True)
-    with pytest.raises(EvidenceError, match="a folder, deeper than evidence can be"):
+    with pytest.raises(EvidenceError, match="a folder at a level below the folders of evidence"):
         plans.read_plan(trial)
 
 

@@ -42,7 +42,7 @@ UNITS = (*VALUES, "share")
 
 
 def fetching(text: str) -> Callable[..., list[str]]:
-    def fetch(_self: Robots, _remote: str, into: Path, *, clean: bool) -> list[str]:
+    def fetch(_self: Robots, _remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         (into / "run.txt").write_text(text, encoding="utf-8")
         write_states(into)
         return []

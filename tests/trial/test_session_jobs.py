@@ -31,7 +31,7 @@ def _installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_package_adds_a_job_to_a_session() -> None:
-    (planned,) = session_jobs.planned(CAST, "s1")
+    (planned,) = session_jobs.planned_jobs(CAST, "s1")
     assert (planned.role, planned.job.name) == (Role.SENDER, "logger")
     assert "/logger-s1/" in planned.job.folder
 

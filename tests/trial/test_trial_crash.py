@@ -70,7 +70,7 @@ WRITES = ("fsync", "write", "rename", "mkdir", "unlink", "truncate")
 def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
     """Replace the measurement on robots; everything after it is real."""
 
-    def fetch(_self: Robots, remote: str, into: Path, *, clean: bool) -> list[str]:
+    def fetch(_self: Robots, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
         (into / "ping.txt").write_text("" if remote.endswith(VOID_FIRST) else PING, encoding="utf-8")
         write_states(into)
         return []
@@ -82,7 +82,7 @@ def robots_with_evidence(monkeypatch: pytest.MonkeyPatch) -> None:
         "begin",
         "measure",
         "require_locks",
-        "end_jobs",
+        "stop_jobs",
         "stop_leftover_jobs",
         "close_connections",
         "delete_remote",

@@ -1,8 +1,8 @@
-"""Follow the leader, 2 m and 1 s behind it, by the odometry that arrives over the radio.
+"""Follow the leader at a distance of 2 m and a headway of 1 s, by the odometry that arrives over the radio.
 
 The control law and its period are those of the scenario `convoy` (`sim_backends/cosim/programs/follow.py`): an error
-of the distance decays at 1/s, states are extrapolated to the present time, and it stops without a state for 1 s.
-Both robots start in one direction; the argument is how many metres the leader starts ahead.
+of the distance decays at 1/s, states are extrapolated to the present time, and the follower stops if no state has
+arrived for 1 s. Both robots start with the same heading. The argument is the leader's initial distance in metres.
 """
 
 import math
@@ -20,7 +20,7 @@ TOP_SPEED_M_S = 1.0
 
 
 class Follower(Node):
-    """Steers the follower; all positions are in the frame of its odometry."""
+    """A node that steers the follower; all positions are in the frame of its odometry."""
 
     def __init__(self, ahead_m: float) -> None:
         super().__init__("follow")

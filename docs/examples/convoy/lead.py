@@ -1,6 +1,7 @@
 """Drive the leader with the velocities of the scenario `convoy`.
 
-Arguments: legs SECONDS:SPEED or SECONDS:SPEED:DEGREES_PER_SECOND, or none for those of the scenario.
+Each argument is a leg, SECONDS:SPEED or SECONDS:SPEED:DEGREES_PER_SECOND. Without arguments the legs are those of the
+scenario.
 """
 
 import math

@@ -1,6 +1,6 @@
-"""Prints the events of a channel with EMANE's own library, to check what fieldkit publishes.
+"""Print the events of a channel with EMANE's library, to check the events that fieldkit publishes.
 
-python3 listen.py 224.1.2.8 45703 lo
+Usage: `python3 listen.py 224.1.2.8 45703 lo`.
 """
 
 import sys

@@ -23,7 +23,10 @@ class Carts:
         self._at_ns = self._last_ns = 0
 
     def advance(self, to_ns, commands):
-        """Return the state of each robot at the last step until `to_ns`; commands apply from the last call's time."""
+        """Return the state of each robot at the last step that is not after `to_ns`.
+
+        Commands apply from the `to_ns` of the previous call on.
+        """
         if commands:
             self._new, self._new_from_ns = self._new | commands, self._last_ns
         self._last_ns = to_ns

@@ -1,4 +1,4 @@
-"""Robots on a bench: a programmable attenuator replaces distance."""
+"""A backend for robots on a bench, where a programmable attenuator simulates the distance."""
 
 import math
 import os
@@ -22,7 +22,7 @@ PORT: Final = 5025  # SCPI over a plain socket
 
 
 class BenchBackend:
-    """Real robots over SSH, their antennas on a cable."""
+    """Real robots over SSH, whose antennas are connected by a cable."""
 
     permissions: frozenset[str] = frozenset()
     by_hand = False
@@ -46,7 +46,7 @@ class BenchBackend:
 
 
 class BenchTestbed:
-    """Robots whose distance is an attenuation."""
+    """A testbed that sets the attenuation of the requested distance."""
 
     oracle = None
 
@@ -63,7 +63,7 @@ class BenchTestbed:
         return self._robots.operator
 
     def inject(self, fault: Fault) -> float | None:
-        return self._robots.inject(fault)  # the operator does it
+        return self._robots.inject(fault)  # the field testbed requests the fault from the operator
 
     def bring_back(self, role: Role, *, has_returned: bool) -> None:
         pass  # no robot drove

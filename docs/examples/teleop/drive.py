@@ -1,4 +1,4 @@
-"""The rover's program in a teleoperation: print each command, and stop if none arrives for half a second."""
+"""The rover's program for teleoperation: print each command, and `stop` if no command arrives for half a second."""
 
 import contextlib
 import socket

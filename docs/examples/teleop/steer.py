@@ -1,4 +1,4 @@
-"""The operator's side: send the rover ten commands a second, for so many seconds."""
+"""The operator's program for teleoperation: send ten commands per second to the rover, for some seconds."""
 
 import socket
 import sys

@@ -1,4 +1,4 @@
-"""Remote driving of our rover, and its stop when commands cease."""
+"""Tests of the teleoperation of a rover, which must stop if no commands arrive."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ DRIVE = ["python3", "drive.py"]
 
 @pytest.fixture(scope="module")
 def rover(robots):
-    """The rover, with our program on it, and the operator's on the other."""
+    """The rover, after the programs were copied to both robots."""
     robots.receiver.put(HERE / "drive.py", "drive.py")
     robots.sender.put(HERE / "steer.py", "steer.py")
     return robots.receiver
@@ -26,13 +26,13 @@ def test_teleop(robots, rover):
     assert program.output.stdout.count("drive") >= 15
 
 
-def test_rover_stops_when_its_link_is_gone(lab, robots, rover):
+def test_rover_stops_when_its_link_is_down(lab, robots, rover):
     with robots.sender.running(steer(rover, seconds=60)), rover.running(DRIVE) as program:
         robots.sender.run(["sleep", "1"])
         lab.fault("link-down", "rover", lasts="2s")
     assert "stop" in program.output.stdout.splitlines()
 
 
-def test_echoes_come_soon(trial):
-    echoes = trial("echo", "20m", repeats=3)
-    assert echoes.cell().rtt_median_s.high < 0.05
+def test_round_trips_are_short(trial):
+    pings = trial("echo", "20m", repeats=3)
+    assert pings.cell().rtt_median_s.high < 0.05

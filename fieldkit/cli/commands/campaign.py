@@ -23,7 +23,7 @@ def add(parser: Parser) -> None:
     parser.epilog = "example: fieldkit campaign lawn.yaml --dry-run"
     parser.add_argument("file", type=Path, metavar="FILE", help="campaign file, see `fieldkit docs campaign`")
     shared.add_site(parser)
-    shared.add_out(parser, "the campaign's folder goes")
+    shared.add_out(parser, "the folder of the campaign")
     parser.add_argument(
         "--dry-run", action="store_true", help="print order, path, time and disk space; change nothing"
     )

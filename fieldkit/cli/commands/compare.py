@@ -1,4 +1,4 @@
-"""`fieldkit compare A B`: field against simulation, or two runs."""
+"""`fieldkit compare A B`: compare two runs, for example a field trial and its simulation."""
 
 import argparse
 from pathlib import Path
@@ -28,7 +28,7 @@ def add(parser: Parser) -> None:
     parser.epilog = _EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("a", type=Path, metavar="A", help=shared.PATH_HELP)
-    parser.add_argument("b", type=Path, metavar="B", nargs="?", help="the same (default: A, with --between)")
+    parser.add_argument("b", type=Path, metavar="B", nargs="?", help="the second run (default: A, with --between)")
     parser.add_argument("more", type=Path, nargs="*", default=[], help=argparse.SUPPRESS)  # from a shell pattern
     parser.add_argument(
         "--between",
@@ -46,7 +46,7 @@ def add(parser: Parser) -> None:
         help="largest acceptable difference: ip_loss=2%% or rtt_median_s=5ms (a share: in percentage points); "
         "may be given more than once",
     )
-    parser.add_argument("--force", action="store_true", help="compare also runs that are not comparable")
+    parser.add_argument("--force", action="store_true", help="also compare runs that are not comparable")
     shared.add_rebuild(parser)
     parser.add_choice("--format", shared.TABLES, default="table", help="output format (default: table)")
     parser.set_defaults(run=run)

@@ -22,7 +22,7 @@ def add(parser: Parser) -> None:
         "Read the SSH host key of a robot (ed25519 if it has one) without logging in, show type and fingerprint, ask "
         "for confirmation, and write the key into the site file as host_key; nothing else in the file changes. A key "
         "that is already pinned is not changed. If the robot offers another key, enroll prints both fingerprints "
-        "and exits with code 3. After the answer no the exit code is 1."
+        "and exits with code 3. If you answer no, the exit code is 1."
     )
     parser.add_argument("robot", metavar="ROBOT", help="name of a robot in the site file")
     parser.add_argument(

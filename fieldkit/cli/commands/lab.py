@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit lab`."""
-    parser.description = "Emulated robots that stay up until they are taken down: one lab per directory."
+    parser.description = "Emulated robots that run until they are stopped; a directory can have one lab."
     actions = parser.add_commands(title="commands", metavar="COMMAND")
     action = actions.add_parser(
         "up",
@@ -40,9 +40,9 @@ def add(parser: Parser) -> None:
         "user, in memory if there is /run/user. The lab exists as long as its process.",
     )
     shared.add_robots(action)
-    action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of everything random (default 1)")
+    action.add_argument("--seed", type=int, default=1, metavar="N", help="seed of all random draws (default 1)")
     action.add_choice("--wifi", ("model", "linux"), help="Wi-Fi of the robots (default: the site file's, or model)")
-    action.add_argument("--foreground", action="store_true", help="keep this terminal; Ctrl-C takes the robots down")
+    action.add_argument("--foreground", action="store_true", help="run in this terminal; Ctrl-C stops the robots")
     action.set_defaults(run=up)
     listing = actions.add_parser(
         "ps",
@@ -144,7 +144,7 @@ def up(arguments: argparse.Namespace) -> int:
         print_text(f"{format_count(len(robots.members), 'robot')} up, until Ctrl-C", flush=True)
 
     if arguments.foreground:
-        daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, ready=announce)
+        daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, on_ready=announce)
         return 0
 
     def serve(detach: daemon.OnReady) -> int:
@@ -153,7 +153,7 @@ def up(arguments: argparse.Namespace) -> int:
             detach(lab_folder.log)
 
         try:
-            daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, ready=ready)
+            daemon.run(lab_folder, backend, seed=arguments.seed, sink=_show_note, on_ready=ready)
         except FieldkitError as error:
             show_error(str(error))
             return error.exit_code

@@ -29,12 +29,15 @@ def add(parser: Parser) -> None:
         help="GPX or CSV file of the robot in that role, or its position: LAT,LON[,ALT], or X,Y[,Z] with units",
     )
     parser.add_argument(
-        "--offset", metavar="TIME", default="0s", help="add it to the times of the files: 0.3s, -2s (default: 0s)"
+        "--offset",
+        metavar="TIME",
+        default="0s",
+        help="time to add to the times of the files: 0.3s, -2s (default: 0s)",
     )
     parser.add_argument(
         "--gap", metavar="TIME", default="3s", help="positions are unknown in longer gaps (default: 3s)"
     )
-    parser.add_argument("--heights", action="store_true", help="use heights above the ellipsoid, too")
+    parser.add_argument("--heights", action="store_true", help="also use heights above the ellipsoid")
     parser.add_argument("--clear", action="store_true", help="remove the stored files")
     parser.set_defaults(run=run)
 

@@ -25,7 +25,7 @@ def add(parser: Parser) -> None:
         type=Path,
         nargs="+",
         metavar="TRIAL",
-        help="folder of a trial, or folder with trials somewhere below",
+        help="folder of a trial, or folder with trials at any depth",
     )
     shared.add_all(parser)
     shared.add_workers(parser)

@@ -12,9 +12,9 @@ from fieldkit.core.text import print_text
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit report`."""
     parser.description = (
-        "Make one HTML file of figures, tables and strips. It begins with what is missing and with the worst "
-        "conditions. It opens without a network and contains no script. For the folder of a campaign, or the folder "
-        "above, it lists planned trials without an attempt."
+        "Write one HTML file with figures and tables. It starts with missing data and the worst conditions. It opens "
+        "without a network and contains no script. For the folder of a campaign, or its parent folder, it also lists "
+        "planned trials without an attempt."
     )
     shared.add_paths(parser)
     shared.add_where(parser)
@@ -26,7 +26,7 @@ def add(parser: Parser) -> None:
         metavar="FILE",
         help="the page (default report.html)",
     )
-    parser.add_argument("--title", default="", help="its title (default: derived from the procedures)")
+    parser.add_argument("--title", default="", help="title of the page (default: derived from the procedures)")
     parser.add_argument(
         "--repeat",
         default="",

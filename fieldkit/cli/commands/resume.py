@@ -18,7 +18,7 @@ def add(parser: Parser) -> None:
     )
     shared.add_trial(parser, "folder of the trial")
     parser.add_argument(
-        "--failed", action="store_true", help="also repeat the failed repeats; the failed attempts are kept as void"
+        "--failed", action="store_true", help="also repeat the failed repeats; their failed attempts become void"
     )
     shared.add_site(parser)
     shared.add_operator(parser)

@@ -26,7 +26,7 @@ def add(parser: Parser) -> None:
     shared.add_site(parser)
     shared.add_overrides(parser)
     parser.add_argument(
-        "--seed", type=shared.natural, metavar="N", default=1, help="seed of everything random (default: 1)"
+        "--seed", type=shared.natural, metavar="N", default=1, help="seed of all random draws (default: 1)"
     )
     parser.add_argument(
         "--notes",
@@ -35,8 +35,8 @@ def add(parser: Parser) -> None:
         default="",
         help="notes stored with the trial: weather, place, people",
     )
-    shared.add_out(parser, "trial folders go")
-    parser.add_argument("--dry-run", action="store_true", help="print every remote command per robot, change nothing")
+    shared.add_out(parser, "the folders of trials")
+    parser.add_argument("--dry-run", action="store_true", help="print the commands of each robot, change nothing")
     shared.add_json(parser)
     shared.add_all(parser)
     shared.add_operator(parser)

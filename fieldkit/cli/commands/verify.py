@@ -13,7 +13,8 @@ from fieldkit.core.units import format_count
 def add(parser: Parser) -> None:
     """Declare the arguments of `fieldkit verify`."""
     parser.description = (
-        "Compare every file of a trial with MANIFEST.sha256: changed, missing, not in it, or not a regular file."
+        "Compare every file of a trial with MANIFEST.sha256, and list files that were changed, are missing, are not "
+        "in it, or are not regular files."
     )
     shared.add_trial(parser)
     parser.set_defaults(run=run)

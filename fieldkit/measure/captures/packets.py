@@ -158,7 +158,7 @@ _STORAGE_TYPES: Final[Mapping[str, type[np.integer[Any]]]] = MappingProxyType(
         **dict.fromkeys(("sport", "dport", "echo", "echo_seq", "interface"), np.int32),
     }
 )
-"""Columns stored in fewer than eight bytes. A type fits the header field and the negative special values."""
+"""Columns stored in fewer than eight bytes. Each type can store the header field and the negative special values."""
 
 for _name, _storage_type in _STORAGE_TYPES.items():
     _column = NarrowColumn(_storage_type)

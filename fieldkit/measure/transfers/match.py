@@ -40,8 +40,7 @@ class Match:
         received_index: Index of the first copy of each sent packet among the received packets; `NONE` if it was lost.
             Shape (n,).
         sent_index: Index of the sent packet that each received packet is a copy of; `NONE` if the sender's capture
-        has
-            no such packet. Shape (m,).
+            has no such packet. Shape (m,).
         duplicates: Mask of received packets that are further copies of a packet that had arrived. Shape (m,).
         ambiguous: Mask of sent packets that cannot be distinguished: others are equal and were sent at nearly the
             same time, so the order of their arrival is unknown. They are matched in the order of sending: if a

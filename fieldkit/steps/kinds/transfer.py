@@ -25,7 +25,7 @@ from fieldkit.measure.transfers.deliveries import Delivery
 from fieldkit.measure.transfers.transfer_columns import COLUMNS
 from fieldkit.measure.transfers.transfer_spec import Transfer
 from fieldkit.remote import jobs
-from fieldkit.remote.jobs import Job, Pending
+from fieldkit.remote.jobs import Job, PendingJob
 from fieldkit.steps import netcat
 from fieldkit.steps.base import FileName, Step
 from fieldkit.steps.capabilities import (
@@ -229,7 +229,7 @@ class TransferStep(
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         self.prepare(scene, testbed)(announce)
 
-    def _send(self, scene: Scene, testbed: Testbed, listener: Pending, start_s: float, announce: Announce) -> None:
+    def _send(self, scene: Scene, testbed: Testbed, listener: PendingJob, start_s: float, announce: Announce) -> None:
         """Send the file to a listener that was started at `start_s` of the monotonic clock.
 
         During the transfer no data crosses the control connections: both commands were accepted before, the receiver

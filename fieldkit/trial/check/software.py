@@ -164,7 +164,7 @@ def _planned_jobs(plan: Plan, role: Role) -> Iterator[Planned]:
     """Yield the jobs of steps and of the session on a robot."""
     for scene in plan.scenes():
         yield from (job for job in plan.jobs(scene) if job.role is role)
-    yield from (job for job in session_jobs.planned(plan.cast, plan.session) if job.role is role)
+    yield from (job for job in session_jobs.planned_jobs(plan.cast, plan.session) if job.role is role)
 
 
 def needs_of(plan: Plan, role: Role, *, by_agent: bool = False) -> tuple[Need, ...]:

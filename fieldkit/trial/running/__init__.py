@@ -1,1 +1,1 @@
-"""Run a trial on robots: open and lock them, run preflight checks and attempts, resume an interrupted trial."""
+"""Running a trial on robots: connections and locks, preflight checks, attempts, and resumption."""

@@ -1,4 +1,4 @@
-"""One attempt at a repeat: run its steps, fetch and judge its evidence, and store it, even if it is interrupted."""
+"""Attempts at a repeat: run the steps, fetch and check the evidence, and store the attempt, even if interrupted."""
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -30,14 +30,14 @@ from fieldkit.trial.step_errors import StepError
 
 
 class Attempts:
-    """Makes the attempts of a trial in sequence.
+    """Makes the attempts of a trial, one after the other.
 
     Args:
         plan: The trial.
-        folder: Its folder.
-        robots: Its robots.
+        folder: Folder of the trial.
+        robots: Robots of the trial.
         ledger: Records the result of each attempt.
-        variants: The tools of each robot.
+        variants: Variants of the tools of each robot.
         sink: Receives the start of each phase.
         motions: The robots that move without a person.
         origins: See `Scene.origins`.
@@ -64,18 +64,18 @@ class Attempts:
         self._motions = motions
         self._origins = origins
         self._last_remote = ""
-        self._reached: Status | None = None
+        self._progress: Status | None = None
 
     def make(self, repeat: RepeatId) -> str:
-        """Make another attempt at a repeat, and store it whatever its result is.
+        """Make another attempt at a repeat, and store it with any result.
 
         Returns:
-            The remedy of a failed step; empty if none failed.
+            The remedy of a failed step; empty if no step failed.
 
         Raises:
-            ConfigurationError: This machine has no space for its evidence.
-            FieldkitError: The trial cannot continue; the attempt is stored as one that does not count.
-            KeyboardInterrupt: As for `FieldkitError`, but `recover` completes an attempt whose steps have ended.
+            ConfigurationError: This machine has no space for the evidence.
+            FieldkitError: The trial cannot continue. The attempt is stored, but is not one of the allowed attempts.
+            KeyboardInterrupt: As for `FieldkitError`; but if its steps have ended, `recover` completes the attempt.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
@@ -83,34 +83,34 @@ class Attempts:
         started = self._ledger.begin(repeat)
         partial = store.open_attempt(self._folder, repeat)
         remote = started.remote(self._plan.trial)
-        self._reached = None
+        self._progress = None
         with self._storing_interrupted(started, partial):
             times_ns = self._robots.begin(remote, old=self._last_remote or None)
             (partial / exchanges.FILE).write_text(exchanges.text(times_ns), encoding="ascii")
-            failure = self._measure(started, remote, partial)
+            failure = self._run_steps(started, remote, partial)
             reasons = [failure.located] if failure else []
             if reasons:
-                self._robots.check_alive()  # fails immediately if a process that the robots need has exited
+                self._robots.check_alive()  # raises if a process that the robots need has exited
             else:
                 self._ledger.record_measured(started)
-                self._reached = Status.MEASURED
+                self._progress = Status.MEASURED
             self._sink(PhaseStarted("collect evidence", str(repeat)))
             reasons += self._robots.fetch(remote, partial, ended_normally=not reasons)
             verdict = self._judge(started, partial)
             for note in verdict.notes:
                 self._sink(Note(f"{repeat}: {note}"))
-            raised = [failure.traceback_text] if isinstance(failure, StepError) else []
-            step_errors.store([*raised, *verdict.step_errors], partial)
-            has_failed = bool(raised) or (not reasons and verdict.has_failed)
-            notes = [step_errors.SEE_LOG] if raised or (not reasons and verdict.step_errors) else []
+            tracebacks = [failure.traceback_text] if isinstance(failure, StepError) else []
+            step_errors.store([*tracebacks, *verdict.step_errors], partial)
+            has_failed = bool(tracebacks) or (not reasons and verdict.has_failed)
+            notes = [step_errors.SEE_LOG] if tracebacks or (not reasons and verdict.step_errors) else []
             reasons = reasons or list(verdict.problems)
             self._last_remote = remote
             if reasons:
                 self._robots.check_alive()
-                self._robots.require_locks()  # an attempt aborted by another user is not counted
-        invalid = Status.FAILED if has_failed or self._ledger.is_last(repeat) else Status.VOID
+                self._robots.require_locks()  # an attempt that another user aborted does not use an allowed attempt
+        status = Status.FAILED if has_failed or self._ledger.is_last(repeat) else Status.VOID
         reasons = [*hosts.drop_effects_of_reboots(reasons), *notes]
-        ended = replace(started, status=invalid if reasons else Status.VALID, reason="; ".join(reasons))
+        ended = replace(started, status=status if reasons else Status.VALID, reason="; ".join(reasons))
         self._ledger.commit(partial, ended, verdict.measured)
         if has_failed:
             log = step_errors.log_file(store.attempt_folder(self._folder, ended.folder))
@@ -118,35 +118,38 @@ class Attempts:
         return failure.remedy if failure else ""
 
     def recover(self, interrupted_attempt: Attempt) -> None:
-        """Complete an attempt during which fieldkit was killed; errors as for `make`."""
+        """Complete an attempt during which fieldkit was killed; raises as `make`."""
         self._sink(PhaseStarted("recover", str(interrupted_attempt.repeat)))
         remote, was_measured = (
             interrupted_attempt.remote(self._plan.trial),
             interrupted_attempt.status is Status.MEASURED,
         )
-        committed = store.unjournalled_attempt(self._folder, interrupted_attempt.folders)
-        evidence_folder = committed or store.reopen_attempt(self._folder, interrupted_attempt.repeat)
+        committed_folder = store.find_committed_attempt(self._folder, interrupted_attempt.folders)
+        evidence_folder = committed_folder or store.reopen_attempt(self._folder, interrupted_attempt.repeat)
         # Partial evidence of an interrupted attempt is stored like the evidence of any void attempt.
-        missing = [] if committed else self._robots.fetch(remote, evidence_folder, ended_normally=was_measured)
+        fetch_problems = (
+            [] if committed_folder else self._robots.fetch(remote, evidence_folder, ended_normally=was_measured)
+        )
         verdict = self._judge(interrupted_attempt, evidence_folder)
-        if not committed:
+        if not committed_folder:
             step_errors.store(verdict.step_errors, evidence_folder)
-        if was_measured and missing:
-            reasons = ["fieldkit was killed before it had the evidence, which could not be fetched later", *missing]
+        if was_measured and fetch_problems:
+            reason = "fieldkit was killed before it had fetched the evidence, which could not be fetched later"
+            reasons = [reason, *fetch_problems]
         else:
-            reasons = list(verdict.problems) if was_measured else ["fieldkit was killed during it"]
+            reasons = list(verdict.problems) if was_measured else ["fieldkit was killed during the attempt"]
             reasons += [step_errors.SEE_LOG] if was_measured and verdict.step_errors else []
-        has_failed = was_measured and not missing and verdict.has_failed
+        has_failed = was_measured and not fetch_problems and verdict.has_failed
         status = Status.FAILED if has_failed else Status.VOID if reasons else Status.VALID
         is_excused = bool(reasons) and not has_failed
         ended = replace(interrupted_attempt, status=status, reason="; ".join(reasons), excused=is_excused)
         self._ledger.commit(evidence_folder, ended, verdict.measured)
         self._last_remote = remote
 
-    def _measure(self, started: Attempt, remote: str, laptop_folder: Path) -> FieldkitError | None:
-        """Run the steps of an attempt; return the error that makes it void, or None."""
+    def _run_steps(self, started: Attempt, remote: str, laptop_folder: Path) -> FieldkitError | None:
+        """Run the steps of an attempt. Return the error that makes the attempt void, or None."""
         repeat = started.repeat
-        self._reached = Status.RUNNING
+        self._progress = Status.RUNNING
         planned = self._plan.scene(repeat, remote, self._variants)
         scene = replace(planned, laptop_folder=laptop_folder, motions=self._motions, origins=self._origins)
 
@@ -155,7 +158,7 @@ class Attempts:
 
         try:
             self._robots.measure(scene, announce)
-            self._motions.stop_notes = ()  # a request to stop does not prevent the remaining work
+            self._motions.stop_notes = ()  # from now on, a request to stop waits for the end of the attempt
         except (RobotError, LinkError, EvidenceError) as error:
             if error.ends_trial:
                 raise
@@ -164,24 +167,24 @@ class Attempts:
 
     @contextmanager
     def _storing_interrupted(self, started: Attempt, partial: Path) -> Iterator[None]:
-        """If the body is interrupted, end its jobs and store the attempt as one that does not count.
+        """If the body is interrupted, stop its jobs and store the attempt as void, without using an allowed attempt.
 
-        Its measurements stay on the robots, and its reason states this: after a request to stop, nothing is fetched.
+        After a request to stop, nothing is fetched. The measurements stay on the robots, and the reason states this.
         """
         try:
             yield
         except BaseException as error:
             if not isinstance(error, Exception) or isinstance(error, TestbedLostError):
                 self._robots.close_connections()  # unblocks threads that wait for an answer
-            with suppress(FieldkitError):  # a robot that cannot be reached ends its jobs at their time limits
-                self._robots.end_jobs(started.remote(self._plan.trial))
+            with suppress(FieldkitError):  # on a robot that cannot be reached, jobs are stopped at their time limits
+                self._robots.stop_jobs(started.remote(self._plan.trial))
             if isinstance(error, OSError):
-                raise  # nothing more can be written; resume continues from the started attempt
-            is_fetched_later = self._reached is Status.MEASURED and not self._robots.is_transient
+                raise  # nothing can be written; `resume` continues from the started attempt
+            is_fetched_later = self._progress is Status.MEASURED and not self._robots.is_transient
             if is_fetched_later and isinstance(error, KeyboardInterrupt):
-                raise  # the attempt is intact: resume fetches the rest of it
+                raise  # the attempt is complete: `resume` fetches the evidence
             reason = STOPPED if self._motions.is_ordered else _interruption_reason(error)
-            if self._reached:
+            if self._progress:
                 self._robots.unfetched.mark_all(started.remote(self._plan.trial), partial, reason)
             ended = replace(started, status=Status.VOID, reason=reason, excused=True)
             self._ledger.commit(partial, ended, self._judge(started, partial).measured)
@@ -202,7 +205,7 @@ def _interruption_reason(error: BaseException) -> str:
     match error:
         case FieldkitError():
             return error.located
-        case Exception():  # most likely raised by a step kind of another package
+        case Exception():  # probably raised by a step kind of another package
             return f"{type(error).__name__}: {error}"
         case _:
             return "interrupted"

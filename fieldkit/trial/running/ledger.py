@@ -1,4 +1,4 @@
-"""The ledger of a trial: it stores the result of each attempt in journal, folders, table and manifest immediately."""
+"""The ledger of a trial, which stores the result of each attempt in journal, folders, table and manifest."""
 
 import time
 from collections import Counter
@@ -22,19 +22,19 @@ from fieldkit.trial.plan import Plan
 from fieldkit.trial.running.stop import Stop
 
 TABLE_SHARE: Final = 0.01
-"""Table and manifest are rewritten when this share of the attempts is missing in them; in a trial of up to 100
-attempts, after each attempt. Therefore the total amount written grows linearly with the trial, not with its square.
+"""Table and manifest are rewritten when they lack this share of the attempts: after each attempt in a trial of up to
+100 attempts. The total amount of written data is therefore linear in the length of the trial, not quadratic.
 """
 
 
 class Ledger:
-    """Starts and commits attempts; the state of an earlier run of the trial is read first.
+    """Starts and commits attempts. The state of an earlier run of the trial is read first.
 
     Attempts in the table are not measured again, and files with a checksum are not read again.
 
     Args:
         plan: The trial.
-        folder: Its folder.
+        folder: Folder of the trial.
         stop: Delays a stop while files are being written.
 
     Raises:
@@ -46,7 +46,7 @@ class Ledger:
         self._folder = folder
         self._stop = stop
         self._lines: list[str] = []
-        self._in_table = 0
+        self._line_count_on_disk = 0
         self._last: tuple[Attempt, Row] | None = None
         self._numbers: dict[RepeatId, int] = {}
         self._counted_attempts: Counter[RepeatId] = Counter()
@@ -67,25 +67,27 @@ class Ledger:
             self._rename(attempt)
         self.differences = dict(self._manifest_differences(ended))
         """Differences from the manifest, by file."""
-        unchanged = self._unchanged_lines(len(ended))
-        remeasured = [attempt for index, attempt in enumerate(ended) if index >= len(unchanged) or attempt.reopened]
+        unchanged_lines = self._unchanged_lines(len(ended))
+        remeasured = [
+            attempt for index, attempt in enumerate(ended) if index >= len(unchanged_lines) or attempt.reopened
+        ]
         if remeasured and self.differences:
             self._require_evidence(remeasured)
         for number, attempt in enumerate(ended):
             evidence = store.attempt_folder(folder, attempt.folder)
-            is_known = number < len(unchanged) and not attempt.reopened  # a reopened attempt changes its row
-            row = {} if is_known else rows.measure_row(plan, attempt, AttemptEvidence(evidence))
-            self._add_line(attempt, unchanged[number] if is_known else rows.line(row, self._plan.table))
+            has_line = number < len(unchanged_lines) and not attempt.reopened  # the row of a reopened attempt changes
+            row = {} if has_line else rows.measure_row(plan, attempt, AttemptEvidence(evidence))
+            self._add_line(attempt, unchanged_lines[number] if has_line else rows.line(row, self._plan.table))
             if attempt.folder not in self._manifest:
                 self._manifest.add(evidence)
         self.ended_attempts = tuple(ended)
         """The attempts that ended in earlier runs, in order."""
         self.interrupted_attempts = tuple(journal.interrupted_attempts(entries))
-        """Attempts during which fieldkit was killed; they must be completed first."""
+        """Attempts during which fieldkit was killed. They must be completed before other attempts."""
 
     @property
     def last(self) -> tuple[Attempt, Row]:
-        """The attempt committed last, and its row."""
+        """The last committed attempt and its row."""
         assert self._last is not None
         return self._last
 
@@ -99,7 +101,7 @@ class Ledger:
 
     @property
     def finished_count(self) -> int:
-        """Number of repeats that are over."""
+        """Number of finished repeats."""
         return len(self._finished)
 
     def is_last(self, repeat: RepeatId) -> bool:
@@ -107,7 +109,7 @@ class Ledger:
         return self._counted_attempts[repeat] + 1 >= self._plan.procedure.attempts
 
     def begin(self, repeat: RepeatId) -> Attempt:
-        """Record the start of a new attempt; returns when it is on disk.
+        """Record the start of a new attempt on disk.
 
         Raises:
             OSError: The disk is full or was removed.
@@ -119,16 +121,16 @@ class Ledger:
         return started
 
     def record_measured(self, attempt: Attempt) -> None:
-        """Record that the steps of an attempt are done and its evidence is on the robots; errors as for `begin`."""
+        """Record that the steps of an attempt have ended. Its evidence is on the robots. Raises as `begin`."""
         self._append(attempt, time.time_ns(), Status.MEASURED)
 
     def commit(self, evidence: Path, attempt: Attempt, measured: Measured) -> None:
-        """Commit an attempt that ended to disk: its evidence, then its journal entry, then the derived files.
+        """Write an attempt that ended to disk: first its evidence, then its journal entry, then the derived files.
 
         Args:
-            evidence: Folder of its files, which gets its final name.
+            evidence: Folder of the attempt's files, which is renamed to its final name.
             attempt: The attempt with its final status.
-            measured: Its measured values.
+            measured: Measured values of the attempt.
 
         Raises:
             OSError: As for `begin`.
@@ -141,18 +143,18 @@ class Ledger:
             self._add_line(ended, rows.line(row, self._plan.table))
             self._last = ended, row
             self._manifest.add(final)
-            if self._is_due(self._in_table):
+            if self._is_due(self._line_count_on_disk):
                 self._write()
 
     def summarize(self) -> tuple[Cell, ...]:
-        """Write the table and the summary of all committed attempts and return the summary; errors as for `begin`."""
+        """Write the table and the summary of all committed attempts, and return the summary; raises as `begin`."""
         with self._stop.saving_files():
             cells = rows.write_summary(self._folder, self._plan, self._table())
             self._write()
         return cells
 
     def _rename(self, attempt: Attempt) -> None:
-        """If an attempt failed before its repeat was reopened, rename its folder as for a void attempt."""
+        """Rename the folder of an attempt to the name of a void attempt if its repeat was reopened later."""
         if not attempt.reopened:
             return
         before = attempt.repeat.folder(Status.FAILED, attempt.number)
@@ -162,13 +164,13 @@ class Ledger:
             files.sync_folder(final.parent)
         self._manifest.rename(before, attempt.folder)
 
-    def _is_due(self, in_table: int) -> bool:
-        return len(self._lines) - in_table >= TABLE_SHARE * len(self._lines)
+    def _is_due(self, line_count: int) -> bool:
+        return len(self._lines) - line_count >= TABLE_SHARE * len(self._lines)
 
     def _write(self) -> None:
         rows.write_table(self._folder, self._table())
         self._manifest.write()
-        self._in_table = len(self._lines)
+        self._line_count_on_disk = len(self._lines)
 
     def _table(self) -> str:
         return rows.header(self._plan.table) + "".join(self._lines)
@@ -185,13 +187,13 @@ class Ledger:
         yield from verification.differences(self._folder).items()
 
     def _unchanged_lines(self, ended: int) -> list[str]:
-        """Return the unchanged lines of the table; none if it has more lines than attempts that ended."""
+        """Return the unchanged lines of the table, or no lines if there are more lines than attempts that ended."""
         line_count = self._manifest.unchanged_lines(store.TRIAL_CSV)
         if not line_count:
             return []
         text = files.read(self._folder / store.TRIAL_CSV).decode()
-        head, *lines = text.splitlines(keepends=True)[:line_count]
-        return lines if head == rows.header(self._plan.table) and len(lines) <= ended else []
+        header, *lines = text.splitlines(keepends=True)[:line_count]
+        return lines if header == rows.header(self._plan.table) and len(lines) <= ended else []
 
     def _require_evidence(self, attempts: list[Attempt]) -> None:
         """Raise an error if evidence that must be measured again has changed."""
@@ -199,10 +201,10 @@ class Ledger:
 
         if differing := verification.differences(self._folder, [attempt.folder for attempt in attempts]):
             raise EvidenceError(
-                f"{store.TRIAL_CSV} must be rebuilt, but the evidence is not what was measured: "
+                f"{store.TRIAL_CSV} must be rebuilt, but the evidence has changed since it was measured: "
                 f"{verification.summarize(differing)}",
                 where=str(self._folder),
-                remedy="restore both from a copy, or start a new trial",
+                remedy="restore the table and the evidence from a copy, or start a new trial",
             )
 
     def _append(self, attempt: Attempt, utc_ns: int, status: Status | None = None) -> None:

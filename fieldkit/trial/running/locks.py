@@ -1,4 +1,7 @@
-"""Locks on robots: one trial at a time; a lock names its holder, and ends with the trial or when it expires."""
+"""Locks on robots: only one trial uses a robot at a time.
+
+A lock contains its holder. It is released at the end of the trial, or expires.
+"""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,26 +16,26 @@ from fieldkit.core.events import Note, Sink
 from fieldkit.core.runtime import NameHeldError
 from fieldkit.core.threads import run_parallel
 from fieldkit.remote import jobs
-from fieldkit.remote.jobs import REPLY_S, Aborted
+from fieldkit.remote.jobs import REPLY_S, AbortResult
 from fieldkit.remote.script import call, word
 from fieldkit.remote.shell import Shell
 from fieldkit.steps.scene import Shells
 
 TTL_S: Final = 3600
-"""Lifetime of a lock that is not renewed; `evidence.begin` renews it after half of this time.
-It is longer than any attempt, and longer than carrying robots to another place takes."""
+"""Lifetime of a lock that is not renewed. `evidence.begin` renews it after half of this time. It is longer than an
+attempt, and longer than it takes to carry robots to another place."""
 
 _HELD: Final = re.compile(rb"(?P<token>\S+) (?P<left>[0-9]{1,11}) (?P<who>\S+) (?P<what>\S+)\n")
 
 
 @dataclass(frozen=True)
 class Holder:
-    """Holder of a lock on robots, and its purpose. At most 80 letters, digits and `._@-` of each text are used.
+    """Holder of a lock on robots. Of each text, at most 80 letters, digits and characters of `._@-` are used.
 
     Attributes:
-        token: Identifies the trial; a holder with the same token can lock its robots again.
+        token: ID of the trial. A holder with the same token can lock its robots again.
         user: `user@laptop`, see `runtime.user_at_host`.
-        purpose: The purpose, for example the trial.
+        purpose: Purpose of the lock, for example the name of the trial.
     """
 
     token: str
@@ -42,10 +45,10 @@ class Holder:
 
 @contextmanager
 def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterator[None]:
-    """Lock all robots while the body runs. Only one process of this machine can use the holder's token.
+    """Lock all robots while the body runs. Only one process on this machine can use the holder's token at a time.
 
     Raises:
-        ConfigurationError: Another process has the token; it would use the same locks and release them.
+        ConfigurationError: Another process uses the token. It would use the same locks and release them.
         FieldkitError: As for `locked`.
     """
     with ExitStack() as stack:
@@ -53,7 +56,7 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
             stack.enter_context(runtime.hold_lock(f"trial-{word(holder.token)}"))
         except NameHeldError as error:
             raise ConfigurationError(
-                "another fieldkit runs this trial, or another trial of its session",
+                "another fieldkit process runs this trial, or another trial of its session",
                 where=holder.purpose,
                 remedy="wait until it has ended, or stop it",
             ) from error
@@ -63,41 +66,42 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
 
 @contextmanager
 def locked(shells: Shells, holder: Holder, *, sink: Sink, ttl_s: int = TTL_S) -> Iterator[None]:
-    """Lock all robots, or none, and unlock them after the body.
+    """Lock all robots, and unlock them after the body. If a robot cannot be locked, no robot stays locked.
 
-    Robots are contacted in parallel, but locked in the order of their names: of two trials that need the same robots,
-    one gets all of them. After Ctrl-C the program does not wait for lost links.
+    Robots are contacted in parallel, but locked in the order of their names. If two trials need the same robots, one
+    of them therefore locks all robots. After Ctrl-C, the program does not wait for robots that cannot be reached.
 
     Args:
         shells: The robots.
         holder: The holder of the locks.
-        sink: Receives a note for a robot that could not be unlocked; its lock expires.
+        sink: Receives a note for each robot that could not be unlocked. Its lock expires.
         ttl_s: Lifetime of a lock that is not renewed, in seconds.
 
     Raises:
         LinkError: A robot did not answer.
-        RobotError: Another holder has a robot; the message names the holder, start and end of the lock, and a remedy.
+        RobotError: Another holder has locked a robot. The message contains the holder, start and end of the lock,
+            and a remedy.
     """
-    attempted: list[Shell] = []
-    in_order = sorted(shells.values(), key=lambda shell: shell.robot)
+    contacted: list[Shell] = []
+    sorted_shells = sorted(shells.values(), key=lambda shell: shell.robot)
     run_parallel(
         lambda shell: jobs.install(shell, Deadline.after(REPLY_S)),
-        in_order,
-        on_interrupt=lambda: _close_all(in_order),
+        sorted_shells,
+        on_interrupt=lambda: _close_all(sorted_shells),
     )
     try:
-        for shell in in_order:
-            attempted.append(shell)  # before the answer, which may be lost
+        for shell in sorted_shells:
+            contacted.append(shell)  # before the request, because its answer may be lost
             words = (word(holder.token), str(ttl_s), word(holder.user), word(holder.purpose))
             call(shell, "lock", *words, deadline=Deadline.after(REPLY_S))
         yield
     except BaseException as error:
         if not isinstance(error, Exception):
-            _close_all(attempted)
+            _close_all(contacted)
         raise
     finally:
-        if attempted:
-            run_parallel(lambda shell: _unlock(shell, holder, sink), attempted)
+        if contacted:
+            run_parallel(lambda shell: _unlock(shell, holder, sink), contacted)
 
 
 @dataclass(frozen=True)
@@ -105,16 +109,16 @@ class LockState:
     """A valid lock.
 
     Attributes:
-        holder: Its holder.
-        left_s: Seconds until the lock expires.
+        holder: Holder of the lock.
+        remaining_s: Time in seconds until the lock expires.
     """
 
     holder: Holder
-    left_s: float
+    remaining_s: float
 
 
 def read_lock(shell: Shell) -> LockState | None:
-    """Return the lock of a robot that has the job script, or None if it is not locked.
+    """Return the lock of a robot on which the job script is installed, or None if the robot is not locked.
 
     Raises:
         LinkError: The robot did not answer.
@@ -128,7 +132,7 @@ def read_lock(shell: Shell) -> LockState | None:
 
 
 def require_lock(shell: Shell, token: str) -> None:
-    """Check that a robot with the job script is still locked by this trial.
+    """Check that this trial still holds the lock of a robot on which the job script is installed.
 
     Raises:
         LinkError: The robot did not answer.
@@ -150,20 +154,20 @@ def _unlock(shell: Shell, holder: Holder, sink: Sink) -> None:
         sink(Note(f"{shell.robot} stays locked until its lock expires: {error.what}"))
 
 
-def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, Aborted]:
+def abort(robots: Mapping[str, Shell | FieldkitError], user: str) -> Mapping[str, AbortResult]:
     """Break the lock of every robot and end all of its jobs, of any trial; return the result for each robot.
 
     Args:
         robots: The robots, from `Backend.persistent_shells`.
-        user: Name that is shown to the users whose trials end, see `runtime.user_at_host`.
+        user: Name that is shown to the users whose trials are aborted, see `runtime.user_at_host`.
     """
     return dict(zip(robots, run_parallel(lambda name: _abort(robots[name], user), robots), strict=True))
 
 
-def _abort(robot: Shell | FieldkitError, user: str) -> Aborted:
+def _abort(robot: Shell | FieldkitError, user: str) -> AbortResult:
     if isinstance(robot, FieldkitError):
-        return Aborted(error=robot)
+        return AbortResult(error=robot)
     try:
         return jobs.abort(robot, word(user), Deadline.after(4 * REPLY_S))
     except FieldkitError as error:
-        return Aborted(error=error)
+        return AbortResult(error=error)

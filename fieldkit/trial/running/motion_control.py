@@ -1,7 +1,7 @@
-"""Interface of the package that moves robots: permission to move, and guards of drones, during trials.
+"""Interface to the package that moves robots: permission to move, and guards of drones, during trials.
 
-The package is found by the entry point `control` of the group `fieldkit.motion`, and imported only for trials in
-which robots move.
+The package has the entry point `control` of the group `fieldkit.motion`. It is imported only for trials in which
+robots move.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +18,7 @@ from fieldkit.trial.plan import Plan
 
 
 class MotionClearance(Protocol):
-    """Permission of the robots of a trial to move, checked before each attempt."""
+    """Permission of the robots of a trial to move. It is checked before each attempt."""
 
     @property
     def origins(self) -> object:
@@ -30,13 +30,13 @@ class MotionClearance(Protocol):
 
         Raises:
             ConfigurationError: As for `Operator.enter`.
-            MotionHeldError: A person must confirm first.
+            MotionHeldError: A person must first confirm the motion.
             OSError: The disk is full or was removed.
         """
         ...
 
     def reporting_holds(self, sink: Sink) -> AbstractContextManager[None]:
-        """Run the body; if the operator stops it, report each robot that must not move without a confirmation."""
+        """Run the body. If the operator stops it, report each robot that must not move without a confirmation."""
         ...
 
 
@@ -44,10 +44,12 @@ class MotionSupport(Protocol):
     """The package that moves robots."""
 
     def require_one_place(self, plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
-        """Check that self-moving robots stay at one place in all trials, or that a person moves them.
+        """Check that robots that move without a person are at the same place in all trials.
+
+        A person may also bring them to their places.
 
         Raises:
-            ConfigurationError: No person moves a robot that must be at another place.
+            ConfigurationError: A robot must be at another place in a later trial, and no person brings it there.
         """
         ...
 
@@ -77,7 +79,7 @@ class _NoMotion:
 def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operator) -> None:
     """Call `MotionSupport.require_one_place` if robots move in one of the trials."""
     if any(plan.procedure.moved_roles() for plan in plans):
-        _control().require_one_place(plans, backend, operator)
+        _motion_support().require_one_place(plans, backend, operator)
 
 
 def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
@@ -85,15 +87,17 @@ def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
     # Even if this trial has no moves, a fault in another trial of its campaign may have stopped a robot.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
     return (
-        _control().permission(plan, testbed, folder) if plan.procedure.moved_roles() or has_journal else _NoMotion()
+        _motion_support().permission(plan, testbed, folder)
+        if plan.procedure.moved_roles() or has_journal
+        else _NoMotion()
     )
 
 
-def _control() -> MotionSupport:
+def _motion_support() -> MotionSupport:
     for point in plugins.entry_points(plugins.MOTION):
-        loaded: MotionSupport = plugins.load(point)
-        return loaded
+        support: MotionSupport = plugins.load(point)
+        return support
     raise ConfigurationError(
         "robots that move automatically need a package that is not installed",
-        remedy=f"install fieldkit with its entry point of the group {plugins.MOTION}",
+        remedy=f"install fieldkit again: its entry point of the group {plugins.MOTION} is missing",
     )

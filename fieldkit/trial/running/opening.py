@@ -1,6 +1,6 @@
-"""Open the robots of a trial: open the testbed, log in on all robots, lock them, run.
+"""Open the robots of trials (testbed, logins, locks, jobs of the session) and run trials on them.
 
-`trial`, `resume`, `campaign` and the pytest plugin all use this module.
+`trial`, `resume`, `campaign` and the pytest plugin use this module.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,32 +21,32 @@ from fieldkit.trial.running.stop import Stop
 
 @contextmanager
 def opened(
-    backend: Backend, cast: Cast, *, session: str, what: str, seed: int, sink: Sink, operator: Operator
+    backend: Backend, cast: Cast, *, session: str, purpose: str, seed: int, sink: Sink, operator: Operator
 ) -> Iterator[Testbed]:
-    """Yield the testbed of a cast, with every robot logged in and locked, and the jobs of the session running.
+    """Yield the testbed of a cast. All robots are connected and locked, and the jobs of the session run on them.
 
     Args:
         backend: The backend.
         cast: The robot in each role.
-        session: Identifies the run of fieldkit in the robots' locks.
-        what: Purpose of the locks, shown to other users.
+        session: ID of the run of fieldkit in the robots' locks.
+        purpose: Purpose of the locks, which is shown to other users.
         seed: Seed of all random numbers in the testbed.
         sink: Receives events.
-        operator: The person who does what the backend cannot do.
+        operator: The person who performs actions that the backend cannot perform.
 
     Raises:
         ConfigurationError: A permission or a program is missing on this machine, there are no credentials, or another
-            fieldkit runs the session.
+            process of fieldkit runs the session.
         LinkError: A robot did not answer.
         RobotError: A robot cannot be reached, has another host key, refuses the login, or is locked by another user.
     """
     with backend.open(cast, seed=seed, sink=sink, operator=operator) as testbed:
         preflight.connect_all(cast, testbed.shells, sink)
-        # Failure to unlock a transient robot does not matter, because the robot ends now.
-        on_lost_lock = (lambda _: None) if isinstance(testbed, Transient) else sink
+        # It does not matter if a transient robot cannot be unlocked, because it is removed now.
+        unlock_sink = (lambda _: None) if isinstance(testbed, Transient) else sink
         with (
             locks.locked_exclusively(
-                testbed.shells, Holder(session, runtime.user_at_host(), what), sink=on_lost_lock
+                testbed.shells, Holder(session, runtime.user_at_host(), purpose), sink=unlock_sink
             ),
             session_jobs.running(cast, testbed.shells, session, sink=sink),
         ):
@@ -56,7 +56,7 @@ def opened(
 def run(
     plans: Sequence[Plan], backend: Backend, cast: Cast, out: Path, *, sink: Sink, operator: Operator, stop: Stop
 ) -> list[Outcome | None]:
-    """Run planned trials of one session in sequence; their robots are opened once.
+    """Run planned trials of one session, one after the other. The robots are opened once.
 
     Args:
         plans: The trials, at least one.
@@ -64,7 +64,7 @@ def run(
         cast: The robot in each role.
         out: Folder in which the trials' folders are created.
         sink: Receives events.
-        operator: The person who does what the backend cannot do.
+        operator: The person who performs actions that the backend cannot perform.
         stop: Request to stop the running trial.
 
     Returns:
@@ -77,16 +77,16 @@ def run(
     motion_control.require_one_place(plans, backend, operator)
     store.prepare(out)
     first = plans[0]
-    ended: list[Outcome | None] = []
+    outcomes: list[Outcome | None] = []
     with opened(
-        backend, cast, session=first.session, what=first.trial, seed=first.seed, sink=sink, operator=operator
+        backend, cast, session=first.session, purpose=first.trial, seed=first.seed, sink=sink, operator=operator
     ) as testbed:
         try:
             for plan in plans:
-                ended.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (needed if one stops)
+                outcomes.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (used below if a trial stops)
         except BaseException:
-            # A person who resumes the interrupted trial alone would overlook the later ones.
-            if later := plans[len(ended) + 1 :]:
-                sink(Note(f"not started: {', '.join(str(plan.distance) for plan in later)}"))
+            # `resume` continues only the interrupted trial, so the operator must start the later trials.
+            if later_plans := plans[len(outcomes) + 1 :]:
+                sink(Note(f"not started: {', '.join(str(plan.distance) for plan in later_plans)}"))
             raise
-    return ended
+    return outcomes

@@ -29,12 +29,12 @@ from fieldkit.trial.running.locks import LockState
 JOBS_S: Final = 10.0
 
 RobotCheck = Callable[[Plan, Role, Shell, ProbeResult, Report], None]
-"""A check that a package adds to `fieldkit check`, after all others. It adds its findings to the report, and raises
-`LinkError` if the robot did not answer, `RobotError` if it could not be checked."""
+"""A check that a package adds to `fieldkit check`. It runs after all other checks, and adds its findings to the
+report. It raises `LinkError` if the robot did not answer, and `RobotError` if the robot could not be checked."""
 
 FleetCheck = Callable[[Plan, Shells, Mapping[Role, Report]], None]
 """A check of all robots together, which a package adds as an option of `fieldkit check`. Its arguments are the plan,
-the robots that answered, and the reports, to which it adds its findings. It raises no `FieldkitError`."""
+the robots that can be reached, and the reports, to which it adds its findings. It raises no `FieldkitError`."""
 
 _CONNECTION: Final = "connection"
 
@@ -44,7 +44,8 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
 
     Raises:
         ConfigurationError: There are no credentials.
-        RobotError: The message names every robot that cannot be reached, has another host key or refuses the login.
+        RobotError: A robot cannot be reached, has another host key, or refuses the login. The message lists all such
+            robots.
     """
     sink(PhaseStarted("connect"))
 
@@ -60,12 +61,12 @@ def connect_all(cast: Cast, shells: Shells, sink: Sink) -> None:
 
 
 @dataclass(frozen=True)
-class CheckResult:
-    """Result of a check.
+class PreflightResult:
+    """Result of `check`.
 
     Attributes:
-        findings: All findings by robot; a robot that cannot be reached is one of the failures.
-        variants: The tools of each robot that was reached.
+        findings: All findings, robot by robot. A robot that cannot be reached is a failed check.
+        variants: Variants of the tools of each robot that was reached.
     """
 
     findings: tuple[Finding, ...]
@@ -74,21 +75,21 @@ class CheckResult:
 
 def check(
     plan: Plan, shells: Shells, out: Path, *, all_checks: bool, fleet_checks: Sequence[FleetCheck] = ()
-) -> CheckResult:
+) -> PreflightResult:
     """Check every robot of the cast and this machine, and install the job script on each robot.
 
     Args:
         plan: The trial.
         shells: The robots.
         out: Folder of the trial.
-        all_checks: Whether to also check locks, and to run the checks that packages add (`plugins.CHECKS`).
-        fleet_checks: Checks of all robots together, which run last, unless a robot is locked.
+        all_checks: True to check locks as well, and to run the checks that packages add (`plugins.CHECKS`).
+        fleet_checks: Checks of all robots together. They run last, and only if no robot is locked.
     """
     reports = {role: Report(robot.name) for role, robot in plan.cast.items()}
     variants_by_role: dict[Role, Variants] = {}
 
     def check_robot(role: Role) -> bool:
-        return _check(plan, role, shells[role], variants_by_role, reports[role], all_checks=all_checks)
+        return _check_robot(plan, role, shells[role], variants_by_role, reports[role], all_checks=all_checks)
 
     are_unlocked = run_parallel(check_robot, plan.cast)
     for refusal in plan.refusals(variants_by_role):
@@ -98,23 +99,23 @@ def check(
     if all(are_unlocked):
         for fleet_check in fleet_checks:
             fleet_check(plan, reachable, reports)
-    elif fleet_checks:  # their packets would disturb the radio of the other user
+    elif fleet_checks:  # packets of these checks would disturb the measurement of the other user
         laptop.warn("network", "not checked, because a robot is locked", HELD_REMEDY)
     system.judge_laptop(plan, out, laptop)
-    return CheckResult(_all_findings([*reports.values(), laptop]), variants_by_role)
+    return PreflightResult(_all_findings([*reports.values(), laptop]), variants_by_role)
 
 
 def check_before_trial(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> Mapping[Role, Variants]:
-    """Run the preflight checks, store all findings in the trial's folder, and report findings that are not ok.
+    """Run the preflight checks, store all findings in the trial's folder, and report warnings and failures.
 
     Returns:
-        The tools of each robot.
+        The variants of the tools of each robot.
 
     Raises:
-        RobotError: A check failed; the message lists each with its remedy.
+        RobotError: A check failed. The message lists all failed checks with their remedies.
     """
-    checked = check(plan, shells, folder.parent, all_checks=False)
-    findings = checked.findings
+    result = check(plan, shells, folder.parent, all_checks=False)
+    findings = result.findings
     fields = ((finding.robot, finding.check, finding.status, finding.detail, finding.remedy) for finding in findings)
     lines = map("\t".join, fields)
     files.write(folder / store.PREFLIGHT_FILE, "".join(f"{line}\n" for line in lines).encode())
@@ -122,14 +123,14 @@ def check_before_trial(plan: Plan, shells: Shells, folder: Path, sink: Sink) -> 
         if finding.status is not Verdict.OK:
             sink(finding)
     require_passed(findings)
-    return checked.variants
+    return result.variants
 
 
 def require_passed(findings: Sequence[Finding]) -> None:
     """Raise an error if a check failed.
 
     Raises:
-        RobotError: A check failed; the message lists each with its remedy.
+        RobotError: A check failed. The message lists all failed checks with their remedies.
     """
     failed = [finding for finding in findings if finding.status is Verdict.FAIL]
     if failed:
@@ -138,14 +139,14 @@ def require_passed(findings: Sequence[Finding]) -> None:
         )
         raise RobotError(
             f"the checks found {format_count(len(failed), 'problem')}:{lines}",
-            remedy="fix these, then try again",
+            remedy="fix these problems, then try again",
         )
 
 
-def _check(
+def _check_robot(
     plan: Plan, role: Role, shell: Shell, variants_by_role: dict[Role, Variants], report: Report, *, all_checks: bool
 ) -> bool:
-    """Add the findings on a robot; return False if another user has locked it."""
+    """Add the findings about a robot. Return False if another user has locked it."""
     stage, robot = _CONNECTION, plan.cast[role]
     try:
         offset = contact.judge(shell, report)
@@ -158,7 +159,7 @@ def _check(
         radio.judge(robot, sections, report)
         stage = "jobs"
         jobs.install(shell, Deadline.after(JOBS_S))
-        # A trial has locked its robots already. A recording would disturb jobs of another user.
+        # During a trial, the robots are already locked. The later checks would disturb the jobs of another user.
         if all_checks and not _judge_lock(locks.read_lock(shell), report):
             return False
         _judge_jobs(plan, jobs.list_running(shell, Deadline.after(JOBS_S)), report)
@@ -166,7 +167,7 @@ def _check(
         software.check_agent(plan, role, sections, shell, report)
         if not all_checks:
             return True
-        from fieldkit.trial.check import time_sources  # noqa: PLC0415 (a trial does not need it)
+        from fieldkit.trial.check import time_sources  # noqa: PLC0415 (trials do not check time sources)
 
         stage = time_sources.CHECK
         time_sources.judge(time_sources.read_reports(shell), report)
@@ -180,13 +181,13 @@ def _check(
 
 
 def _judge_jobs(plan: Plan, running_jobs: Sequence[str], report: Report) -> None:
-    session_folders = {f"{planned.job.folder}/" for planned in session_jobs.planned(plan.cast, plan.session)}
-    own_folders = (f"/{plan.trial}/", *session_folders)
-    others = [line for line in running_jobs if not any(folder in line for folder in own_folders)]
-    for line in others:
-        report.fail("jobs", f"a job of an earlier trial runs: {line}", "fieldkit abort")
-    if not others:
-        report.ok("jobs", "no job of an earlier trial runs")
+    session_folders = {f"{planned.job.folder}/" for planned in session_jobs.planned_jobs(plan.cast, plan.session)}
+    trial_folders = (f"/{plan.trial}/", *session_folders)
+    other_jobs = [line for line in running_jobs if not any(folder in line for folder in trial_folders)]
+    for line in other_jobs:
+        report.fail("jobs", f"a job of an earlier trial is running: {line}", "fieldkit abort")
+    if not other_jobs:
+        report.ok("jobs", "no job of an earlier trial is running")
 
 
 def _judge_lock(lock: LockState | None, report: Report) -> bool:
@@ -194,8 +195,9 @@ def _judge_lock(lock: LockState | None, report: Report) -> bool:
     if lock is None:
         report.ok("lock", "the robot is not locked")
         return True
-    holder, remaining = lock.holder, format_duration(lock.left_s)
-    report.fail("lock", f"{holder.user} holds the robot for {holder.purpose}, at most {remaining} more", HELD_REMEDY)
+    holder, remaining = lock.holder, format_duration(lock.remaining_s)
+    detail = f"{holder.user} has locked the robot for {holder.purpose}; the lock expires in {remaining}"
+    report.fail("lock", detail, HELD_REMEDY)
     return False
 
 

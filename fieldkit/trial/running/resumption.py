@@ -1,4 +1,4 @@
-"""Resume a trial: code, backend and robots must be the same as at its start."""
+"""Resume a trial. Code, backend and robots must be the same as when the trial was started."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -29,16 +29,16 @@ def resume(
         folder: The trial's folder.
         name: Name of the backend.
         backend: The backend.
-        failed: Whether failed repeats are repeated too.
+        failed: True to repeat failed repeats as well.
         sink: Receives events.
-        operator: The person who does what the backend cannot do.
+        operator: The person who performs actions that the backend cannot perform.
         stop: Request to stop the trial.
 
     Returns:
         The outcome; None if the operator skipped the trial.
 
     Raises:
-        FieldkitError: The trial was started by other code, on another backend or with other robots; or as for
+        FieldkitError: The trial was started with other code, on another backend or with other robots; or as for
             `opened` and `resume_trial`.
     """
     plan = resumable(folder)
@@ -48,7 +48,7 @@ def resume(
     require_simulators(plan, simulators_of(backend), folder)
     require_cast(plan, backend.cast(plan.topology))
     with opened(
-        backend, plan.cast, session=plan.session, what=plan.trial, seed=plan.seed, sink=sink, operator=operator
+        backend, plan.cast, session=plan.session, purpose=plan.trial, seed=plan.seed, sink=sink, operator=operator
     ) as testbed:
         return resume_trial(folder, testbed, sink, stop, failed=failed)
 
@@ -56,7 +56,7 @@ def resume(
 def resume_trial(
     folder: Path, testbed: Testbed, sink: Sink, stop: Stop | None = None, *, failed: bool = False
 ) -> Outcome | None:
-    """Place the robots and resume a trial; None if the operator skipped it. Errors as for `continue_trial`."""
+    """Place the robots and resume a trial; None if the operator skipped it. Raises as `continue_trial`."""
     placement = place(resumable(folder), testbed, sink)
     if placement.answer.skip:
         return None
@@ -66,22 +66,23 @@ def resume_trial(
 def continue_trial(
     folder: Path, testbed: Testbed, sink: Sink, stop: Stop, *, report_resume: bool = True, failed: bool = False
 ) -> Outcome:
-    """Resume an interrupted trial: finished repeats are kept, each other repeat is attempted again.
+    """Resume an interrupted trial. Finished repeats are kept; all other repeats are attempted again.
 
-    The evidence of an attempt whose steps were done is fetched and judged. An interrupted attempt is stored as void
-    and does not count as one of the allowed attempts.
+    If the steps of an attempt had ended, its evidence is fetched and checked. Otherwise, the attempt is stored as
+    void and is not one of the allowed attempts.
 
     Args:
         folder: The trial's folder.
-        testbed: The robots of its plan, at their places.
+        testbed: The robots of the trial, at their places.
         sink: Receives events.
         stop: Request to stop the trial.
         report_resume: As for `begin`.
-        failed: Whether failed repeats are repeated too, each with as many attempts as the procedure allows.
+        failed: True to repeat failed repeats as well, each with as many attempts as the procedure allows.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, other code started it, or another process runs it now.
-        EvidenceError: Its journal is damaged.
+        ConfigurationError: `folder` is not a trial, the trial was started with other code, or another process runs
+            it.
+        EvidenceError: The journal is damaged.
         FieldkitError: As for `begin`.
     """
     plan = resumable(folder)
@@ -93,24 +94,26 @@ def continue_trial(
 
 
 def resumable(folder: Path) -> Plan:
-    """Return the plan of a trial that this fieldkit can resume.
+    """Return the plan of a trial that this version of fieldkit can resume.
 
     Raises:
-        ConfigurationError: `folder` is not a trial; or other code started it, so that its rows would be measured in
-            two ways; or a program of the lab that it copies to robots has changed or is missing.
+        ConfigurationError: `folder` is not a trial; the trial was started with other code, so that its rows would be
+            measured in two ways; or a program of the lab that it copies to robots has changed or is missing.
     """
     plan = plans.read_plan(folder)
     versions = plan.versions
     # Packages that add steps or a backend are compared by version, fieldkit by its hash, which is more precise.
-    added = {name: now for name, now in plugins.versions().items() if name != "fieldkit"}
-    changed = [f"{name} {versions[name]}" for name, now in added.items() if versions.get(name, now) != now]
+    packages = {name: version for name, version in plugins.versions().items() if name != "fieldkit"}
+    changed = [
+        f"{name} {versions[name]}" for name, version in packages.items() if versions.get(name, version) != version
+    ]
     if plan.code_sha256 != code_hash():
-        changed = [f"fieldkit {versions.get('fieldkit', 'of no version')}, {plan.code_sha256}"]
+        changed = [f"fieldkit {versions.get('fieldkit', 'of an unknown version')}, {plan.code_sha256}"]
     if changed:
         raise ConfigurationError(
-            f"it was started by other code ({', '.join(changed)})",
+            f"it was started with other code ({', '.join(changed)})",
             where=str(folder),
-            remedy="resume it with that version, or start a new trial; the repeats that ended are complete: "
+            remedy="resume it with that version, or start a new trial; the results of the finished repeats: "
             + shell_command("fieldkit", "rebuild", folder),
         )
     for put in plan.program_copies():
@@ -127,7 +130,7 @@ def require_backend(plan: Plan, name: str, folder: Path) -> None:
         folder: The trial's folder.
 
     Raises:
-        ConfigurationError: It was started on another backend.
+        ConfigurationError: The trial was started on another backend.
     """
     if name != plan.backend:
         raise ConfigurationError(
@@ -141,7 +144,7 @@ _NO_SIMULATORS: Final = "no simulators"
 
 
 def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) -> None:
-    """Raise an error if a trial would be resumed on other simulators, because one table must not mix simulators.
+    """Raise an error if a trial would be resumed on other simulators, which must not be mixed in one table.
 
     Args:
         plan: The trial.
@@ -149,7 +152,7 @@ def require_simulators(plan: Plan, simulators: Mapping[str, str], folder: Path) 
         folder: The trial's folder.
 
     Raises:
-        ConfigurationError: It was started on other simulators.
+        ConfigurationError: The trial was started on other simulators.
     """
     if simulators != plan.simulators:
         raise ConfigurationError(
@@ -172,11 +175,11 @@ def require_cast(plan: Plan, cast: Cast) -> None:
         if current and is_moved and robot.abilities - current.abilities:
             options = " ".join(map(permissions.option, permissions.repeated(permissions.installed())))
             raise ConfigurationError(
-                f"{robot.name} moved without a person in this trial, and may not now",
+                f"{robot.name} moves without a person in this trial, which is not permitted now",
                 where=plan.trial,
-                remedy=f"give {options} again, or start a new trial in which a person moves it",
+                remedy=f"add {options}, or start a new trial in which a person moves it",
             )
-        # Permission to move does not matter in a trial that does not move the robot.
+        # In a trial that does not move the robot, its permission to move may differ.
         if current is None or current.model_copy(update={"abilities": robot.abilities}) != robot:
             raise ConfigurationError(
                 f"{role} was {robot.name} ({robot.address}, {robot.profile.name}); the site file now differs",
@@ -186,7 +189,7 @@ def require_cast(plan: Plan, cast: Cast) -> None:
 
 
 def _step_code_changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
-    """Yield a sentence for each kind of step whose code differs from the plan although the version is equal."""
+    """Yield a sentence for each kind of step whose version is that of the plan, but whose code is not."""
     for kind, current in step_packages.packages_of_kinds(planned).items():
         frozen = planned[kind]
         if (frozen.package, frozen.version) == (
@@ -195,5 +198,5 @@ def _step_code_changes(planned: Mapping[str, StepPackage]) -> Iterator[str]:
         ) and frozen.code_sha256 != current.code_sha256:
             yield (
                 f"the code of the step {kind} ({current.package} {current.version}) has changed since the trial "
-                "started: its repeats are measured by two versions of it"
+                "was started: its repeats are measured with different code"
             )

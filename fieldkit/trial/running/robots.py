@@ -27,7 +27,7 @@ from fieldkit.remote.fetching import FetchProgress, LateJobError, NoFolderError
 from fieldkit.steps.scene import Announce, Scene, Shells
 from fieldkit.trial import hosts, size, step_errors
 from fieldkit.trial.owners import FileOwners
-from fieldkit.trial.plan import Plan
+from fieldkit.trial.plan import Plan, telemetry_cast
 from fieldkit.trial.running import locks
 from fieldkit.trial.running.unfetched import UnfetchedEvidence
 
@@ -37,7 +37,7 @@ _WATCH_S: Final = 0.5
 
 
 class Robots:
-    """The robots that take part in a trial; each operation runs on all of them in parallel.
+    """The robots of a trial. Each operation runs on all robots in parallel.
 
     Args:
         plan: The trial.
@@ -50,14 +50,14 @@ class Robots:
         self._testbed = testbed
         self._sink = sink
         self.is_transient = isinstance(testbed, Transient)
-        """Whether the robots and their files are removed at the end of this run of fieldkit."""
+        """True if the robots and their files are removed at the end of this run of fieldkit."""
         self._roles = sorted(plan.procedure.roles())
         protocol = plan.procedure.protocols[0]
         self._owners = FileOwners.of_procedure(plan.procedure, plan.scene(RepeatId(protocol, 1), ""))
         self._is_fetch_cancelled = False
         self.unfetched = UnfetchedEvidence(plan, self._roles, transient=self.is_transient)
         """Evidence that was not fetched and stays on the robots."""
-        self._boots: dict[Role, str] = {}
+        self._boot_ids: dict[Role, str] = {}
 
     @property
     def shells(self) -> Shells:
@@ -65,25 +65,25 @@ class Robots:
         return self._testbed.shells
 
     def begin(self, remote: str, *, old: str | None) -> Mapping[Role, tuple[int, int]]:
-        """Create an attempt's folder `remote` on each robot, and remove the folder `old` unless it was not fetched.
+        """Create an attempt's folder `remote` on each robot, and remove the folder `old` if its evidence was fetched.
 
-        Programs of the lab are copied now, before the first step, so that the copies do not load the radio later.
+        Programs of the lab are copied before the first step, so that copying does not use the radio during steps.
 
         Returns:
-            The laptop's clock before the request to each robot and after its answer; see `robot_state.exchanges`.
+            Laptop's clock before the request to each robot and after the response; see `robot_state.exchanges`.
 
         Raises:
             FieldkitError: As for `evidence.begin` and `programs.copy`; or a program of the lab has changed.
         """
         plan = self._plan
-        puts = [(put, put.program.content()) for put in plan.program_copies()]
+        copies = [(put, put.program.content()) for put in plan.program_copies()]
         sources = self._telemetry_sources()
 
         times_ns: dict[Role, tuple[int, int]] = {}
 
-        def make(role: Role) -> None:
+        def create_folder(role: Role) -> None:
             request_ns = time.time_ns()
-            self._boots[role] = evidence.begin(
+            self._boot_ids[role] = evidence.begin(
                 self.shells[role],
                 remote,
                 role,
@@ -94,27 +94,27 @@ class Robots:
                 sources=sources.get(role, ()),
             )
             times_ns[role] = request_ns, time.time_ns()
-            for put, content in puts:
+            for put, content in copies:
                 if put.role == role:
                     from fieldkit.remote import programs  # noqa: PLC0415 (few procedures copy programs)
 
                     sha256, executable = put.program.sha256, put.program.executable
                     programs.copy(self.shells[role], remote, put.at, content, sha256, executable=executable)
 
-        self._run_on_all(make)
+        self._run_on_all(create_folder)
         return times_ns
 
     def _telemetry_sources(self) -> Mapping[Role, Sequence[Sequence[str]]]:
         """Return the telemetry sources that each robot queries during an attempt."""
-        cast = self._plan.telemetry_cast()
+        cast = telemetry_cast(self._plan)
         if not cast:
             return {}
         from fieldkit.telemetry import telemetry_queries  # noqa: PLC0415 (few profiles have sources)
 
-        return telemetry_queries.of_robots(cast)
+        return telemetry_queries.queries_by_role(cast)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run every step, and store the measurements of the testbed's oracle, if any; errors as for `Step.run`."""
+        """Run all steps, and store the measurements of the testbed's oracle, if it has one; raises as `Step.run`."""
         oracle = self._testbed.oracle
         if oracle is None:
             self._run_steps(scene, announce)
@@ -136,7 +136,7 @@ class Robots:
 
     def _run_steps(self, scene: Scene, announce: Announce) -> None:
         with self._monitored_processes(), ExitStack() as stack:
-            if (cast := self._plan.telemetry_cast()) and scene.laptop_folder is not None:
+            if (cast := telemetry_cast(self._plan)) and scene.laptop_folder is not None:
                 from fieldkit.telemetry import laptop_telemetry  # noqa: PLC0415 (few profiles have sources)
 
                 stack.enter_context(laptop_telemetry.querying(cast, scene.laptop_folder))
@@ -148,30 +148,30 @@ class Robots:
 
     @contextmanager
     def _monitored_processes(self) -> Iterator[None]:
-        """Unblock the body if a process that the robots need has exited, because no answer can arrive any more."""
-        ended = Event()
+        """Unblock the body if a process that the robots need has exited, because no more answers can arrive."""
+        has_ended = Event()
 
         def watch() -> None:
-            while not ended.wait(_WATCH_S):
+            while not has_ended.wait(_WATCH_S):
                 try:
                     self.check_alive()
                 except TestbedLostError:
                     self.close_connections()
 
-        watching = Thread(target=watch, name="testbed", daemon=True)
+        watch_thread = Thread(target=watch, name="testbed", daemon=True)
         if self.is_transient:
-            watching.start()
+            watch_thread.start()
         try:
             yield
         finally:
-            ended.set()
+            has_ended.set()
             if self.is_transient:
-                watching.join()
+                watch_thread.join()
 
     def fetch(self, remote: str, into: Path, *, ended_normally: bool) -> list[str]:
-        """Fetch an attempt's evidence; if it did not end normally, its jobs are ended first.
+        """Fetch the evidence of an attempt. If the attempt did not end normally, its jobs are stopped first.
 
-        Evidence that was not fetched stays on its robot, and `ROLE-unfetched.txt` records it.
+        Evidence that was not fetched stays on its robot, which `ROLE-unfetched.txt` records.
 
         Args:
             remote: The attempt's folder on each robot.
@@ -183,19 +183,19 @@ class Robots:
         """
         self._is_fetch_cancelled = False
         problems = self._run_on_all(lambda role: self._collect(role, remote, into, ended_normally=ended_normally))
-        failed = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
-        for role, reason, is_there in failed:
-            if is_there:
+        failures = [(role, *problem) for role, problem in zip(self._roles, problems, strict=True) if problem]
+        for role, reason, is_on_robot in failures:
+            if is_on_robot:
                 self.unfetched.mark(role, remote, into, reason)
-        return [reason for _, reason, _ in failed]
+        return [reason for _, reason, _ in failures]
 
     def _collect(self, role: Role, remote: str, into: Path, *, ended_normally: bool) -> tuple[str, bool] | None:
-        """Fetch the evidence of one robot; return the problem and whether the robot still has it, or None."""
+        """Fetch the evidence of one robot. If this fails, return the reason and True if it is still on the robot."""
         shell, attempt = self.shells[role], remote.rpartition("/")[2]
 
-        def announce(progress_text: str, left_s: float) -> None:
+        def announce(progress_text: str, remaining_s: float) -> None:
             name = f"collect evidence, {progress_text} of {self._plan.cast[role].name}"
-            self._sink(PhaseStarted(name, attempt.rpartition("-")[0], left_s))
+            self._sink(PhaseStarted(name, attempt.rpartition("-")[0], remaining_s))
 
         progress = FetchProgress(announce, lambda: self._is_fetch_cancelled)
         expected_bytes = size.evidence_bytes(self._plan, role)
@@ -210,30 +210,32 @@ class Robots:
                 into,
                 expected_bytes=expected_bytes,
                 progress=progress,
-                foreign=partial(self._owners.refusal, role),
+                forbidden_reason=partial(self._owners.refusal, role),
             )
         except LinkError as error:
             return error.located, True
         except (RobotError, EvidenceError) as error:
             return self._reboot_message(role) or error.located, not isinstance(error, (NoFolderError, LateJobError))
-        rebooted = None if ended_normally else self._reboot_message(role)
-        return (rebooted, False) if rebooted else None
+        message = None if ended_normally else self._reboot_message(role)
+        return (message, False) if message else None
 
     def _reboot_message(self, role: Role) -> str | None:
-        """Return a message if a robot rebooted unexpectedly during the attempt; None if it did not, or is unknown."""
-        booted = self._boots.get(role) if role not in hosts.restarted_roles(self._plan.procedure) else None
+        """Return a message if a robot is known to have rebooted unexpectedly during the attempt; otherwise None."""
+        boot_id = self._boot_ids.get(role) if role not in hosts.restarted_roles(self._plan.procedure) else None
         with suppress(FieldkitError):
-            if booted and hosts.has_rebooted(booted, evidence.boot_id(self.shells[role])):
+            if boot_id and hosts.has_rebooted(boot_id, evidence.boot_id(self.shells[role])):
                 return f"{self._plan.cast[role].name}: {hosts.REBOOTED}"
         return None
 
     def check_alive(self) -> None:
-        """Raise an error if a process that the robots need has exited; errors as for `Transient.check_alive`."""
+        """Raise an error, as `Transient.check_alive`, if a process that the robots need has exited."""
         if isinstance(self._testbed, Transient):
             self._testbed.check_alive()
 
     def require_locks(self) -> None:
-        """Raise an error if a robot reports that its lock was broken; robots that do not answer are ignored.
+        """Raise an error if a robot reports that this trial no longer holds its lock.
+
+        Robots that do not answer are ignored.
 
         Raises:
             LockLostError: The trial was aborted, or the lock expired and another holder locked the robot.
@@ -245,41 +247,43 @@ class Robots:
             except LockLostError:
                 raise
             except FieldkitError:
-                return  # the attempt already has reasons for its failure
+                return  # the attempt is void for other reasons
 
         self._run_on_all(check_lock)
 
-    def end_jobs(self, remote: str) -> None:
-        """End every job of an attempt; errors as `evidence.end_jobs`."""
+    def stop_jobs(self, remote: str) -> None:
+        """Stop all jobs of an attempt; raises as `evidence.end_jobs`."""
         self._run_on_all(lambda role: evidence.end_jobs(self.shells[role], remote))
 
     def stop_leftover_jobs(self) -> None:
-        """End every job of this trial that remains from a killed run; errors as for `evidence.end_all`."""
+        """Stop all jobs of this trial that a killed run left on the robots; raises as `evidence.end_all`."""
 
-        def end(role: Role) -> None:
+        def stop(role: Role) -> None:
             jobs.install(self.shells[role], Deadline.after(jobs.REPLY_S))
             evidence.end_all(self.shells[role], self._plan.trial)
 
-        self._run_on_all(end)
+        self._run_on_all(stop)
 
     def close_connections(self) -> None:
-        """Close every control connection and cancel fetching; the next command opens a new connection."""
+        """Close all control connections and cancel fetching. The next command opens a new connection."""
         self._is_fetch_cancelled = True
         for shell in self.shells.values():
             shell.close()
 
     def delete_remote(self, remote: str | None = None) -> None:
-        """Remove the folder of an attempt, or of the whole trial, from the robots, except unfetched evidence.
+        """Remove the folder of an attempt or, if `remote` is None, of the trial from the robots.
+
+        Evidence that was not fetched is kept.
 
         Raises:
             FieldkitError: As for `evidence.discard`.
         """
 
         def remove(role: Role) -> None:
-            unfetched = self.unfetched.folders[role]
+            unfetched_folders = self.unfetched.folders[role]
             if remote is None:
-                evidence.discard(self.shells[role], self._plan.trial, kept_folders=unfetched)
-            elif remote not in unfetched:
+                evidence.discard(self.shells[role], self._plan.trial, kept_folders=unfetched_folders)
+            elif remote not in unfetched_folders:
                 evidence.discard_attempt(self.shells[role], remote)
 
         self._run_on_all(remove)

@@ -44,10 +44,10 @@ class Outcome:
     """Result of a trial.
 
     Attributes:
-        folder: Its folder.
-        cells: Its summary.
-        valid: Repeats that are valid.
-        failed: Repeats that no attempt made valid.
+        folder: Folder of the trial.
+        cells: Summary of the trial.
+        valid: Number of valid repeats.
+        failed: Number of repeats without a valid attempt.
         judgements: Judgements of the procedure's expectations.
     """
 
@@ -59,7 +59,7 @@ class Outcome:
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
-    """Place the robots and run a trial; None if the operator skipped it. Errors as for `place` and `begin`."""
+    """Place the robots and run a trial; None if the operator skipped it. Raises as `place` and `begin`."""
     placement = place(plan, testbed, sink)
     if placement.answer.skip:
         return None
@@ -80,7 +80,7 @@ class PlacementResult:
 
 
 def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
-    """Bring the robots to the places of a trial; errors as for `Testbed.place`."""
+    """Bring the robots to the places of a trial; raises as `Testbed.place`."""
     started_s = time.monotonic()
     placement = PlacementResult(testbed.place(plan.placement), time.monotonic() - started_s)
     sink(Placed(placement.answer.skip, placement.answer.note, placement.duration_s))
@@ -88,10 +88,10 @@ def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
 
 
 def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, report_resume: bool = True) -> Outcome:
-    """Run the preflight checks on robots at their places, then every repeat.
+    """Run the preflight checks on robots at their places, then all repeats.
 
-    If the trial ends early, its folder contains the plan, the journal, every attempt that ended, their rows and a
-    manifest, and `resumption.continue_trial` resumes it. If fieldkit was killed, the summary is missing; `rebuild`
+    If the trial ends early, its folder contains the plan, the journal, all attempts that ended, their rows and a
+    manifest, and `resumption.continue_trial` can resume it. If fieldkit was killed, the summary is missing; `rebuild`
     writes it.
 
     Args:
@@ -100,7 +100,7 @@ def begin(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop, *, re
         out: Folder in which the trial's folder is created.
         sink: Receives events.
         stop: Request to stop the trial.
-        report_resume: Whether to report how to resume this trial alone if it stops.
+        report_resume: True to report the command that resumes this trial if it stops.
 
     Raises:
         ConfigurationError: The folder cannot be created.
@@ -124,7 +124,7 @@ def run_repeats(
     for ended in ledger.ended_attempts:
         robots.unfetched.restore(ended, store.attempt_folder(folder, ended.folder))
     repeats = list(plan.repeats_in_order())
-    finished = estimates.finished_repeats(plan, journal.read(folder))
+    finished_repeats = estimates.finished_repeats(plan, journal.read(folder))
     if ledger.differences:
         from fieldkit.trial.stored import verification  # noqa: PLC0415 (only a resumed trial has a manifest)
 
@@ -156,17 +156,19 @@ def run_repeats(
                 with permission.reporting_holds(sink), stop.finishing(expected_s, notes):
                     remedy = attempts.make(repeat)
                     if ledger.is_finished(repeat):
-                        finished.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
+                        finished_repeats.append(FinishedRepeat(plan, repeat.protocol, time.monotonic() - started_s))
                     remaining = [other for other in repeats if not ledger.is_finished(other)]
-                    # Inside the context, so that a repeat that ends after a stop request is reported too.
+                    # This is inside the context, so that a repeat that ends after a stop request is also reported.
                     sink(
-                        _repeat_event(plan, ledger, len(repeats), _remaining_time(plan, remaining, finished), remedy)
+                        _repeat_event(
+                            plan, ledger, len(repeats), _remaining_time(plan, remaining, finished_repeats), remedy
+                        )
                     )
     except BaseException as error:
         if report_resume:
             sink(TrialStopped(str(folder), ledger.finished_count, len(repeats)))
         if isinstance(error, OSError):
-            raise  # nothing more can be written
+            raise  # nothing can be written
         _report_unfetched(robots, sink)
         ledger.summarize()
         raise
@@ -180,7 +182,7 @@ def run_repeats(
 
 
 def _judge(plan: Plan, cells: Sequence[Cell], sink: Sink) -> "tuple[Judgement, ...]":
-    """Judge the expectations of a procedure, and report each judgement."""
+    """Judge the expectations of a procedure and report the judgements."""
     from fieldkit.analysis.judgements import judge  # noqa: PLC0415 (few procedures have expectations)
 
     judgements = judge(plan.procedure.expectations, cells)
@@ -208,12 +210,13 @@ def _judgement_event(judgement: "Judgement") -> ExpectationJudged:
 
 
 def _report_unfetched(robots: Robots, sink: Sink) -> None:
-    """Report evidence that was not fetched and is still on the robots."""
+    """Report the evidence that was not fetched and is still on the robots."""
     for robot, folders in robots.unfetched.by_robot().items():
         folder_names = ", ".join(f"~/{folder}" for folder in folders)
         sink(
             Note(
-                f"{robot}: evidence that was not fetched stays on it; delete it when it is not needed: {folder_names}"
+                f"{robot}: evidence that was not fetched stays on the robot; delete it if you do not need it: "
+                f"{folder_names}"
             )
         )
 
@@ -226,7 +229,7 @@ def _remaining_time(plan: Plan, remaining: Sequence[RepeatId], finished: Sequenc
     )
 
 
-def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, remedy: str) -> RepeatEnded:
+def _repeat_event(plan: Plan, ledger: Ledger, total: int, remaining: TimeEstimate, remedy: str) -> RepeatEnded:
     attempt, row = ledger.last
     return RepeatEnded(
         repeat=str(attempt.repeat),
@@ -236,23 +239,23 @@ def _repeat_event(plan: Plan, ledger: Ledger, total: int, left: TimeEstimate, re
         summary=rows.describe(plan, row),
         done=ledger.finished_count,
         total=total,
-        left_s=left.likely_s,
+        left_s=remaining.likely_s,
         remedy=remedy,
-        left_most_s=left.most_s,
+        left_most_s=remaining.most_s,
     )
 
 
 @contextmanager
 def converting_write_errors(folder: Path) -> Iterator[None]:
-    """Convert errors from writing to a trial's folder, for example if the disk is full or the folder was moved."""
+    """Convert errors of writing to a trial's folder, for example if the disk is full or the folder was moved."""
     try:
         yield
     except OSError as error:
-        first = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct the cause"
+        remedy = "free some space" if error.errno in {errno.ENOSPC, errno.EDQUOT} else "correct the cause"
         raise ConfigurationError(
-            f"cannot be written: {error.strerror or error}; the repeats that ended are saved",
+            f"cannot be written: {error.strerror or error}; the finished repeats are saved",
             where=str(error.filename or folder),
-            remedy=f"{first}, then: {shell_command('fieldkit', 'resume', folder)}"
+            remedy=f"{remedy}, then: {shell_command('fieldkit', 'resume', folder)}"
             if folder.is_dir()
             else "fieldkit resume FOLDER, with the present path of the folder",
         ) from error

@@ -1,4 +1,4 @@
-"""Stop a running trial, from a signal handler or another thread."""
+"""Requests to stop a running trial, from a signal handler or another thread."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,14 +10,14 @@ from fieldkit.steps.motions import Motions
 class Stop:
     """A request to stop.
 
-    It takes effect immediately while a robot moves without a person or may start to (`motions`), and while no repeat
-    runs; otherwise after the running repeat.
+    It takes effect immediately while a robot moves without a person or may start to move (`motions`), and while no
+    repeat is running. Otherwise, it takes effect after the running repeat.
 
     Attributes:
-        after_repeat: Whether the trial must stop after the running repeat.
-        can_finish: Whether a repeat is running that may be finished first.
-        saving: Whether files are being written that must not be left incomplete.
-        after_saving: Whether to stop as soon as they are written.
+        after_repeat: True if the trial must stop after the running repeat.
+        can_finish: True if a running repeat may finish before the trial stops.
+        saving: True while files are being written that must not be left incomplete.
+        after_saving: True if the trial must stop when these files are written.
         motions: The robots that move without a person.
     """
 
@@ -31,19 +31,20 @@ class Stop:
 
     @property
     def left_s(self) -> float:
-        """Estimated remaining time of the running repeat in seconds; 0 if it takes longer than estimated."""
+        """Estimated remaining time of the running repeat in seconds; 0 if the repeat takes longer than estimated."""
         return self._expected_end.remaining_s
 
     @contextmanager
     def finishing(self, expected_s: float, motions: tuple[str, ...]) -> Iterator[None]:
-        """Allow the body to finish before a request to stop takes effect, unless robots move in it without a person.
+        """Delay a request to stop until the body has finished, unless robots move without a person in the body.
 
         Args:
             expected_s: Estimated duration of the body, in seconds.
-            motions: See `Motions.stop_notes`: until the body clears it, a request to stop takes effect immediately.
+            motions: Value of `Motions.stop_notes`. If it is not empty, a request to stop takes effect immediately
+                until the body clears it.
 
         Raises:
-            KeyboardInterrupt: The body has finished, and a stop was requested meanwhile.
+            KeyboardInterrupt: A stop was requested while the body was running.
         """
         self._expected_end, self.motions.stop_notes = Deadline.after(expected_s), motions
         self.can_finish = True
@@ -56,10 +57,10 @@ class Stop:
 
     @contextmanager
     def saving_files(self) -> Iterator[None]:
-        """Allow the body, which is short, to finish before a stop.
+        """Delay a stop until the body, which must be short, has finished.
 
         Raises:
-            KeyboardInterrupt: The body has finished, and a stop was due meanwhile.
+            KeyboardInterrupt: A stop was due while the body was running.
         """
         self.saving = True
         try:

@@ -1,4 +1,4 @@
-"""Evidence that was not fetched: it stays on its robot, and a file in the attempt's local folder records it."""
+"""Evidence that was not fetched. It stays on its robot, and a file in the attempt's local folder records this."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,7 +11,7 @@ from fieldkit.trial.plan import Plan
 
 
 def unfetched_file(role: Role) -> str:
-    """Return the name of the file that records why evidence was left on the robot in `role`."""
+    """Return the name of the file with the reason why evidence was left on the robot in `role`."""
     return f"{role}-{laptop_files.UNFETCHED}"
 
 
@@ -20,11 +20,11 @@ class UnfetchedEvidence:
 
     Args:
         plan: The trial.
-        roles: Its roles.
-        transient: Whether the robots and their files are removed at the end of this run of fieldkit.
+        roles: Roles of the trial.
+        transient: True if the robots and their files are removed at the end of this run of fieldkit.
 
     Attributes:
-        folders: The folders of attempts on the robot in each role.
+        folders: Folders of attempts with unfetched evidence on the robot in each role.
     """
 
     def __init__(self, plan: Plan, roles: Iterable[Role], *, transient: bool) -> None:
@@ -33,28 +33,28 @@ class UnfetchedEvidence:
         self.folders: dict[Role, list[str]] = {role: [] for role in roles}
 
     def mark(self, role: Role, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on a robot, and record its path and the reason in its local folder.
+        """Leave an attempt's folder on a robot, and record the path and the reason in the attempt's local folder.
 
         Args:
             role: Role of the robot.
             remote: The attempt's folder on the robot.
             into: The local folder.
-            reason: Why it was not fetched.
+            reason: Reason why the evidence was not fetched.
         """
         if remote not in self.folders[role]:
             self.folders[role].append(remote)
-        verb = "had" if self._transient else "has"
-        end = "; its files ended with it" if self._transient else ""
-        text = f"{reason}\n{self._plan.cast[role].name} {verb} it in ~/{remote}{end}\n"
+        verb = "was" if self._transient else "is"
+        end = ", and was removed with the robot" if self._transient else ""
+        text = f"{reason}\nthe evidence {verb} on {self._plan.cast[role].name} in ~/{remote}{end}\n"
         (into / unfetched_file(role)).write_text(encodable(text), encoding="utf-8")
 
     def mark_all(self, remote: str, into: Path, reason: str) -> None:
-        """Leave an attempt's folder on every robot; arguments as for `mark`."""
+        """Leave an attempt's folder on all robots; arguments as for `mark`."""
         for role in self.folders:
             self.mark(role, remote, into, reason)
 
     def restore(self, ended: Attempt, stored_folder: Path) -> None:
-        """Mark the evidence of an attempt in an earlier run as unfetched if its stored folder has such a mark."""
+        """Mark the evidence of an attempt of an earlier run if its stored folder contains the file of a mark."""
         if ended.status is not Status.VALID and not self._transient:
             for role, folders in self.folders.items():
                 if (stored_folder / unfetched_file(role)).is_file():

@@ -1,1 +1,1 @@
-"""Trials in their folders: tables of many trials, checks of their files, measuring again, positions added later."""
+"""Stored trials: tables of many trials, checks of files, measurements from the evidence, positions added later."""

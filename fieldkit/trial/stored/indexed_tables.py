@@ -1,4 +1,4 @@
-"""Tables of trials and their index: find the tables that the index covers, and add the other tables to it."""
+"""Tables of trials and their index: find the tables that are in the index, and add other tables to it."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,26 +20,26 @@ from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored.tables import expectation_texts, frozen_columns, other_names
 
 MIN_TABLES: Final = 100
-"""Smallest number of tables for which an index is made; fewer tables are read faster without an index."""
+"""Smallest number of tables for which an index is created. Fewer tables are read faster without an index."""
 MIN_NEW: Final = 20
-"""Smallest number of new or changed tables for which an index is written again; fewer are read from their files."""
+"""Smallest number of new or changed tables for which an index is written again. Fewer are read from their files."""
 MAX_TABLE_BYTES: Final = 1 << 25
-"""Largest table that is indexed."""
+"""Maximum size of a table in the index."""
 _IN_PARALLEL: Final = 200
-"""Smallest number of plans that are read in parallel: reading a plan takes 20 ms, starting processes takes 1 s."""
+"""Smallest number of plans that are read in parallel. Reading a plan takes 20 ms; starting processes takes 1 s."""
 
 Note = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class IndexedTables:
-    """The tables that an index covers, and the tables to be added to it.
+    """The tables that are in an index, and the tables that must be added to it.
 
     Attributes:
-        path: The file of the index; None if there is no index.
-        index: Its content.
-        entries: The entries of the tables that it covers.
-        new: Properties of tables that `write` adds to it, with their stamps.
+        path: File of the index; None if there is no index.
+        index: Content of the index.
+        entries: Entries of the tables that are in the index.
+        new: Stamps and properties of the tables that `write` adds to the index.
     """
 
     path: Path | None = None
@@ -53,7 +53,7 @@ class IndexedTables:
         return frozenset(table for table, entry in self.entries.items() if entry.rows >= 0)
 
     def facts(self, table: Path) -> TableFacts | None:
-        """Return the properties of a table; None if they are unknown."""
+        """Return the properties of a table, or None if they are unknown."""
         if table in self.new:
             return self.new[table][1]
         return self.entries[table].facts if table in self.entries else None
@@ -61,7 +61,7 @@ class IndexedTables:
     def read(
         self, tables: Sequence[Path], declared: Mapping[str, Column]
     ) -> tuple[dict[str, Numbers], dict[str, Texts], list[int]] | None:
-        """Return the rows of tables, as `table_files.IndexedRows`; None if the types of columns have changed."""
+        """Return the rows of tables, as `table_files.IndexedRows`, or None if the types of columns have changed."""
         if not self.index.has_types(declared.values()):
             return None
         entries = [self.entries[table] for table in tables]
@@ -72,7 +72,7 @@ NO_INDEX: Final = IndexedTables()
 
 
 def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
-    """Return the tables that the index in the user's cache covers, and the properties of the tables to add.
+    """Return the tables that are in the index in the user's cache, and the properties of the tables to add.
 
     Args:
         tables: The tables.
@@ -86,7 +86,7 @@ def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
     try:
         index = table_index.load(path)
     except OSError as error:
-        note(_unused(path, error))
+        note(_no_index_note(path, error))
         return NO_INDEX
     now_ns = time.time_ns()
     entries, new = {}, {}
@@ -105,8 +105,8 @@ def find(tables: Iterable[Path], workers: Workers, note: Note) -> IndexedTables:
     return replace(indexed, new={table: (new[table], facts[table]) for table in facts})
 
 
-def _unused(path: Path, error: OSError) -> str:
-    return f"{path}: {error.strerror or error}; reading tables without an index takes longer (--no-index: no note)"
+def _no_index_note(path: Path, error: OSError) -> str:
+    return f"{path}: {error.strerror or error}; tables are read without an index, which takes longer (see --no-index)"
 
 
 def _can_be_indexed(stamps: TableStamp, now_ns: int) -> bool:
@@ -137,12 +137,12 @@ def _facts(tables: Sequence[Path], workers: Workers, note: Note) -> dict[Path, T
 
 
 def _declarations(table: Path) -> str:
-    """Return the columns that the plan next to a table declares, as JSON."""
+    """Return the columns in the plan next to a table, as JSON."""
     return frozen.to_json(frozen_columns(table))
 
 
 def write(indexed: IndexedTables, columns: Sequence[Column], note: Note) -> IndexedTables:
-    """Write the index with its new tables, and return the tables that it covers.
+    """Write the index with its new tables, and return the tables that are in it.
 
     Args:
         indexed: The tables, as `find` returned them.
@@ -159,11 +159,11 @@ def write(indexed: IndexedTables, columns: Sequence[Column], note: Note) -> Inde
             if index.entries:
                 writer.copy(index, _kept_entries(indexed))
             for arrays, counts in table_files.typed_tables(_unchanged(indexed.new), declared):
-                added = [Entry(str(table.absolute()), *indexed.new[table], 0, rows) for table, rows in counts]
-                writer.add(arrays, added)
+                new_entries = [Entry(str(table.absolute()), *indexed.new[table], 0, rows) for table, rows in counts]
+                writer.add(arrays, new_entries)
         written = table_index.load(indexed.path)
     except OSError as error:
-        note(_unused(indexed.path, error))
+        note(_no_index_note(indexed.path, error))
         return replace(indexed, new={})
     stamps = {table: entry.stamp for table, entry in indexed.entries.items()}
     stamps |= {table: stamp for table, (stamp, _) in indexed.new.items()}
@@ -172,7 +172,7 @@ def write(indexed: IndexedTables, columns: Sequence[Column], note: Note) -> Inde
 
 
 def _kept_entries(indexed: IndexedTables) -> list[Entry]:
-    """Return the entries of an index whose tables have not changed."""
+    """Return the entries of an index for tables that have not changed."""
     requested = {entry.stamp for entry in indexed.entries.values()}
     return [
         entry

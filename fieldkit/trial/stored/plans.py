@@ -16,7 +16,7 @@ from fieldkit.trial.journal import JOURNAL_FILE
 from fieldkit.trial.plan import PLAN_FILE, Plan
 
 DEPTH: Final = 3
-"""Maximum depth of evidence below `repeats/`: in a subfolder of an attempt's folder."""
+"""Maximum depth of an evidence file below `repeats/`: a subfolder of an attempt's folder."""
 
 _TRIAL_FILES: Final = frozenset(
     {
@@ -44,14 +44,14 @@ def read_plan(folder: Path) -> Plan:
     require_plain(folder)
     if not (folder / PLAN_FILE).is_file():
         raise ConfigurationError(
-            f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial, trials/<stamp>_..."
+            f"there is no {PLAN_FILE}", where=str(folder), remedy="name the folder of a trial: trials/<time>_..."
         )
     document = schema.read(folder / PLAN_FILE)
-    if absent := _missing_kinds(document.data):
+    if missing_kinds := _missing_kinds(document.data):
         raise ConfigurationError(
-            absent,
+            missing_kinds,
             where=str(folder / PLAN_FILE),
-            remedy="install that package with pip: rebuild needs any version of it, resume the same one",
+            remedy="install that package with pip: any version for rebuild, the same version for resume",
         )
     return schema.validate(document, Plan)
 
@@ -70,12 +70,12 @@ def require_plain(folder: Path) -> None:
             raise EvidenceError(
                 problem,
                 where=str(path),
-                remedy="get a copy with plain files from the person who ran the trial; no others are read",
+                remedy="get a copy with plain files from the person who ran the trial; only plain files are read",
             )
 
 
 def unexpected_files(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield each path in a trial's folder that is neither a plain file nor one of its folders, and its type."""
+    """Yield each path in a trial's folder that is neither a plain file nor a folder of evidence, with its type."""
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if file_type := files.unexpected_type(path):
             yield path, file_type
@@ -90,7 +90,7 @@ def _unexpected_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
         path = folder / entry.name
         if entry.is_dir(follow_symlinks=False):
             if depth == 1:
-                yield path, "it is a folder, deeper than evidence can be"
+                yield path, "it is a folder at a level below the folders of evidence"
             else:
                 yield from _unexpected_below(path, depth - 1)
         elif not entry.is_file(follow_symlinks=False):
@@ -98,7 +98,7 @@ def _unexpected_below(folder: Path, depth: int) -> Iterator[tuple[Path, str]]:
 
 
 def _missing_kinds(document: object) -> str | None:
-    """Return a sentence that names the kinds of step of a frozen plan that are not installed; None if all are.
+    """Return a sentence with the kinds of step of a plan that are not installed, or None if all are installed.
 
     Args:
         document: The plan as plain data, before it is validated.
@@ -106,15 +106,15 @@ def _missing_kinds(document: object) -> str | None:
     packages = document.get("step_packages") if isinstance(document, dict) else None
     if not isinstance(packages, dict):
         return None
-    absent = [kind for kind in packages if kind not in base.step_types()]
-    if not absent:
+    missing_kinds = [kind for kind in packages if kind not in base.step_types()]
+    if not missing_kinds:
         return None
-    sources = (packages[kind] if isinstance(packages[kind], dict) else {} for kind in absent)
+    sources = (packages[kind] if isinstance(packages[kind], dict) else {} for kind in missing_kinds)
     descriptions = (
         f"step kind `{kind}` from {source.get('package', 'an unknown package')} {source.get('version', '')}".strip()
-        for kind, source in zip(absent, sources, strict=True)
+        for kind, source in zip(missing_kinds, sources, strict=True)
     )
-    return f"{', '.join(descriptions)} {'is' if len(absent) == 1 else 'are'} not installed"
+    return f"{', '.join(descriptions)} {'is' if len(missing_kinds) == 1 else 'are'} not installed"
 
 
 class _PlanColumns(schema.Strict):
@@ -148,7 +148,7 @@ def read_expectations(path: Path) -> tuple[str, ...]:
     Raises:
         ConfigurationError: The file cannot be read, or its expectations are invalid.
     """
-    if b"expect:" not in files.read(path):  # a fast test: most plans have no expectations, and need not be parsed
+    if b"expect:" not in files.read(path):  # most plans have no expectations, and need not be parsed
         return ()
     procedure = schema.read(path).part("procedure")
     data = {"expect": procedure.data["expect"]} if "expect" in procedure.data else {}

@@ -1,4 +1,4 @@
-"""Positions of robots that are added after a trial, for example GPX tracks; they are stored with its evidence."""
+"""Positions of robots that are added after a trial, such as GPX tracks. They are stored with its evidence."""
 
 import shutil
 from collections.abc import Iterator, Mapping
@@ -30,9 +30,9 @@ class AttemptPositions:
     """The position columns of one attempt.
 
     Attributes:
-        attempt: Its folder's name.
-        source: Sources of the positions, as text; None if there are none besides the testbed.
-        distances_m: Smallest and largest distance by measurement: `transfer`, `rtt`, `up.rtt`.
+        attempt: Name of the attempt's folder.
+        source: Sources of the positions as text; None if there is no source other than the testbed.
+        distances_m: Smallest and largest distance by measurement, such as `transfer`, `rtt` or `up.rtt`.
         missing: Reasons for missing distances, by measurement.
     """
 
@@ -52,10 +52,10 @@ def set_positions(
         sources: GPX or CSV file, or a fixed place, by role; empty to remove positions that were added before.
         offset_s: Offset that is added to the times of the files to convert them to the laptop's clock, in seconds.
         gap_s: Longest time between two points over which positions are interpolated linearly, in seconds.
-        heights: Whether heights above the ellipsoid are used.
+        heights: True to use heights above the ellipsoid.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another process runs it, it has no such role, or a file is
+        ConfigurationError: `folder` is not a trial, another process runs the trial, it has no such role, or a file is
             missing.
         EvidenceError: A file cannot be read, or the trial's evidence has changed.
     """
@@ -70,7 +70,7 @@ def set_positions(
         name: change for name, change in verification.differences(folder).items() if not manifest.is_positions(name)
     }
     if changes:
-        problem = f"the evidence is not what was measured: {verification.summarize(changes)}"
+        problem = f"the evidence has changed since it was measured: {verification.summarize(changes)}"
         raise EvidenceError(problem, where=str(folder), remedy="restore it from a copy")
     with journal.locked(folder):
         sources_by_role = {
@@ -96,11 +96,11 @@ def _require_role(plan: Plan, role: Role) -> None:
 def _require_file(path: Path) -> None:
     if not path.is_file():
         raise ConfigurationError(
-            "there is no such file", where=str(path), remedy="name GPX, CSV, or a place: 48.1,11.5"
+            "there is no such file", where=str(path), remedy="name a GPX or CSV file, or a place: 48.1,11.5"
         )
     if (size_bytes := path.stat().st_size) > MAX_BYTES:
-        problem = f"it has {format_bytes(size_bytes)}, the limit is {format_bytes(MAX_BYTES)}"
-        raise ConfigurationError(problem, where=str(path), remedy="cut it to the time of the trial")
+        problem = f"it has {format_bytes(size_bytes)}, but the limit is {format_bytes(MAX_BYTES)}"
+        raise ConfigurationError(problem, where=str(path), remedy="remove the points outside of the trial")
 
 
 def _store_source(
@@ -122,12 +122,13 @@ def _remove_others(folder: Path, names: set[str]) -> None:
 
 
 def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
-    """Return a role and the position source of its robot: `receiver=walk.gpx`, `sender=48.1,11.5`, `sender=0m,5m`.
+    """Return a role and the position source of its robot.
 
-    A third number is the height above the ellipsoid in metres.
+    Examples are `receiver=walk.gpx`, `sender=48.1,11.5` and `sender=0m,5m`. A third number is the height above the
+    ellipsoid in metres.
 
     Raises:
-        ConfigurationError: The text is not such a pair.
+        ConfigurationError: The text does not have this form.
     """
     name, separator, source = text.partition("=")
     try:
@@ -140,13 +141,13 @@ def parse_source(text: str) -> tuple[Role, Path | PositionSource]:
 
 
 def _place(text: str) -> PositionSource | None:
-    """Return a fixed place, or None if the text is not one."""
+    """Return a fixed place, or None if the text is not a place."""
     try:
         (first, first_is_length), (second, is_length), *third = map(_degrees_or_m, text.split(","))
     except ValueError:
         return None
-    fits = is_length or (abs(first) <= 90 and abs(second) <= 180)
-    if first_is_length is not is_length or not fits or len(third) > 1:
+    is_in_range = is_length or (abs(first) <= 90 and abs(second) <= 180)
+    if first_is_length is not is_length or not is_in_range or len(third) > 1:
         return None
     height_m = third[0][0] if third else 0.0 if is_length else None
     return PositionSource(place=(first, second, height_m), frame=LOCAL if is_length else WGS84)

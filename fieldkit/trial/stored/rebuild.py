@@ -1,6 +1,6 @@
-"""Rebuild a trial's tables from its plan, journal and raw evidence, without a robot.
+"""Rebuild the tables of a trial from its plan, journal and raw evidence, without a robot.
 
-The same version of fieldkit gives the same bytes.
+The same version of fieldkit writes the same bytes.
 """
 
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ class RebuildResult:
     """Result of `rebuild`.
 
     Attributes:
-        cells: The summary.
-        changed: Files whose bytes differ from before, or that were missing.
+        cells: Summary of the trial.
+        changed: Files that changed or were missing.
         expected: Names of the quantities that have an expectation.
-        has_manifest: Whether there is a manifest, with which the evidence was verified.
+        has_manifest: True if there is a manifest, with which the evidence was compared.
     """
 
     cells: tuple[Cell, ...]
@@ -38,25 +38,24 @@ def rebuild(folder: Path) -> RebuildResult:
     """Write trial.csv and summary.csv of the trial in `folder` again.
 
     Raises:
-        ConfigurationError: `folder` is not a trial, another process runs it, or it cannot be written.
-        EvidenceError: The journal cannot be read, or the evidence differs from its checksums; nothing is written
-            then.
+        ConfigurationError: `folder` is not a trial, another process runs the trial, or a file cannot be written.
+        EvidenceError: The journal cannot be read, or the evidence differs from its checksums. Nothing is written.
     """
     plan = plans.read_plan(folder)
     if differences := verification.differences(folder):
         raise EvidenceError(
-            "the evidence is not what was measured; the tables are not changed: "
+            "the evidence has changed since it was measured, so the tables are not rebuilt: "
             f"{verification.summarize(differences)}",
             where=str(folder),
-            remedy="restore it from a copy; or show the results of the evidence as it is now: "
+            remedy="restore it from a copy; or show the results of the present evidence: "
             + shell_command("fieldkit", "aggregate", folder, "--rebuild"),
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
     before = {name: _content(folder / name) for name in names}
     entries = journal.history(folder, plan)
-    with journal.locked(folder):  # rows that a running trial adds meanwhile would be lost
+    with journal.locked(folder):  # otherwise rows that a running trial adds would be lost
         table = rows.to_csv(_rows(folder, plan, entries), plan.table)
-        rows.summary(folder, plan, table)  # if this fails, nothing has been written yet
+        rows.summary(folder, plan, table)  # raises errors before a file is written
         rows.write_table(folder, table)
         cells = rows.write_summary(folder, plan, table)
         if has_manifest := (folder / store.MANIFEST_FILE).exists():
@@ -67,7 +66,7 @@ def rebuild(folder: Path) -> RebuildResult:
 
 
 def measure_rows(folder: Path, plan: Plan) -> list[Row]:
-    """Return the rows of a trial's attempts, measured again from the evidence; nothing is written.
+    """Return the rows of a trial's attempts, measured again from the evidence. Nothing is written.
 
     Raises:
         EvidenceError: As for `journal.history`.

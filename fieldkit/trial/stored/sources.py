@@ -1,4 +1,4 @@
-"""Find trials and CSV files at paths for commands and the Python API, and read their repeats."""
+"""Find trials and CSV files and read their repeats, for commands and the Python API."""
 
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -27,24 +27,24 @@ from fieldkit.trial.stored.indexed_tables import NO_INDEX, IndexedTables
 ALL_PROCESSORS: Final = Workers()
 
 _IN_PARALLEL: Final = 8
-"""Smallest number of trials that are measured in parallel by default; starting processes takes a second."""
+"""Smallest number of trials that are measured in parallel by default, because starting processes takes a second."""
 
 Note = Callable[[str], None]
-"""Shows a sentence about data that is left out or treated in an unexpected way."""
+"""Function that shows a sentence about data that is omitted or treated in an unexpected way."""
 
 
 @dataclass(frozen=True)
 class Sources:
-    """Tables that were found at some paths.
+    """The tables at some paths.
 
     Attributes:
         where: The paths, for messages.
         tables: The tables, without duplicates.
         columns: The columns of all tables.
-        rebuild: Whether raw evidence is measured again instead; nothing is written.
+        rebuild: True to measure the raw evidence again instead of reading the tables. Nothing is written.
         note: Receives notes.
         workers: Processes that measure raw evidence again.
-        row_filter: Chooses rows; None for all.
+        row_filter: Selects rows; None for all rows.
         indexed: The tables that are in an index.
     """
 
@@ -72,24 +72,24 @@ class Sources:
 
         Args:
             text: Comma-separated names.
-            option: The option or argument that gave them; for the message.
+            option: Option or argument with these names, for the message.
 
         Raises:
             ConfigurationError: There is no such column.
         """
         names = tuple(name.strip() for name in text.split(","))
-        names_allowed = [*(column.name for column in self.columns), SOURCE]
+        allowed_names = [*(column.name for column in self.columns), SOURCE]
         for name in names:
-            if name not in names_allowed:
+            if name not in allowed_names:
                 raise ConfigurationError(
                     f"{option}: there is no column {name!r}",
-                    remedy=did_you_mean(name, names_allowed, "fieldkit columns lists them"),
+                    remedy=did_you_mean(name, allowed_names, "fieldkit columns lists them"),
                 )
         return tuple(dict.fromkeys(names))
 
     @cached_property
     def sweep_columns(self) -> Mapping[str, str]:
-        """The columns that define a condition, as `datasets.condition`; empty if not all tables are sweeps."""
+        """The columns that define a condition (`datasets.condition`); empty if a table is not a sweep."""
         if not all(table.is_dir() for table in self.tables):
             return {}
         from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
@@ -98,13 +98,15 @@ class Sources:
 
     @property
     def sweep_condition(self) -> tuple[str, ...]:
-        """The columns that define a condition: the flow and the factors of sweeps; empty if not all are sweeps."""
+        """The columns that define a condition, the flow and the factors; empty if a table is not a sweep."""
         return tuple(self.sweep_columns)
 
     def select(
         self, names: Collection[str], *, option: str = "--quantity"
     ) -> tuple[list[Quantity] | None, list[Column] | None]:
-        """Return the quantities and the word columns of some names; both are None, meaning all, if no name is given.
+        """Return the quantities and the word columns with some names.
+
+        Both are None, which means all, if there are no names.
 
         Raises:
             ConfigurationError: As for `quantity`, with `option` in the message.
@@ -115,7 +117,7 @@ class Sources:
         return quantities, [self.words[name] for name in names if name in self.words]
 
     def quantity(self, name: str, *, option: str = "--quantity") -> Quantity:
-        """Return the quantity of a name; `option` as for `condition`.
+        """Return the quantity with a name; `option` as for `condition`.
 
         Raises:
             ConfigurationError: There is no such quantity.
@@ -128,22 +130,22 @@ class Sources:
         return self.quantities[name]
 
     def expectations(self) -> Mapping[str, Sequence[Expectation]]:
-        """Return the expectations of trials by source folder; a CSV file without its trial has none.
+        """Return the expectations of trials by source folder. A CSV file without its trial has no expectations.
 
         Raises:
             ConfigurationError: A plan cannot be read.
         """
-        by_source: dict[str, list[Expectation]] = {}
+        expectations_by_source: dict[str, list[Expectation]] = {}
         for table in self.tables:
             facts = self.indexed.facts(table)
             for text in tables.expectation_texts(table) if facts is None else facts.expected:
                 try:
                     expectation = expectations.parse(text, self.quantities.values())
                 except ConfigurationError as error:  # the plan is of an earlier version, or was edited
-                    self.note(f"{table.parent}: an expectation is left out: {error.what}")
+                    self.note(f"{table.parent}: an expectation is omitted: {error.what}")
                 else:
-                    by_source.setdefault(str(table.parent), []).append(expectation)
-        return by_source
+                    expectations_by_source.setdefault(str(table.parent), []).append(expectation)
+        return expectations_by_source
 
     def read(
         self, columns: Collection[str] | None = None, *, also: Collection[str] = (), undeclared: bool = False
@@ -151,20 +153,22 @@ class Sources:
         """Return the attempts in the tables without duplicates, as `table_files.read`.
 
         Args:
-            columns: Columns that are needed; None for all that are declared.
-            also: Columns that are needed even if they are not declared.
-            undeclared: Whether to keep all undeclared columns; a note lists them.
+            columns: Columns to read; None for all declared columns.
+            also: Further columns to read, even if they are not declared.
+            undeclared: True to read all undeclared columns; a note lists them.
 
         Raises:
             ConfigurationError: A file is not a table of repeats, two tables contradict each other, or there is no
                 evidence to rebuild from.
             EvidenceError: A line or a journal is damaged, or no repeat has ended.
         """
-        others = [column.name for column in self.columns if table_files.is_undeclared(column)]
-        if others and undeclared:
-            self.note(f"kept as text, because no installed kind of step declares it: {', '.join(others)}")
+        undeclared_names = [column.name for column in self.columns if table_files.is_undeclared(column)]
+        if undeclared_names and undeclared:
+            names_text = ", ".join(undeclared_names)
+            self.note(f"read as text, because no installed kind of step declares it: {names_text}")
         if columns is None:
-            columns = {column.name for column in self.columns} - (set() if undeclared else set(others) - set(also))
+            omitted = set() if undeclared else set(undeclared_names) - set(also)
+            columns = {column.name for column in self.columns} - omitted
         if self.row_filter is not None:
             columns = {*columns, *self.row_filter.names}
         content = _remeasured_tables(self.tables, self.workers, self.note) if self.rebuild else Path.read_bytes
@@ -172,33 +176,37 @@ class Sources:
         for note in notes:
             self.note(note)
         if not len(attempts):
-            started = next((table.parent for table in self.tables if (table.parent / PLAN_FILE).is_file()), None)
+            started_trial = next(
+                (table.parent for table in self.tables if (table.parent / PLAN_FILE).is_file()), None
+            )
             raise EvidenceError(
                 "no repeat has ended yet",
                 where=self.where,
-                remedy=shell_command("fieldkit", "resume", started) if started else "name a trial that ran",
+                remedy=shell_command("fieldkit", "resume", started_trial)
+                if started_trial
+                else "name a trial that ran",
             )
-        return attempts if self.row_filter is None else self._chosen_rows(attempts, self.row_filter)
+        return attempts if self.row_filter is None else self._selected_rows(attempts, self.row_filter)
 
     def _rows(self, columns: Collection[str], content: Callable[[Path], bytes]) -> Repeats:
         if self.indexed.tables:
-            # Of several invalid tables, reading without the index may report another one, so this error is not used.
+            # This error is not reported: if several tables are invalid, reading without the index may report another.
             with suppress(FieldkitError):
                 return table_files.read(self.tables, self.columns, columns, content, self.indexed)
         return table_files.read(self.tables, self.columns, columns, content)
 
-    def _chosen_rows(self, attempts: Repeats, row_filter: RowFilter) -> Repeats:
-        chosen = attempts.where(row_filter.mask(attempts))
-        if not len(chosen):
+    def _selected_rows(self, attempts: Repeats, row_filter: RowFilter) -> Repeats:
+        selected = attempts.where(row_filter.mask(attempts))
+        if not len(selected):
             raise EvidenceError(
                 f"none of {format_count(len(attempts), 'attempt')} satisfies --where {row_filter.text}",
                 where=self.where,
-                remedy="a missing value satisfies no comparison; fieldkit columns show NAME explains a column",
+                remedy="a missing value satisfies no comparison; fieldkit columns show NAME describes a column",
             )
-        return chosen
+        return selected
 
     def with_filter(self, text: str) -> "Sources":
-        """Return these sources with the rows that satisfy an expression; all rows if it is empty.
+        """Return these sources with only the rows that satisfy an expression, or with all rows if it is empty.
 
         Raises:
             ConfigurationError: As for `parse_filter`.
@@ -218,15 +226,15 @@ def find(
     """Return the tables of the trials and CSV files at or below `paths`, with their columns.
 
     Args:
-        paths: Folders of trials, folders with trials below, or CSV files with the columns of trial.csv.
+        paths: Folders of trials, folders with trials at any depth, or CSV files with the columns of trial.csv.
         note: Receives notes.
-        rebuild: Whether to measure raw evidence again.
-        workers: Processes that measure it, and that read many plans.
-        use_index: Whether to read many tables from an index; the result is the same.
+        rebuild: True to measure raw evidence again.
+        workers: Processes that measure evidence and read plans.
+        use_index: True to read many tables from an index, which does not change the result.
 
     Raises:
-        ConfigurationError: A path does not exist or has no trial below, or as for `tables.declared_columns`.
-        EvidenceError: No trial has its table.
+        ConfigurationError: A path does not exist or contains no trial; or as for `tables.declared_columns`.
+        EvidenceError: No trial has a table.
     """
     return find_each([paths], note, rebuild=rebuild, workers=workers, use_index=use_index)[0]
 
@@ -239,7 +247,7 @@ def find_each(
     workers: Workers = ALL_PROCESSORS,
     use_index: bool = True,
 ) -> list[Sources]:
-    """Return the sources at the paths of each run, as `find`; all have the columns of all runs."""
+    """Return the sources at the paths of each run, as `find`. Each of them has the columns of all runs."""
     tables_by_run = [_find_tables(paths, note, rebuild=rebuild) for paths in runs]
     all_tables = list(dict.fromkeys(table for run_tables in tables_by_run for table in run_tables))
     indexed = indexed_tables.find(all_tables, workers, note) if use_index and not rebuild else NO_INDEX
@@ -252,11 +260,11 @@ def find_each(
 
 
 def _find_tables(paths: Sequence[Path], note: Note, *, rebuild: bool) -> list[Path]:
-    by_identity = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
-    if not by_identity:
+    tables_by_identity = {_identity(table): table for path in paths for table in _tables(path, note, rebuild=rebuild)}
+    if not tables_by_identity:
         remedy = "add --rebuild, or run the commands in the notes above"
-        raise EvidenceError(f"no trial there has its {store.TRIAL_CSV}", where=_paths_text(paths), remedy=remedy)
-    return list(by_identity.values())
+        raise EvidenceError(f"no trial there has a {store.TRIAL_CSV}", where=_paths_text(paths), remedy=remedy)
+    return list(tables_by_identity.values())
 
 
 def _paths_text(paths: Sequence[Path]) -> str:
@@ -277,7 +285,7 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
         raise ConfigurationError(
             "there is no trial in this folder or its subfolders",
             where=str(path),
-            remedy=f"name the folder that trials are in, or CSV files: {shell_command(path)}/*.csv",
+            remedy=f"name the folder that contains trials, or CSV files: {shell_command(path)}/*.csv",
         )
     for folder in folders:
         table = folder / store.TRIAL_CSV
@@ -289,46 +297,46 @@ def _tables(path: Path, note: Note, *, rebuild: bool) -> Iterator[Path]:
             if (folder / laptop_files.SWEEP_RESULTS).is_dir():
                 yield folder / laptop_files.SWEEP_RESULTS
             else:
-                note(f"{folder}: has no results yet; run its command again")
+                note(f"{folder}: has no results yet; run the command of the sweep again")
         elif not rebuild and (reason := files.unexpected_type(table)):
-            note(f"{table}: {reason}; it is left out")
+            note(f"{table}: {reason}; it is omitted")
         elif rebuild or table.is_file():
             yield table
         else:
             command = shell_command("fieldkit", "rebuild", folder)
-            note(f"{folder}: has no {store.TRIAL_CSV} and is left out; to make it: {command}")
+            note(f"{folder}: has no {store.TRIAL_CSV} and is omitted; to create it: {command}")
 
 
 def trial_folders(path: Path) -> list[Path]:
-    """Return the folders of trials at or below a path; empty if there are none, or if it is not a folder."""
+    """Return the folders of trials at or below a path; none if the path is not a folder."""
     return [Path(folder) for folder in _trials(str(path), set())] if path.is_dir() else []
 
 
-_MARKS: Final = frozenset({PLAN_FILE, store.TRIAL_CSV, laptop_files.SWEEP})
-"""Files in the folder of a trial or a sweep."""
+_IDENTIFYING_FILES: Final = frozenset({PLAN_FILE, store.TRIAL_CSV, laptop_files.SWEEP})
+"""Files that identify the folder of a trial or a sweep."""
 
 
-def _trials(folder: str, seen: set[tuple[int, int]]) -> Iterator[str]:
+def _trials(folder: str, visited: set[tuple[int, int]]) -> Iterator[str]:
     """Yield the folders of trials and sweeps at or below a folder, sorted.
 
-    Links are followed, each folder is visited once.
+    Links are followed. Each folder is visited once.
     """
     status = os.stat(folder)  # noqa: PTH116 (a path object per folder takes longer than the call)
-    if (status.st_dev, status.st_ino) in seen:
+    if (status.st_dev, status.st_ino) in visited:
         return
-    seen.add((status.st_dev, status.st_ino))
+    visited.add((status.st_dev, status.st_ino))
     with os.scandir(folder) as scan:
         entries = sorted(scan, key=lambda entry: entry.name)
-    if not _MARKS.isdisjoint(entry.name for entry in entries):
+    if not _IDENTIFYING_FILES.isdisjoint(entry.name for entry in entries):
         yield folder
         return
     for entry in entries:
         if not entry.name.startswith(".") and not entry.name.endswith(".partial") and entry.is_dir():
-            yield from _trials(entry.path, seen)
+            yield from _trials(entry.path, visited)
 
 
 def _identity(table: Path) -> object:
-    """Return the identity of a table, which is the same for two paths to it."""
+    """Return the identity of a table, which is the same for all paths to it."""
     is_folder = table.name == store.TRIAL_CSV or table.is_dir()
     status = (table.parent if is_folder else table).stat()
     return status.st_dev, status.st_ino
@@ -374,7 +382,7 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
 
 
 def note_differences(folder: Path, note: Note) -> None:
-    """Show a note if evidence that is measured again differs from what was measured first."""
+    """Show a note if the evidence that is measured again has changed since it was first measured."""
     from fieldkit.trial.stored import verification  # noqa: PLC0415 (as above)
 
     if differences := verification.differences(folder):

@@ -1,4 +1,4 @@
-"""The combined columns of the tables of trials whose procedures differ."""
+"""Columns of the combined tables of trials with different procedures."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -17,19 +17,19 @@ from fieldkit.trial.plan import PLAN_FILE
 from fieldkit.trial.stored import plans
 
 Facts = Callable[[Path], TableFacts | None]
-"""Returns the properties of a table that are known without reading it; None if they are unknown."""
+"""Function that returns the properties of a table that are known without reading it, or None."""
 
 
 def no_facts(_: Path) -> None:
-    """Return no properties."""
+    """Return None, because no properties are known."""
 
 
 def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[Column, ...]:
     """Return all columns of the tables: first the columns of every trial, then others in the order of the tables.
 
-    A column that is not in every trial is declared by the `trial.yaml` next to the table; otherwise by an installed
-    kind of step, by its name with or without the name of the step; otherwise it is text
-    (`table_files.is_undeclared`).
+    A column that is not in every trial has the declaration in the `trial.yaml` next to the table. Without it, the
+    column has the declaration of an installed kind of step, if its name with or without the name of the step is
+    declared. Any other column is text (`table_files.is_undeclared`).
 
     Args:
         tables: CSV files with the columns of trial.csv.
@@ -38,52 +38,52 @@ def declared_columns(tables: Sequence[Path], facts: Facts = no_facts) -> tuple[C
     Raises:
         ConfigurationError: A table or a plan cannot be read, or plans contradict each other.
     """
-    others = {table: names for table in tables if (names := _other_names_of(table, facts(table)))}
+    other_names_by_table = {table: names for table in tables if (names := _other_names_of(table, facts(table)))}
     planned_columns = merge_columns(
         (table.parent / PLAN_FILE, columns)
-        for table in others
+        for table in other_names_by_table
         for known_facts in [facts(table)]
         for columns in [frozen_columns(table) if known_facts is None else frozen.from_json(known_facts.declarations)]
     )
     columns_by_name = {column.name: column for column in installed_columns()}
-    other_names = dict.fromkeys(name for names in others.values() for name in names)
+    other_names = dict.fromkeys(name for names in other_names_by_table.values() for name in names)
     return trial_columns(planned_columns.get(name) or _by_name(name, columns_by_name) for name in other_names)
 
 
 def planned_columns(tables: Iterable[Path]) -> tuple[Column, ...]:
-    """Return every column in the plans of tables; errors as for `declared_in`, or if a plan cannot be read."""
+    """Return all columns in the plans of tables; raises as `declared_columns`, and if a plan cannot be read."""
     plan_files = [table.parent / PLAN_FILE for table in tables if (table.parent / PLAN_FILE).is_file()]
-    everywhere = set(trial_columns())
+    common_columns = set(trial_columns())
     declared = (
-        (plan, [column for column in plans.read_plan(plan.parent).table if column not in everywhere])
+        (plan, [column for column in plans.read_plan(plan.parent).table if column not in common_columns])
         for plan in plan_files
     )
     return trial_columns(merge_columns(declared).values())
 
 
 def merge_columns(declared: Iterable[tuple[Path, Iterable[Column]]]) -> dict[str, Column]:
-    """Return the columns of several plans by name; if columns of one name are compatible, the first is kept.
+    """Return the columns of several plans by name. Of compatible columns with the same name, the first is used.
 
     Args:
         declared: Plans with their columns.
 
     Raises:
-        ConfigurationError: Two plans declare incompatible columns of one name.
+        ConfigurationError: Two plans declare incompatible columns with the same name.
     """
     merged: dict[str, tuple[Path, Column]] = {}
     for path, columns in declared:
         for column in columns:
-            first, kept = merged.setdefault(column.name, (path, column))
-            if _type_of(kept) != _type_of(column):
+            first_path, first = merged.setdefault(column.name, (path, column))
+            if _type_of(first) != _type_of(column):
                 raise ConfigurationError(
                     f"{column.name} is a different column here ({_description(column)}) "
-                    f"than in {first} ({_description(kept)})",
+                    f"than in {first_path} ({_description(first)})",
                     where=str(path),
-                    remedy="combine only trials in which it is the same",
+                    remedy="combine only trials in which the column is the same",
                 )
-            if kept.bounds != column.bounds:
-                (low, high), (other_low, other_high) = kept.possible, column.possible
-                merged[column.name] = first, replace(kept, bounds=(min(low, other_low), max(high, other_high)))
+            if first.bounds != column.bounds:
+                (low, high), (other_low, other_high) = first.possible, column.possible
+                merged[column.name] = first_path, replace(first, bounds=(min(low, other_low), max(high, other_high)))
     return {name: column for name, (_, column) in merged.items()}
 
 
@@ -94,8 +94,8 @@ def _other_names_of(table: Path, known_facts: TableFacts | None) -> tuple[str, .
 @lru_cache  # thousands of tables have the same columns
 def other_names(names: tuple[str, ...]) -> tuple[str, ...]:
     """Return the names of a table's columns that are not in every trial."""
-    everywhere = {column.name for column in trial_columns()} | {"", SOURCE}
-    return tuple(name for name in names if name not in everywhere)
+    common_names = {column.name for column in trial_columns()} | {"", SOURCE}
+    return tuple(name for name in names if name not in common_names)
 
 
 def frozen_columns(table: Path) -> tuple[Column, ...]:
@@ -113,7 +113,7 @@ def frozen_columns(table: Path) -> tuple[Column, ...]:
 
 
 def expectation_texts(table: Path) -> tuple[str, ...]:
-    """Return the expectations in the plan of a trial's table; a CSV file without its trial has none.
+    """Return the expectations in the plan of a trial's table. A CSV file without its trial has no expectations.
 
     Raises:
         ConfigurationError: The plan cannot be read.
@@ -124,7 +124,7 @@ def expectation_texts(table: Path) -> tuple[str, ...]:
 
 
 def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
-    """Return the column of a name that no plan declares."""
+    """Return the column for a name that no plan declares."""
     step, _, plain = name.rpartition(".")
     column = installed_columns.get(name) or (
         installed_columns.get(plain_name(name)) and with_step_name(step, installed_columns[plain])
@@ -133,7 +133,7 @@ def _by_name(name: str, installed_columns: Mapping[str, Column]) -> Column:
 
 
 def _type_of(column: Column) -> tuple[object, ...]:
-    """Return the properties that must be equal to combine values of two columns; for texts they always are."""
+    """Return the properties that must be equal to combine the values of two columns. They are equal for all texts."""
     figure = None if column.type is str else column.figure
     return column.unit, figure and (figure.kind, figure.arrived, figure.sent)
 

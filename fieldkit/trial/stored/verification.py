@@ -21,23 +21,25 @@ def verify(folder: Path) -> list[str]:
     """Compare a trial's files with its manifest.
 
     Returns:
-        One sentence per difference, sorted by file; empty when all agree.
+        One sentence per difference, sorted by file; empty if there are no differences.
 
     Raises:
         EvidenceError: There is no manifest, or it cannot be read.
     """
-    listed = manifest.read(folder)
+    sums = manifest.read(folder)
     unexpected = {str(path.relative_to(folder)): kind for path, kind in plans.unexpected_files(folder)}
     present = {manifest.relative_name(folder, path): path for path in manifest.plain_files(folder)}
     present.pop(MANIFEST_FILE, None)
-    return _sentences(_file_differences(listed.keys() - unexpected.keys(), listed, present) | unexpected)
+    return _sentences(_file_differences(sums.keys() - unexpected.keys(), sums, present) | unexpected)
 
 
 def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[str, str]:
-    """Return the changes of evidence since its checksums were made, by file; files without a checksum are ignored.
+    """Return the changes of evidence since its checksums were computed, by file.
+
+    Files of attempts without checksums are ignored.
 
     Args:
-        folder: The trial's folder; without a manifest there are no differences.
+        folder: The trial's folder. Without a manifest, there are no differences.
         attempts: Names of the attempts' folders; None for all attempts, plan, journals and position files.
 
     Raises:
@@ -46,16 +48,16 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
     if not (folder / MANIFEST_FILE).exists():
         return {}
     sums = manifest.read(folder)
-    summed = manifest.by_attempt(sums)
+    sums_by_attempt = manifest.by_attempt(sums)
     top_level = _top_level_differences(folder, sums) if attempts is None else {}
-    selected = summed.keys() if attempts is None else summed.keys() & set(attempts)
+    selected = sums_by_attempt.keys() if attempts is None else sums_by_attempt.keys() & set(attempts)
 
     def compare(attempt: str) -> dict[str, str]:
         present = {
             manifest.relative_name(folder, path): path
             for path in manifest.plain_files(store.attempt_folder(folder, attempt))
         }
-        return _file_differences(summed[attempt].keys(), summed[attempt], present)
+        return _file_differences(sums_by_attempt[attempt].keys(), sums_by_attempt[attempt], present)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return top_level | {
@@ -64,7 +66,10 @@ def differences(folder: Path, attempts: Iterable[str] | None = None) -> Mapping[
 
 
 def _top_level_differences(folder: Path, sums: manifest.Sums) -> dict[str, str]:
-    """Return the changes of the plan and the journals; journals may have grown since their checksums were made."""
+    """Return the changes of the plan, the journals and position files.
+
+    Lines may have been appended to journals since their checksums were computed.
+    """
     changed = {PLAN_FILE: PLAN_FILE in sums and manifest.sha256(folder / PLAN_FILE) != sums[PLAN_FILE]}
     for name in (JOURNAL_FILE, laptop_files.MOTION):
         changed[name] = name in sums and manifest.count_unchanged_lines(folder / name, sums[name]) is None
@@ -74,21 +79,22 @@ def _top_level_differences(folder: Path, sums: manifest.Sums) -> dict[str, str]:
 
 
 def summarize(problems: Mapping[str, str]) -> str:
-    """Return a sentence with the first differences and the number of further ones."""
+    """Return a sentence with the first differences and the number of further differences."""
     sentences = _sentences(problems)
-    more = len(sentences) - _MAX_LISTED
-    return "; ".join(sentences[:_MAX_LISTED]) + (f"; and {more} more: fieldkit verify lists them" if more > 0 else "")
+    further = len(sentences) - _MAX_LISTED
+    more_text = f"; and {further} more: fieldkit verify lists them" if further > 0 else ""
+    return "; ".join(sentences[:_MAX_LISTED]) + more_text
 
 
-def _file_differences(names: Iterable[str], listed: manifest.Sums, present: Mapping[str, Path]) -> dict[str, str]:
+def _file_differences(names: Iterable[str], sums: manifest.Sums, present: Mapping[str, Path]) -> dict[str, str]:
     listed_names = set(names)
     problems = dict.fromkeys(listed_names - present.keys(), "missing")
-    problems |= dict.fromkeys(present.keys() - listed.keys(), "not in the manifest")
+    problems |= dict.fromkeys(present.keys() - sums.keys(), "not in the manifest")
     problems |= {
-        name: "changed" for name in listed_names & present.keys() if manifest.sha256(present[name]) != listed[name]
+        name: "changed" for name in listed_names & present.keys() if manifest.sha256(present[name]) != sums[name]
     }
     return problems
 
 
 def _sentences(problems: Mapping[str, str]) -> list[str]:
-    return [f"{sanitized(name).replace(chr(10), '?')}: {what}" for name, what in sorted(problems.items())]
+    return [f"{sanitized(name).replace(chr(10), '?')}: {problem}" for name, problem in sorted(problems.items())]

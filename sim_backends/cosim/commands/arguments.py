@@ -135,8 +135,7 @@ def _add_shootout(commands: Commands) -> None:
     modes.add_argument(
         "--bound",
         action="store_true",
-        help="number of exchanges needed to keep the scenario's policy.bound, with error_bounded and with fixed "
-        "windows",
+        help="number of exchanges needed for the scenario's policy.bound, with error_bounded and with fixed windows",
     )
     parser.add_argument(
         "--figure", type=Path, metavar="FILE", help="draw error against cost, or against the window: SVG, PDF or PNG"
@@ -188,7 +187,7 @@ def _add_satisfy(commands: Commands) -> None:
         "--policy",
         ("velocity_aware_raw", "velocity_aware"),
         default="velocity_aware_raw",
-        help="the rule: as printed in the paper (default), or corrected so that each window is positive",
+        help="rule of the paper as printed (default), or corrected so that each window is positive",
     )
     _add_window(parser, "window of the first round")
     parser.add_argument(

@@ -14,7 +14,7 @@ from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.cosim.scenario.loading import load_scenario
 from sim_backends.cosim.scenario.schema import CosimScenario
 from sim_backends.federates.conformance.probe import Target
-from sim_backends.federates.conformance.suite import CheckResult, run_checks
+from sim_backends.federates.conformance.suite import ConformanceResult, run_checks
 from sim_backends.federates.frames import NETWORK, PHYSICS, ROLES
 from sim_backends.federates.handshake import Hello
 from sim_backends.federates.named import named_federate
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     changes = settings.changes(arguments)
     if _is_federate_with_role(endpoint, NETWORK):
         changes |= {"traffic": _udp_traffic(load_scenario(arguments.scenario, changes))}
-    scenario = load_scenario(arguments.scenario, changes | _named_federate(endpoint))
+    scenario = load_scenario(arguments.scenario, changes | _federate_change(endpoint))
     role, name = _role(endpoint, scenario, arguments.role, deadline_s)
     opener = partial(open_session, role, endpoint, deadline_s=deadline_s)
     target = Target(opener, _hello(scenario, role), arguments.windows)
@@ -59,14 +59,14 @@ def _hello(scenario: CosimScenario, role: int) -> Hello:
     return make_hello(scenario, world, bodies(scenario, world), scenario.seeds[0], role)
 
 
-def _role(endpoint: str, scenario: CosimScenario, requested: str | None, deadline_s: float) -> tuple[int, str]:
+def _role(endpoint: str, scenario: CosimScenario, requested_role: str | None, deadline_s: float) -> tuple[int, str]:
     """Return the role of a federate, and its name for messages: the requested role, or the first that it accepts.
 
     Raises:
         FieldkitError: The federate accepts no role.
     """
-    roles = [role for role in (PHYSICS, NETWORK) if requested in {None, ROLES[role]}]
-    if requested is None:
+    roles = [role for role in (PHYSICS, NETWORK) if requested_role in {None, ROLES[role]}]
+    if requested_role is None:
         roles = [role for role in roles if _is_federate_with_role(endpoint, role)] or roles
     for role in roles:
         try:
@@ -80,7 +80,7 @@ def _role(endpoint: str, scenario: CosimScenario, requested: str | None, deadlin
     raise FieldkitError(f"{endpoint} accepts no role")
 
 
-def _named_federate(endpoint: str) -> dict[str, str]:
+def _federate_change(endpoint: str) -> dict[str, str]:
     """Return the change that makes a scenario use a named federate, so that its options are validated."""
     return {
         f"{ROLES[role]}.federate": endpoint for role in (PHYSICS, NETWORK) if _is_federate_with_role(endpoint, role)
@@ -105,7 +105,7 @@ def _is_federate_with_role(endpoint: str, role: int) -> bool:
         return False
 
 
-def _show(result: CheckResult) -> None:
+def _show(result: ConformanceResult) -> None:
     state = "FAILED" if result.failure else "skipped" if result.skipped else "passed"
     print_text(f"{state:7}  {result.name}: {result.meaning}")
     for label, text in (

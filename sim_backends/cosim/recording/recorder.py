@@ -146,7 +146,7 @@ class RunRecorder:
         """Create and lock the folder.
 
         Raises:
-            ConfigurationError: There is a recording already.
+            ConfigurationError: There is already a recording.
             RecordingError: The folder cannot be written.
         """
         try:

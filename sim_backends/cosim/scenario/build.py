@@ -71,7 +71,7 @@ def radio_network(
     radio: RadioModel[Fragment]
     if carrier is not None:
         radio = carried_radio(carrier, tuple(stations))
-    elif scenario.radio.fixed:
+    elif scenario.radio.is_fixed:
         radio = UniformLinks(seed, scenario.radio)
     else:
         radio = WifiInWorld(seed, scenario.radio, stations, world, path_losses_db=path_losses_db)

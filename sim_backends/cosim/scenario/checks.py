@@ -44,7 +44,7 @@ def needed_bytes(scenario: CosimScenario) -> int:
 
 def radio_bytes(scenario: CosimScenario) -> int:
     """Return the approximate maximum memory of the radio, which is proportional to the number of pairs of agents."""
-    return 0 if scenario.radio.fixed else math.comb(len(scenario.agents), 2) * PAIR_BYTES
+    return 0 if scenario.radio.is_fixed else math.comb(len(scenario.agents), 2) * PAIR_BYTES
 
 
 def available_bytes() -> int | None:

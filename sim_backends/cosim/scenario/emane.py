@@ -137,7 +137,7 @@ def emane_observer(scenario: CosimScenario, seed: int, observer: WindowObserver 
         nems = options.nems_of(scenario.agents)
     except ValueError as error:
         raise ConfigurationError(f"scenario {scenario.name}: emane: {error}") from error
-    has_losses = options.pathloss and not scenario.radio.fixed
+    has_losses = options.pathloss and not scenario.radio.is_fixed
     return EmaneObserver(options, nems, _losses(scenario, seed) if has_losses else None, observer)
 
 

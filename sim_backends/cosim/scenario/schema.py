@@ -349,7 +349,7 @@ class CosimScenario(Named):
     @schema.model_validator(mode="after")
     def _jammers_have_an_effect(self) -> "CosimScenario":
         for number, fault in enumerate(self.faults):
-            if self.radio.fixed and isinstance(fault, JammerFault):
+            if self.radio.is_fixed and isinstance(fault, JammerFault):
                 raise schema.validation_error(
                     "fixed links ignore a jammer; remove it, or remove loss, delay, rate and jitter of the radio",
                     "faults",

@@ -143,7 +143,7 @@ def delay_change(ours_s: Floats, other_s: Floats) -> tuple[IntervalEstimate, int
 
 
 def _changes_in_paper_tables(lines: Sequence[Sight]) -> tuple[float, float]:
-    """Return the changes of delay and loss from the paper's table 3, by TCP, to its table 1."""
+    """Return the changes of delay and loss from the paper's table 3, with TCP, to its table 1."""
     our_columns, other_columns = (
         [PRINTED["1"][line, "topic"] for line in lines],
         [PRINTED["3"][line, "ros1"] for line in lines],

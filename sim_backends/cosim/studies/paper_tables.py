@@ -144,7 +144,7 @@ EMANE: Final[Mapping[str, tuple[Printed, Printed]]] = MappingProxyType(
 FIXED: Final = "fixed window"
 """The paper's own system with a window that does not adapt."""
 MASTER: Final = "master-based"
-"""ROS 1, by TCP."""
+"""ROS 1 with TCP."""
 
 CLAIMS: Final[Mapping[tuple[str, str], tuple[Printed, Printed]]] = MappingProxyType(
     {

@@ -137,12 +137,12 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
     """Return the refusal of a change of mode; an unarmed vehicle accepts any mode (Copter::set_mode)."""
-    if mode is not Mode.MISSION or not conditions.armed:
+    if mode is not Mode.MISSION or not conditions.is_armed:
         return None
     text, commands = "Mode change to AUTO failed: init failed", conditions.mission_commands
     if len(commands) <= _FIRST_ITEM:
         return ModeRefusal(text)
-    if conditions.landed and commands[_FIRST_ITEM] != _d.MAV_CMD_NAV_TAKEOFF:
+    if conditions.has_landed and commands[_FIRST_ITEM] != _d.MAV_CMD_NAV_TAKEOFF:
         return ModeRefusal(text, "Auto: Missing Takeoff Cmd")
     return None
 

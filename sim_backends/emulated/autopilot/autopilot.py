@@ -96,7 +96,7 @@ class Autopilot:
             if not self._port.register(sender, message, now_ns):
                 continue
             if message.get_type() == "HEARTBEAT":
-                self.vehicle.failsafes.heartbeat(message.get_srcSystem(), message.type, now_ns)
+                self.vehicle.failsafes.on_heartbeat(message.get_srcSystem(), message.type, now_ns)
             elif self._is_addressed(message):
                 yield from self._port.frames(self._replies(message, now_ns))
 
@@ -145,7 +145,7 @@ class Autopilot:
     def _reports(self, now_ns: int) -> Iterator[Message]:
         """Yield the vehicle's reports since the last call, for all clients."""
         mission, status_texts = self.vehicle.mission, self.vehicle.status_texts
-        yield from (dialect.MAVLink_mission_item_reached_message(number) for number in mission.reached(now_ns))
+        yield from (dialect.MAVLink_mission_item_reached_message(number) for number in mission.reached_items(now_ns))
         for severity, text in status_texts:
             yield dialect.MAVLink_statustext_message(severity, text.encode("ascii", "replace")[:_TEXT_BYTES])
         self.vehicle.status_texts.clear()

@@ -134,7 +134,7 @@ class Commands:
         """Reboot (param1 is 1); refused while armed."""
         if message.param1 != 1:
             return int(dialect.MAV_RESULT_UNSUPPORTED)
-        if self._vehicle.armed:
+        if self._vehicle.is_armed:
             return self._vehicle.firmware.refusal_result
         self._vehicle.boot(self._vehicle.body.now_ns)
         return _ACCEPTED

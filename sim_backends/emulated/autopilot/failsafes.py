@@ -28,15 +28,15 @@ class VehicleState:
 
     Attributes:
         now_ns: Time.
-        armed: True if it is armed.
-        landed: True if it is on the ground.
+        is_armed: True if it is armed.
+        has_landed: True if it is on the ground.
         mode: Its mode.
         battery: Its battery.
     """
 
     now_ns: int
-    armed: bool
-    landed: bool
+    is_armed: bool
+    has_landed: bool
     mode: Mode
     battery: Battery
 
@@ -74,13 +74,13 @@ class Failsafes(Protocol):
     def arming_errors(self) -> list[str]:
         """Reasons why they prevent arming."""
 
-    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:
+    def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:
         """Process a heartbeat: system id and MAV_TYPE of its sender."""
 
-    def mode_changed(self, now_ns: int) -> None:
+    def on_mode_change(self, now_ns: int) -> None:
         """Record that a client has changed the mode, or that the vehicle was disarmed."""
 
-    def set_points_lost(self) -> None:
+    def on_lost_set_points(self) -> None:
         """Record that the vehicle has changed its mode because set-points are missing, which only PX4 does."""
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
@@ -116,16 +116,16 @@ class ArduCopterFailsafes:
         """Implement `Failsafes.arming_errors`."""
         return ["Battery failsafe"] * (self._stage > 0) + ["GCS failsafe on"] * self._gcs_lost
 
-    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any type counts)
-        """Implement `Failsafes.heartbeat`."""
+    def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any type counts)
+        """Implement `Failsafes.on_heartbeat`."""
         if system == self._parameters["SYSID_MYGCS"]:
             self._gcs_heartbeat_ns = now_ns
 
-    def mode_changed(self, now_ns: int) -> None:
-        """Implement `Failsafes.mode_changed`: nothing depends on the mode."""
+    def on_mode_change(self, now_ns: int) -> None:
+        """Implement `Failsafes.on_mode_change`: nothing depends on the mode."""
 
-    def set_points_lost(self) -> None:
-        """Implement `Failsafes.set_points_lost`: ArduCopter has no such failsafe."""
+    def on_lost_set_points(self) -> None:
+        """Implement `Failsafes.on_lost_set_points`: ArduCopter has no such failsafe."""
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
         """Implement `Failsafes.advance`."""
@@ -171,9 +171,9 @@ class ArduCopterFailsafes:
         self, action: int, modes: dict[int, Mode], text: str, state: VehicleState
     ) -> Iterator[Reaction]:
         mode = modes.get(action)
-        if not state.armed or mode is None:
+        if not state.is_armed or mode is None:
             yield Reaction(text)
-        elif state.landed:
+        elif state.has_landed:
             yield Reaction(text, disarm=True)
         elif state.mode in LANDING:
             yield Reaction(f"{text} - Continuing Landing")
@@ -216,17 +216,17 @@ class Px4Failsafes:
         is_missing = self._parameters["NAV_DLL_ACT"] > 0 and (self._gcs_lost or self._gcs_heartbeat_ns is None)
         return ["No connection to the ground control station"] * is_missing
 
-    def heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any system counts)
-        """Implement `Failsafes.heartbeat`."""
+    def on_heartbeat(self, system: int, kind: int, now_ns: int) -> None:  # noqa: ARG002 (any system counts)
+        """Implement `Failsafes.on_heartbeat`."""
         if kind == dialect.MAV_TYPE_GCS:
             self._gcs_heartbeat_ns = now_ns
 
-    def mode_changed(self, now_ns: int) -> None:  # noqa: ARG002
-        """Implement `Failsafes.mode_changed`: the failsafe ends."""
+    def on_mode_change(self, now_ns: int) -> None:  # noqa: ARG002
+        """Implement `Failsafes.on_mode_change`: the failsafe ends."""
         self._active, self._pending_change = False, None
 
-    def set_points_lost(self) -> None:
-        """Implement `Failsafes.set_points_lost`: the failsafe lasts until a client changes the mode."""
+    def on_lost_set_points(self) -> None:
+        """Implement `Failsafes.on_lost_set_points`: the failsafe lasts until a client changes the mode."""
         self._active = True
 
     def advance(self, state: VehicleState) -> Iterator[Reaction]:
@@ -262,8 +262,8 @@ class Px4Failsafes:
     def _trigger(self, mode: Mode | None, state: VehicleState) -> Iterator[Reaction]:
         if (
             mode is None
-            or not state.armed
-            or state.landed
+            or not state.is_armed
+            or state.has_landed
             or state.mode in (LANDING if mode is Mode.LAND else RETURNING)
         ):
             return
@@ -331,7 +331,7 @@ class Fence:
         return stop_distance_m > max(radius_m, math.hypot(*here_m[:2])) or stop_m[2] > max(height_m, here_m[2])
 
     def reset(self) -> None:
-        """Treat the vehicle as inside, after it was armed or carried to another place."""
+        """Treat the vehicle as inside the fence, after it was armed or carried to another place."""
         self._is_breached = False
 
     def advance(self, state: VehicleState, place_m: Vector) -> Reaction | None:
@@ -339,7 +339,7 @@ class Fence:
         (east, north, up), (radius_m, height_m) = place_m, self.limits_m
         fences = ["Max Alt"] * (up > height_m) + ["Circle"] * (math.hypot(east, north) > radius_m)
         is_new, self._is_breached = bool(fences) and not self._is_breached, bool(fences)
-        if not is_new or not state.armed or state.landed:
+        if not is_new or not state.is_armed or state.has_landed:
             return None
         text = f"{' and '.join(fences)} fence{'s' * (len(fences) > 1)} breached"
         mode = None if state.mode in LANDING else _FENCE_ACTIONS[int(self._parameters["FENCE_ACTION"])]

@@ -30,15 +30,15 @@ class ModeConditions:
     """The state of a vehicle that determines whether a firmware accepts a change of mode.
 
     Attributes:
-        armed: True if its motors turn.
-        landed: True if it has detected that it is on the ground.
+        is_armed: True if its motors turn.
+        has_landed: True if it has detected that it is on the ground.
         on_ground: True if it is on the ground.
         mission_commands: MAV_CMD of each item of its mission.
         has_recent_set_point: True if its last set-point is recent enough.
     """
 
-    armed: bool
-    landed: bool
+    is_armed: bool
+    has_landed: bool
     on_ground: bool
     mission_commands: Sequence[int]
     has_recent_set_point: bool

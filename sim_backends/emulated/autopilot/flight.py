@@ -114,7 +114,7 @@ class Airframe:
         obstacles = self._nearby_obstacles(before_m)
         stop = move(body, before_m, pose.place_m, obstacles)
         if stop is not None:
-            pose = body.stopped(pose, stop, None)
+            pose = body.after_contact(pose, stop, None)
         self.turn_rad_s = math.remainder(pose.heading_rad - self._pose.heading_rad, math.tau) / _STEP_S
         self._pose = pose
         self.on_ground = pose.velocity_m_s[2] <= _REST_M and self._is_supported(obstacles)

@@ -171,7 +171,7 @@ class MavlinkPort:
         self._clients: dict[Address, _Client] = {}
 
     def identify(self, system: int) -> None:
-        """Use another system id from now on."""
+        """Set the system id of later frames."""
         self._writer = Writer(system)
 
     @property

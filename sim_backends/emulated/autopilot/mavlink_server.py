@@ -206,6 +206,6 @@ def _send(endpoint: socket.socket, frames: "Iterable[Frame]") -> None:
 def _wait_s(autopilot: "Autopilot") -> float | None:
     """Return the maximum time to wait for a datagram; None (no limit) for a drone on the ground without clients."""
     vehicle = autopilot.vehicle
-    if autopilot.next_ns() is None and not vehicle.armed and vehicle.body.on_ground:
+    if autopilot.next_ns() is None and not vehicle.is_armed and vehicle.body.on_ground:
         return None
     return _TICK_NS / 1e9

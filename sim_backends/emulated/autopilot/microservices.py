@@ -76,11 +76,11 @@ class ParameterService:
     def _set(self, name: str, message: Message) -> None:
         value = message.param_value
         if not self._firmware.is_ardupilot:
-            expected = _INT if self._parameters.is_integer(name) else _FLOAT
-            if message.param_type != expected:
+            expected_type = _INT if self._parameters.is_integer(name) else _FLOAT
+            if message.param_type != expected_type:
                 self._report(dialect.MAV_SEVERITY_INFO, f"[pm] param types mismatch param: {name}")
                 return
-            if expected == _INT:
+            if expected_type == _INT:
                 (value,) = struct.unpack("<i", struct.pack("<f", value))
         if self._parameters.set(name, value):
             self._on_change(name)

@@ -142,8 +142,8 @@ class Mission:
         self.items: tuple[Item, ...] = ()
         self.current = 0
         self.speed_m_s: float | None = None
-        self._done = False
-        self._reached: list[int] = []
+        self._is_finished = False
+        self._reached_items: list[int] = []
         self._repeated_reports: Iterator[int] = iter(())
         self._next_repeat_ns = 0
         self._start_m: Vector | None = None  # position at the start of the current item
@@ -157,22 +157,25 @@ class Mission:
 
     def start(self) -> None:
         """Continue at the current item, or start at the first if all are done."""
-        if self._done:
+        if self._is_finished:
             self.set_current(0)
         self._reset_item_state()
 
     def set_current(self, number: int) -> None:
         """Make the item with this number the current item, or the nearest one if no item has this number."""
-        self.current, self._done = max(number, min(self._first, len(self.items) - 1), 0), False
-        self._reached, self._repeated_reports = [], iter(())
+        self.current, self._is_finished = max(number, min(self._first, len(self.items) - 1), 0), False
+        self._reached_items, self._repeated_reports = [], iter(())
         self._reset_item_state()
 
-    def reached(self, now_ns: int) -> Iterator[int]:
+    def reached_items(self, now_ns: int) -> Iterator[int]:
         """Yield the numbers of completed items that must be reported now; times must not decrease."""
-        if self._reached:
-            yield from self._reached
-            self._repeated_reports, self._next_repeat_ns = repeat(self._reached[-1], REPEATS), now_ns + REPEAT_NS
-            self._reached = []
+        if self._reached_items:
+            yield from self._reached_items
+            self._repeated_reports, self._next_repeat_ns = (
+                repeat(self._reached_items[-1], REPEATS),
+                now_ns + REPEAT_NS,
+            )
+            self._reached_items = []
         elif now_ns >= self._next_repeat_ns:
             yield from islice(self._repeated_reports, 1)
             self._next_repeat_ns = now_ns + REPEAT_NS
@@ -187,7 +190,7 @@ class Mission:
             home_m: Home in the world.
             near_m: Radius within which a point is reached, unless the item defines a radius.
         """
-        while not self._done:
+        while not self._is_finished:
             item = self.items[self.current]
             if item.command == dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH:
                 self._next()
@@ -234,11 +237,11 @@ class Mission:
         return not must_wait or body.now_ns - self._arrived_ns >= wait_s * 1e9
 
     def _next(self) -> None:
-        self._reached.append(self.current)
+        self._reached_items.append(self.current)
         if self.current + 1 < len(self.items):
             self.current += 1
         else:
-            self._done = True
+            self._is_finished = True
         self._reset_item_state()
 
     def _reset_item_state(self) -> None:

@@ -37,8 +37,8 @@ class Battery:
     def advance(self, now_ns: int, *, motors_on: bool) -> None:
         """Reduce the charge by the consumption since the last call."""
         self.current_a = _HOVER_A if motors_on else _REST_A
-        used = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
-        self.charge, self._last_ns = max(min(self.min_charge, self.charge), self.charge - used), now_ns
+        consumption = (now_ns - self._last_ns) / 1e9 / self.flight_s * self.current_a / _HOVER_A
+        self.charge, self._last_ns = max(min(self.min_charge, self.charge), self.charge - consumption), now_ns
 
     @property
     def used_mah(self) -> float:
@@ -125,7 +125,7 @@ class LandDetector:
         landed_s: Time on the ground after which it has detected a landing.
 
     Attributes:
-        landed: True if it has detected that the drone is on the ground.
+        has_landed: True if it has detected that the drone is on the ground.
         has_flown: True if the drone was in the air since it was armed last.
         grounded_ns: Time of the last contact with the ground, or of arming.
         armed_ns: Time of arming.
@@ -133,12 +133,12 @@ class LandDetector:
 
     def __init__(self, landed_s: float) -> None:
         self._landed_s = landed_s
-        self.landed = True
+        self.has_landed = True
         self.arm(0)
 
     def place(self, now_ns: int) -> None:
         """Start on the ground."""
-        self.landed = True
+        self.has_landed = True
         self.arm(now_ns)
 
     def arm(self, now_ns: int) -> None:
@@ -149,6 +149,6 @@ class LandDetector:
     def advance(self, now_ns: int, *, on_ground: bool) -> None:
         """Update the state with the present contact with the ground."""
         if not on_ground:
-            self.has_flown, self.landed, self.grounded_ns = True, False, now_ns
+            self.has_flown, self.has_landed, self.grounded_ns = True, False, now_ns
         elif now_ns - self.grounded_ns >= self._landed_s * 1e9:
-            self.landed = True
+            self.has_landed = True

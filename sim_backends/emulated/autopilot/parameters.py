@@ -80,14 +80,14 @@ class Parameters:
     """Current values of the parameters.
 
     Args:
-        declared: All parameters; they are listed in the order of their names.
+        parameters: All parameters; they are listed in the order of their names.
     """
 
-    def __init__(self, declared: tuple[Parameter, ...]) -> None:
-        self._by_key = {parameter.key or parameter.name: parameter for parameter in declared}
+    def __init__(self, parameters: tuple[Parameter, ...]) -> None:
+        self._by_key = {parameter.key or parameter.name: parameter for parameter in parameters}
         self._key_of = {
             parameter.name: parameter.key or parameter.name
-            for parameter in sorted(declared, key=lambda parameter: parameter.name)
+            for parameter in sorted(parameters, key=lambda parameter: parameter.name)
             if parameter.name
         }
         self._values = {key: parameter.value for key, parameter in self._by_key.items()}

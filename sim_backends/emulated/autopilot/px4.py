@@ -101,8 +101,8 @@ def _arming_errors(parameters: Parameters, battery: Battery) -> list[str]:
 
 def _mode_refusal(mode: Mode, conditions: ModeConditions) -> ModeRefusal | None:
     """Return the refusal of a change of mode."""
-    grounded = not conditions.armed or conditions.on_ground
-    if mode in {Mode.LAND, Mode.RTL} and grounded:
+    is_on_ground = not conditions.is_armed or conditions.on_ground
+    if mode in {Mode.LAND, Mode.RTL} and is_on_ground:
         return ModeRefusal(f"{mode.name} denied: not in the air")
     if mode is Mode.OFFBOARD and not conditions.has_recent_set_point:
         return ModeRefusal("OFFBOARD denied: no set-points")

@@ -16,7 +16,7 @@ _MAX_EXTRAPOLATION_NS: Final = 100_000_000
 
 
 class SimulatedAirframe(Airframe):
-    """A drone that a physics moves, as `Airframe`.
+    """An `Airframe` that a physics moves.
 
     On the ground its rotors turn without thrust until it climbs. Until its first flight it stays at the place where
     the lab has put it.

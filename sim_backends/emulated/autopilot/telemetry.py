@@ -117,7 +117,7 @@ class Telemetry:
         is_px4 = not firmware.is_ardupilot
         is_automatic = vehicle.mode not in {Mode.OFFBOARD, Mode.STABILIZE, Mode.ALT_HOLD, Mode.POSHOLD}
         base |= dialect.MAV_MODE_FLAG_AUTO_ENABLED if is_px4 and is_automatic else 0
-        base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0
+        base |= dialect.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.is_armed else 0
         return dialect.MAVLink_heartbeat_message(
             dialect.MAV_TYPE_QUADROTOR, firmware.autopilot, base, firmware.modes[vehicle.mode], self._state(), 3
         )
@@ -126,16 +126,16 @@ class Telemetry:
         """Return MAV_STATE: ArduCopter is ACTIVE after it lifts off, PX4 while it is armed."""
         vehicle = self._vehicle
         is_ardupilot = vehicle.firmware.is_ardupilot
-        if vehicle.failsafes.active and (is_ardupilot or vehicle.armed):
+        if vehicle.failsafes.active and (is_ardupilot or vehicle.is_armed):
             return int(dialect.MAV_STATE_CRITICAL)
-        is_active = vehicle.armed and not (is_ardupilot and vehicle.land_detector.landed)
+        is_active = vehicle.is_armed and not (is_ardupilot and vehicle.land_detector.has_landed)
         return int(dialect.MAV_STATE_ACTIVE if is_active else dialect.MAV_STATE_STANDBY)
 
     def _sys_status(self) -> Message:
         battery = self._vehicle.battery
-        failed = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
+        failed_check = dialect.MAV_SYS_STATUS_PREARM_CHECK if self._vehicle.arming_errors else 0
         return dialect.MAVLink_sys_status_message(
-            *(_SENSORS, _SENSORS, _SENSORS & ~failed),
+            *(_SENSORS, _SENSORS, _SENSORS & ~failed_check),
             *(200, _u16(battery.voltage_v * 1e3), round(battery.current_a * 1e2), math.ceil(battery.charge * 100)),
             *(0,) * 6,
         )
@@ -303,7 +303,7 @@ class Telemetry:
     def _extended_sys_state(self) -> Message:
         vehicle = self._vehicle
         state = dialect.MAV_LANDED_STATE_IN_AIR
-        if vehicle.land_detector.landed:
+        if vehicle.land_detector.has_landed:
             state = dialect.MAV_LANDED_STATE_ON_GROUND
         elif vehicle.mode is Mode.TAKEOFF:
             state = dialect.MAV_LANDED_STATE_TAKEOFF

@@ -40,7 +40,7 @@ class Vehicle(VehicleBase):
         Raises:
             Refused: It is armed.
         """
-        if self.armed:
+        if self.is_armed:
             raise self._refusal("Prearm checks denied: armed")
         for reason in self.arming_errors:
             self.report(_CRITICAL, self.firmware.prearm_prefixes[0] + reason)
@@ -51,7 +51,7 @@ class Vehicle(VehicleBase):
         Raises:
             Refused: The vehicle is falling, or cannot be armed now.
         """
-        if self.armed:
+        if self.is_armed:
             return
         if not self.body.on_ground:
             raise self._refusal("Arming denied: it falls")
@@ -63,7 +63,7 @@ class Vehicle(VehicleBase):
         if reasons:
             raise self._refusal("Arming denied: Resolve system health failures first")
         self.home_m = self.body.home_m = self.body.place_m
-        self.armed = True
+        self.is_armed = True
         self.fence.reset()
         self.land_detector.arm(self.body.now_ns)
         self.guidance.hold(self.body.position_m)
@@ -78,12 +78,12 @@ class Vehicle(VehicleBase):
         Raises:
             Refused: It is flying.
         """
-        if self.armed and not self.body.on_ground and not force:
+        if self.is_armed and not self.body.on_ground and not force:
             raise self._refusal("Disarming denied: not landed")
-        if self.armed and self.firmware.is_ardupilot:
+        if self.is_armed and self.firmware.is_ardupilot:
             self.report(_INFO, "Disarming motors")
-        self.armed = False
-        self.failsafes.mode_changed(self.body.now_ns)
+        self.is_armed = False
+        self.failsafes.on_mode_change(self.body.now_ns)
         if not self.firmware.is_ardupilot:  # ArduCopter keeps its mode
             self.mode = Mode.LOITER
 
@@ -96,10 +96,10 @@ class Vehicle(VehicleBase):
         Raises:
             Refused: The motors are off, it is flying, or the height is not allowed.
         """
-        if self.mode is Mode.TAKEOFF and (self.land_detector.landed or not self.firmware.is_ardupilot):
+        if self.mode is Mode.TAKEOFF and (self.land_detector.has_landed or not self.firmware.is_ardupilot):
             return
         height_m = self._parameters["MIS_TAKEOFF_ALT"] if height_m is None else height_m
-        if not self.armed:
+        if not self.is_armed:
             raise self._refusal("Takeoff denied: not armed")
         if not self.body.on_ground:
             raise self._refusal("Takeoff denied: already in the air")
@@ -120,7 +120,7 @@ class Vehicle(VehicleBase):
             self.accept_set_point(SetPoint(goal_m, is_place=True))
         else:
             self._fly_to(Mode.LOITER, goal_m)
-            self.failsafes.mode_changed(self.body.now_ns)
+            self.failsafes.on_mode_change(self.body.now_ns)
 
     def accept_set_point(self, set_point: SetPoint) -> None:
         """Accept a set-point for mode OFFBOARD.
@@ -143,11 +143,11 @@ class Vehicle(VehicleBase):
             Refused: The mission, the set-points or the flight that the mode requires is missing.
         """
         self._switch(mode)
-        self.failsafes.mode_changed(self.body.now_ns)
+        self.failsafes.on_mode_change(self.body.now_ns)
 
     def load(self, items: tuple[Item, ...]) -> None:
         """Load a new mission; a mission in flight is aborted, and the vehicle holds its position."""
-        if self.mode is Mode.MISSION and self.armed:
+        if self.mode is Mode.MISSION and self.is_armed:
             self._switch(Mode.LOITER)
         self.mission.load(items)
 
@@ -156,14 +156,14 @@ class Vehicle(VehicleBase):
         parameters, battery = self._parameters, self.battery
         battery.full_v, battery.flight_s = parameters["SIM_BATT_VOLTAGE"], parameters["SIM_BAT_DRAIN"]
         battery.min_charge = parameters["SIM_BAT_MIN_PCT"] / 100
-        battery.advance(now_ns, motors_on=self.armed)
+        battery.advance(now_ns, motors_on=self.is_armed)
         while self.body.now_ns + STEP_NS <= now_ns:
-            if not self.armed and self.body.on_ground:
+            if not self.is_armed and self.body.on_ground:
                 self.body.rest(now_ns)
-                self.land_detector.landed = True
+                self.land_detector.has_landed = True
                 break
             self._update_ground_state()
-            self.body.motors_on = self.armed
+            self.body.motors_on = self.is_armed
             target_m_s = self._target_m_s()  # it may change the mode
             self.body.step(target_m_s, self.limits, self.guidance.yaw_rad(self.mode, self.body))
         self._update_boot_state()
@@ -172,13 +172,13 @@ class Vehicle(VehicleBase):
     def _update_boot_state(self) -> None:
         """Set the origin once the position estimate is good; until then report the reasons against arming."""
         now_ns, estimate = self.body.now_ns, self.estimate
-        if self.firmware.is_ardupilot and not self.armed and now_ns >= self._prearm_ns:
+        if self.firmware.is_ardupilot and not self.is_armed and now_ns >= self._prearm_ns:
             self._prearm_ns = now_ns + _PREARM_NS
             if estimate.is_starting(now_ns) or estimate.origin_m is not None:
                 self.check()
         if not estimate.advance(now_ns, self.body.place_m):
             return
-        if not self.armed:
+        if not self.is_armed:
             self.home_m = self.body.home_m = self.body.place_m
             self.guidance.hold(self.body.position_m)
         if self.firmware.is_ardupilot and not estimate.is_instant:
@@ -220,8 +220,8 @@ class Vehicle(VehicleBase):
     def _check_mode(self, mode: Mode) -> None:
         """Raise `Refused` if the firmware refuses a mode now."""
         conditions = ModeConditions(
-            armed=self.armed,
-            landed=self.land_detector.landed,
+            is_armed=self.is_armed,
+            has_landed=self.land_detector.has_landed,
             on_ground=self.body.on_ground,
             mission_commands=[item.command for item in self.mission.items],
             has_recent_set_point=self.guidance.has_recent_set_point(self.body.now_ns),
@@ -245,7 +245,7 @@ class Vehicle(VehicleBase):
         """Detect take-off and landing; stop idle motors; react to missing set-points and to the fence."""
         now_ns, is_ardupilot = self.body.now_ns, self.firmware.is_ardupilot
         self.land_detector.advance(now_ns, on_ground=self.body.on_ground)
-        if self.armed and now_ns - self.land_detector.grounded_ns > self._idle_s() * 1e9:
+        if self.is_armed and now_ns - self.land_detector.grounded_ns > self._idle_s() * 1e9:
             if not is_ardupilot:
                 reason = "landing" if self.land_detector.has_flown else "auto preflight disarming"
                 self.report(_INFO, f"Disarmed by {reason}")
@@ -273,7 +273,7 @@ class Vehicle(VehicleBase):
         elif not has_recent_set_point:
             self.report(_CRITICAL, "Failsafe activated")
             self._switch_automatically(_OFFBOARD_LOST.get(int(self._parameters["COM_OBL_RC_ACT"]), Mode.LOITER))
-            self.failsafes.set_points_lost()
+            self.failsafes.on_lost_set_points()
         elif self.fence.is_crossed(self.body.position_m, stop_m(self.body, self.limits)):
             self.report(_CRITICAL, "Geofence: hold")
             self._switch_automatically(Mode.LOITER)

@@ -36,7 +36,7 @@ class VehicleBase:
 
     Attributes:
         body: Position and motion, relative to home.
-        armed: True if its motors turn.
+        is_armed: True if its motors turn.
         land_detector: Its detection of take-off and landing.
         mode: Its flight mode.
         mission: The mission of mode MISSION.
@@ -82,7 +82,7 @@ class VehicleBase:
         self.estimate.boot(now_ns)
         self._prearm_ns = now_ns
         self.mode = self.firmware.boot_mode
-        self.armed = False
+        self.is_armed = False
         self.failsafes = self.firmware.failsafes(self._parameters)
 
     def place(self, place_m: Vector, facing_rad: float, now_ns: int) -> None:
@@ -91,7 +91,7 @@ class VehicleBase:
         if self.estimate.origin_m is None:
             self.home_m = place_m
         self.body.home_m = self.home_m
-        self.armed = False
+        self.is_armed = False
         self.guidance.hold(self.body.position_m)
         self.guidance.set_point_ns = None
         self.fence.reset()
@@ -129,7 +129,7 @@ class VehicleBase:
 
     @property
     def _state(self) -> VehicleState:
-        return VehicleState(self.body.now_ns, self.armed, self.land_detector.landed, self.mode, self.battery)
+        return VehicleState(self.body.now_ns, self.is_armed, self.land_detector.has_landed, self.mode, self.battery)
 
     def _stop_m(self) -> Vector:
         """Return the position at which it stops if it brakes now, or the nearest point inside the fence."""

@@ -56,7 +56,7 @@ _START_NS: Final = 5_000_000
 
 
 class _NewSession(BaseException):
-    """Ends the coordinator of an old session."""
+    """Raised to end the coordinator of an old session."""
 
 
 class CosimulatedMedium(MediumServer):
@@ -75,7 +75,7 @@ class CosimulatedMedium(MediumServer):
         self._clock = RealTime()
         self._queue: deque[RealPacket] = deque()
         self._arrived_after_ns = self._previous_poll_ns = time.monotonic_ns()
-        self._late_windows: Counter[int] = Counter()
+        self._window_lateness_counts: Counter[int] = Counter()
         self._added_delays = FlowDelays()
 
     def run(self) -> None:
@@ -175,13 +175,13 @@ class CosimulatedMedium(MediumServer):
                 # The robot's namespace and its device no longer exist; a socket returns no bytes in this case.
                 self._epoll.unregister(port.fd)
                 return
-            port.read += 1
+            port.sent_packets += 1
             if not is_carried:
-                port.not_ipv4 += 1
+                port.other_packets += 1
                 continue
             destination = framing.destination(content, routes)
             if destination == NO_ROBOT:
-                port.unroutable += 1
+                port.unroutable_packets += 1
                 continue
             if self._flows.delays_by_flow and (inner := framing.ipv4(content)) is not None:
                 self._flows.note_first_fragment(inner)
@@ -204,15 +204,15 @@ class CosimulatedMedium(MediumServer):
         assert session is not None
         end_ns = self._clock.monotonic_ns(window.end_ns)
         if window.decided_fates:
-            delivered = session.agents.delivered
-            arrived = [fate for fate in window.decided_fates if fate.arrived_ns is not None]
-            for fate, packet in zip(arrived, delivered, strict=True):
+            delivered_packets = session.agents.delivered_packets
+            arrived_fates = [fate for fate in window.decided_fates if fate.arrived_ns is not None]
+            for fate, packet in zip(arrived_fates, delivered_packets, strict=True):
                 self._write(session, fate, packet, window.end_ns, end_ns)
-            delivered.clear()
+            delivered_packets.clear()
             for fate in window.decided_fates:
                 session.remove_packet(fate.packet)
         lag_ns = time.monotonic_ns() - end_ns
-        self._late_windows[round_up(max(lag_ns, 0))] += 1
+        self._window_lateness_counts[round_up(max(lag_ns, 0))] += 1
         if lag_ns > _MAX_LAG_NS:
             self._skip_lag(lag_ns)
 
@@ -234,7 +234,7 @@ class CosimulatedMedium(MediumServer):
             os.write(port.fd, packet.content)
         except OSError:
             # The interface is down, or the robot has stopped.
-            port.refused += 1
+            port.refused_packets += 1
             return
         assert fate.arrived_ns is not None
         late_ns = packet.waited_ns + time.monotonic_ns() - end_monotonic_ns
@@ -246,7 +246,7 @@ class CosimulatedMedium(MediumServer):
             self._flows.count(inner, delay, port.address.packed)
             extra = PACKET + added_ns * PROCESSING_NS + undivided_ns * TRANSMISSION_NS
             self._added_delays.count(inner, extra, port.address.packed)
-        self._late[round_up(late_ns)] += 1
+        self._packet_lateness_counts[round_up(late_ns)] += 1
 
     # Requests of the lab.
 
@@ -277,13 +277,13 @@ class CosimulatedMedium(MediumServer):
     def _delays(self, request: Message) -> Message:
         source, destination = (self._ports[request[key]].address.ip for key in ("source", "destination"))
         flow = source, destination, request["protocol"], request["port"]
-        added = self._added_delays.delay_parts(*flow)
+        added_delay = self._added_delays.delay_parts(*flow)
         parts = self._flows.delay_parts(*flow)
-        return vars(replace(parts, policy_ns=added.processing_ns, undivided_ns=added.transmission_ns))
+        return vars(replace(parts, policy_ns=added_delay.processing_ns, undivided_ns=added_delay.transmission_ns))
 
     @override
     def _stats(self) -> MediumStats:
-        return replace(super()._stats(), late_windows=self._late_windows)
+        return replace(super()._stats(), window_lateness_counts=self._window_lateness_counts)
 
     @override
     def _place_stations(self, positions_m: dict[str, Vector], relay: str | None) -> None:

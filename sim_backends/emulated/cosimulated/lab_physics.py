@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from operator import itemgetter
 from typing import Any, Final, Protocol, runtime_checkable
 
 from typing_extensions import override
@@ -41,7 +42,7 @@ class Placing(PhysicsFederate, Protocol):
 
 @runtime_checkable
 class Flying(PhysicsFederate, Protocol):
-    """A physics that flies drones by the commands of their autopilots."""
+    """A physics that moves drones according to the commands of their autopilots."""
 
     def flight_status(self, name: str) -> FlightStatus:
         """Return attitude and support of a drone at its present state."""
@@ -49,7 +50,7 @@ class Flying(PhysicsFederate, Protocol):
 
 
 StartPhysics = Callable[[Mapping[str, State]], PhysicsFederate]
-"""Starts a physics with the robots at these states of their antennas; its time begins at 0."""
+"""Starts a physics with the robots at these states of their antennas; its time starts at 0."""
 
 
 class LabPhysics:
@@ -123,7 +124,7 @@ class LabPhysics:
     @property
     def states(self) -> Mapping[str, State]:
         """The present states, including changes by the lab since the last call of `advance`."""
-        return self._combined()
+        return self._combine_states()
 
     def limit_m_s2(self, name: str) -> float:
         """Return the acceleration limit of a station; 0 if no program drives it."""
@@ -137,14 +138,14 @@ class LabPhysics:
         if (now_ns := self._clock.now_ns()) - self._polled_ns >= _POLL_NS:
             self._poll_placements(now_ns)
         if self._physics is not None:
-            for at_ns, name, command in sorted(self._commands(to_ns), key=lambda timed: timed[0]):
+            for at_ns, name, command in sorted(self._commands(to_ns), key=itemgetter(0)):
                 self._drive(name, max(at_ns, self._now_ns), command)
             self._advance(to_ns)
             self._report(to_ns)
         self._now_ns = to_ns
         if self._has_changed:
             self._has_changed = False
-            self._states = self._combined()
+            self._states = self._combine_states()
         return self._states
 
     def close(self) -> None:
@@ -189,7 +190,7 @@ class LabPhysics:
                     flight = self._physics.flight_status(name)
                 steering.report(at_ns, self._physics_states[name], flight)
 
-    def _combined(self) -> Mapping[str, State]:
+    def _combine_states(self) -> Mapping[str, State]:
         states = dict(self._assigned_states)
         for name, steering in self._steerings.items():
             if steering.is_driven and self._physics is not None:

@@ -67,16 +67,16 @@ class RealAgents(Agents):
     most one step of the physics. If there is no event, they get the time of that step.
 
     Args:
-        physics: Moves the robots, also by the commands of their programs.
+        physics: Moves the robots, and receives the commands of their programs.
         devices: Their devices.
 
     Attributes:
-        delivered: The payloads of the packets that arrived since the list was cleared, in order.
+        delivered_packets: The payloads of the packets that arrived since the list was cleared, in order.
     """
 
     def __init__(self, physics: PhysicsFederate, devices: Devices) -> None:
         super().__init__(physics, {})
-        self.delivered: list[RealPacket] = []
+        self.delivered_packets: list[RealPacket] = []
         self._devices = devices
         self._reached_ns = 0
         self._numbers: dict[str, int] = {}
@@ -96,7 +96,7 @@ class RealAgents(Agents):
 
     @override
     def deliver(self, receiver: str, received_datagram: ReceivedDatagram) -> None:
-        self.delivered.append(received_datagram.payload)
+        self.delivered_packets.append(received_datagram.payload)
 
     @property
     @override

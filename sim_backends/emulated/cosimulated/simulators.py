@@ -164,7 +164,7 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
     options, antennas = settings.options, settings.antennas
     radio: RadioModel[Fragment] = (
         UniformLinks(settings.seed, options)
-        if options.fixed
+        if options.is_fixed
         else WifiInWorld(settings.seed, options, antennas, settings.world)
     )
     radio.use_meter()
@@ -173,10 +173,18 @@ def builtin_network(settings: LabSettings) -> BuiltinNetwork:
 
 
 def start_network(settings: LabSettings, states: Mapping[str, State]) -> remote.RemoteNetwork:
-    """Start the program of a network. Arguments and errors are those of `start_physics`, but with all stations."""
+    """Start the program of a network.
+
+    Args:
+        settings: Settings of the lab.
+        states: State of the antenna of each station.
+
+    Raises:
+        ConfigurationError: The program cannot be started, or does not carry the packets of real programs.
+    """
     network = remote.open_network(settings.simulators.network, _hello(settings, NETWORK, states), DEADLINE_S)
-    supported = network.welcome.transports
-    if supported and not {UNICAST, BROADCAST} <= {*supported}:
+    supported_transports = network.welcome.transports
+    if supported_transports and not {UNICAST, BROADCAST} <= {*supported_transports}:
         network.close()
         raise ConfigurationError(
             f"{network.session.name} does not carry bare IP packets, which real programs send",

@@ -21,7 +21,7 @@ _REPORT_NS: Final = 10_000_000
 """Interval of the records while a robot moves; the robot's own base controller uses 20 ms."""
 
 _PENDING_COMMANDS: Final = 1000
-"""Commands that are kept while the simulation lags, by at most 1 s; older ones are dropped."""
+"""Maximum number of commands that are kept while the simulation lags (at most 1 s); older ones are dropped."""
 
 Command = Twist | FlightTarget
 

@@ -36,7 +36,8 @@ table netdev fieldkit {{
 """
 """The rules of robots (`wireless`), but for frames that the bridge forwards, which do not pass the hook `output`."""
 _BEACON_INTERVALS_TU: Final = (100, 101, 103, 107, 109, 113)
-"""hwsim derives the times of beacons from one clock, so beacons of equal intervals would always collide."""
+"""They differ because hwsim derives the times of beacons from one clock: beacons of equal intervals would always
+collide."""
 _ENABLED: Final = "AP-ENABLED"
 _START_S: Final = 60.0
 _EXIT_S: Final = 5.0
@@ -44,7 +45,7 @@ _POLL_S: Final = 0.1
 
 
 class AccessPoints:
-    """Running access points of one network, until `close`.
+    """The access points of one network, which run until `close`.
 
     The process starts when the object is created. The kernel kills it when the thread that created the object ends.
 

@@ -36,23 +36,23 @@ class FrameOnAir:
     """A frame, from its transmission until its status is reported.
 
     Attributes:
-        sent: The frame.
+        sent_frame: The frame.
         source: Name of its transmitter.
         receiver: Name of its receiver; None for a broadcast or multicast, `""` if no radio has the address.
         chain: Its tries; a broadcast or multicast has one, in the basic mode.
         attempts: Number of tries that were made.
-        acknowledged: True if an ACK was received.
+        is_acknowledged: True if an ACK was received.
         signal_dbm: Signal of that ACK, at the start of the try.
         mode: Mode of the last try that a receiver decoded.
         is_final: True if its status is known.
     """
 
-    sent: SentFrame
+    sent_frame: SentFrame
     source: str
     receiver: str | None
     chain: RateChain
     attempts: int = 0
-    acknowledged: bool = False
+    is_acknowledged: bool = False
     signal_dbm: int = _LOWEST_SIGNAL_DBM
     mode: WifiMode = G_MODES[0]
     is_final: bool = False
@@ -107,7 +107,7 @@ class _ChainRates(RateControl):
     def report(self, mode: WifiMode, *, acknowledged: int, attempts: int = 1) -> None:
         frame = self._frame
         assert frame is not None
-        frame.acknowledged = bool(acknowledged)
+        frame.is_acknowledged = bool(acknowledged)
         if acknowledged:
             transmitter, receiver = self._ends
             frame.signal_dbm = self._channel.signal_dbm(receiver, transmitter, self._now_ns)
@@ -174,7 +174,7 @@ class _Channel:
         if not tries:
             self.finish(frame)
             return
-        size_bytes = len(frame.sent.frame) + _FCS_BYTES - HEADER_BYTES
+        size_bytes = len(frame.sent_frame.frame) + _FCS_BYTES - HEADER_BYTES
         self._wifi.send(now_ns, frame.source, frame, size_bytes, frame.receiver, packet=identity, max_attempts=tries)
 
     def next_event_ns(self) -> int | None:
@@ -223,7 +223,7 @@ class Air:
         world: Obstacles; None for open ground.
 
     Raises:
-        ValueError: There is no radio, or one has the empty name.
+        ValueError: There is no radio, or the name of a radio is empty.
     """
 
     def __init__(
@@ -245,17 +245,17 @@ class Air:
         for frequency_mhz in self._channels:
             self._place(now_ns, frequency_mhz)
 
-    def transmit(self, now_ns: int, sent: SentFrame, source: str, receiver: str | None) -> None:
+    def transmit(self, now_ns: int, sent_frame: SentFrame, source: str, receiver: str | None) -> None:
         """Send a frame at `now_ns`; times must not decrease.
 
         Args:
             now_ns: Current time.
-            sent: The frame.
+            sent_frame: The frame.
             source: Name of its radio.
             receiver: Name of the radio with the receiver's address; None if no radio has it. Ignored for a broadcast
                 or multicast.
         """
-        frequency_mhz = sent.frequency_mhz
+        frequency_mhz = sent_frame.frequency_mhz
         if frequency_mhz not in self._channels:
             self._channels[frequency_mhz] = _Channel(*self._channel_arguments)
             self._place(now_ns, frequency_mhz)
@@ -265,13 +265,13 @@ class Air:
             changed_mhz = self._channels if previous_mhz is None else (previous_mhz, frequency_mhz)
             for channel_mhz in changed_mhz:
                 self._place(now_ns, channel_mhz)
-        destination = None if sent.is_group else receiver if receiver not in {None, source} else _ABSENT
-        if sent.is_group:
+        destination = None if sent_frame.is_group else receiver if receiver not in {None, source} else _ABSENT
+        if sent_frame.is_group:
             chain = rate_chain((), frequency_mhz)
         else:
-            max_tries = 1 if sent.flags & FLAG_NO_ACK else SHORT_RETRY_LIMIT
-            chain = rate_chain(sent.stages, frequency_mhz, max_tries=max_tries)
-        self._channels[frequency_mhz].transmit(now_ns, FrameOnAir(sent, source, destination, chain))
+            max_tries = 1 if sent_frame.flags & FLAG_NO_ACK else SHORT_RETRY_LIMIT
+            chain = rate_chain(sent_frame.stages, frequency_mhz, max_tries=max_tries)
+        self._channels[frequency_mhz].transmit(now_ns, FrameOnAir(sent_frame, source, destination, chain))
 
     def next_event_ns(self) -> int | None:
         """Return the time of the next event, or None if there is no frame on the air."""

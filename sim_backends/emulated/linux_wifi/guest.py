@@ -69,9 +69,9 @@ def prologue(folder: Path) -> str:
     """Return the part of a shell script that prepares the machine for programs of fieldkit in a folder."""
     # Programs of a folder of extracted packages are not on the PATH of the robots.
     links = [
-        shlex.join(("ln", "-sf", found, f"/usr/local/sbin/{name}"))
+        shlex.join(("ln", "-sf", path, f"/usr/local/sbin/{name}"))
         for name in PACKAGE_OF
-        if shutil.which(name, path=worker.PATH) is None and (found := find_program(name, kernel_roots())) is not None
+        if shutil.which(name, path=worker.PATH) is None and (path := find_program(name, kernel_roots())) is not None
     ]
     variables = {
         "PATH": worker.PATH,

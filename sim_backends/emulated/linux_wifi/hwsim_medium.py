@@ -15,7 +15,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RadioAddress,
     SentFrame,
     decode_event,
-    encode_received,
+    encode_reception,
     encode_status,
 )
 from sim_backends.emulated.linux_wifi.netlink import NLMSG_ERROR, NetlinkFormatError, NetlinkMessage
@@ -54,11 +54,11 @@ class MediumCounts:
     """Counts of messages.
 
     Attributes:
-        rejected: Messages that were malformed, or from a radio that is not part of the lab.
+        rejected_messages: Messages that were malformed, or from a radio that is not part of the lab.
         errors: Errors that the kernel returned, by number; EINVAL includes frames to a radio on another channel.
     """
 
-    rejected: int = 0
+    rejected_messages: int = 0
     errors: Counter[int] = field(default_factory=Counter)
 
 
@@ -92,7 +92,7 @@ class HwsimMedium:
                 return
             event = decode_event(message.payload)
         except NetlinkFormatError:
-            self.counts.rejected += 1
+            self.counts.rejected_messages += 1
             return
         match event:
             case SentFrame():
@@ -107,23 +107,23 @@ class HwsimMedium:
         messages += [self._status_message(frame) for frame in events.statuses]
         return [message for message in messages if message is not None]
 
-    def _transmit(self, now_ns: int, sent: SentFrame) -> None:
-        name = self._names.get(sent.radio)
-        if name is None or not MIN_FREQUENCY_MHZ <= sent.frequency_mhz <= MAX_FREQUENCY_MHZ:
-            self.counts.rejected += 1
+    def _transmit(self, now_ns: int, sent_frame: SentFrame) -> None:
+        name = self._names.get(sent_frame.radio)
+        if name is None or not MIN_FREQUENCY_MHZ <= sent_frame.frequency_mhz <= MAX_FREQUENCY_MHZ:
+            self.counts.rejected_messages += 1
             return
-        address = sent.transmitter
+        address = sent_frame.transmitter
         # An interface that existed before the medium started was not announced. An address that already belongs to a
         # radio is not reassigned.
         if address is not None and not address[0] & 1 and address not in self._by_address:
             self._add_address(address, name)
-        self.air.transmit(now_ns, sent, name, self._by_address.get(sent.receiver))
+        self.air.transmit(now_ns, sent_frame, name, self._by_address.get(sent_frame.receiver))
 
     def _update_address(self, event: InterfaceAddress) -> None:
         name = self._names.get(event.radio)
         if name is None:
-            self.counts.rejected += 1
-        elif event.added:
+            self.counts.rejected_messages += 1
+        elif event.is_added:
             self._remove_address(event.address)
             self._add_address(event.address, name)
         elif self._by_address.get(event.address) == name:
@@ -142,19 +142,21 @@ class HwsimMedium:
     def _reception_message(self, reception: FrameReception) -> bytes | None:
         frame = reception.frame
         self._totals(frame.source, reception.receiver).signal_dbm = reception.signal_dbm
-        rate_index = legacy_index(reception.mode, frame.sent.frequency_mhz)
+        rate_index = legacy_index(reception.mode, frame.sent_frame.frequency_mhz)
         radio = self._radio_of[reception.receiver]
-        return encode_received(frame.sent, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
+        return encode_reception(frame.sent_frame, radio, rate_index=rate_index, signal_dbm=reception.signal_dbm)
 
     def _status_message(self, frame: FrameOnAir) -> bytes:
         tries = frame.chain.tries_made(frame.attempts)
         if frame.receiver:
             totals = self._totals(frame.source, frame.receiver)
             totals.frames += 1
-            totals.acknowledged += frame.acknowledged
+            totals.acknowledged += frame.is_acknowledged
             totals.tries += frame.attempts
             totals.reported_tries += sum(tries)
-        return encode_status(frame.sent, tries=tries, acknowledged=frame.acknowledged, signal_dbm=frame.signal_dbm)
+        return encode_status(
+            frame.sent_frame, tries=tries, acknowledged=frame.is_acknowledged, signal_dbm=frame.signal_dbm
+        )
 
     def _totals(self, transmitter: str, receiver: str) -> LinkTotals:
         return self.totals.setdefault((transmitter, receiver), LinkTotals())

@@ -111,12 +111,12 @@ class InterfaceAddress:
     Attributes:
         radio: The radio.
         address: MAC address of the interface.
-        added: False if the address was removed.
+        is_added: False if the address was removed.
     """
 
     radio: RadioAddress
     address: bytes
-    added: bool
+    is_added: bool
 
 
 def decode_event(payload: bytes) -> SentFrame | InterfaceAddress | None:
@@ -167,7 +167,7 @@ def encode_status(frame: SentFrame, *, tries: Sequence[int], acknowledged: bool,
     )
 
 
-def encode_received(frame: SentFrame, receiver: RadioAddress, *, rate_index: int, signal_dbm: int) -> bytes | None:
+def encode_reception(frame: SentFrame, receiver: RadioAddress, *, rate_index: int, signal_dbm: int) -> bytes | None:
     """Return the message that passes a frame to a receiving radio; None if the frame is too short for the kernel.
 
     Args:

@@ -1,7 +1,7 @@
 """The initial file system of the virtual machine: busybox, kernel modules and a start script, in a cpio archive.
 
 Everything else is the root file system of the host, which the machine mounts read-only over 9p, below a layer in
-memory that has all changes. The archive has the format `newc` (Linux,
+memory that contains all changes. The archive has the format `newc` (Linux,
 Documentation/driver-api/early-userspace/buffer-format.rst). This module writes it, because a program for it would
 have to be installed, and needs a copy of each file.
 """
@@ -131,7 +131,7 @@ def module_order(modules: Path, names: Iterable[str]) -> list[Path]:
 
 
 def without_signature(module: bytes) -> bytes:
-    """Return a module without the signature at its end (Linux, scripts/sign-file.c): its check needs seconds."""
+    """Return a module without the signature at its end (Linux, scripts/sign-file.c): checking it takes seconds."""
     if not module.endswith(_SIGNED):
         return module
     end = len(module) - len(_SIGNED)

@@ -176,7 +176,7 @@ def _receive(kernel: KernelSocket, medium: HwsimMedium | None, now_ns: int) -> N
             messages = kernel.receive()
         except NetlinkFormatError:
             if medium is not None:
-                medium.counts.rejected += 1
+                medium.counts.rejected_messages += 1
             continue
         if not messages:
             return
@@ -205,7 +205,7 @@ def _answer(
                     for (transmitter, receiver), totals in medium.totals.items()
                 ]
                 errors = {os.strerror(number): count for number, count in medium.counts.errors.items()}
-                counts = {"rejected": medium.counts.rejected, "overruns": kernel.overruns, "errors": errors}
+                counts = {"rejected": medium.counts.rejected_messages, "overruns": kernel.overruns, "errors": errors}
                 return medium, {"links": links, **counts}
             case other:
                 return medium, {"error": f"unknown request {other!r}"}

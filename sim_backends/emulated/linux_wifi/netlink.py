@@ -63,7 +63,7 @@ class NetlinkMessage:
     def encode(self) -> bytes:
         """Return the message with header and padding; its port number is 0, which the kernel replaces."""
         size = _MESSAGE.size + len(self.payload)
-        return _padded(_MESSAGE.pack(size, self.type, self.flags, self.sequence, 0) + self.payload)
+        return _pad(_MESSAGE.pack(size, self.type, self.flags, self.sequence, 0) + self.payload)
 
     @property
     def error_number(self) -> int:
@@ -91,7 +91,7 @@ def decode_messages(datagram: bytes) -> Iterator[NetlinkMessage]:
         if not _MESSAGE.size <= size <= len(datagram) - offset:
             raise NetlinkFormatError(f"a message of {size} bytes in {len(datagram) - offset} bytes")
         yield NetlinkMessage(kind, flags, sequence, datagram[offset + _MESSAGE.size : offset + size])
-        offset += _aligned(size)
+        offset += _align(size)
 
 
 def encode_generic(command: int, version: int, attributes: Mapping[int, bytes]) -> bytes:
@@ -109,7 +109,7 @@ def encode_generic(command: int, version: int, attributes: Mapping[int, bytes]) 
     for kind, value in attributes.items():
         if _ATTRIBUTE.size + len(value) > 0xFFFF:
             raise NetlinkFormatError(f"attribute {kind} has {len(value)} bytes, more than {0xFFFF - _ATTRIBUTE.size}")
-        parts.append(_padded(_ATTRIBUTE.pack(_ATTRIBUTE.size + len(value), kind) + value))
+        parts.append(_pad(_ATTRIBUTE.pack(_ATTRIBUTE.size + len(value), kind) + value))
     return b"".join(parts)
 
 
@@ -129,7 +129,7 @@ def decode_generic(payload: bytes) -> tuple[int, dict[int, bytes]]:
         if not _ATTRIBUTE.size <= size <= len(payload) - offset:
             raise NetlinkFormatError(f"an attribute of {size} bytes in {len(payload) - offset} bytes")
         attributes[kind & _TYPE_MASK] = payload[offset + _ATTRIBUTE.size : offset + size]
-        offset += _aligned(size)
+        offset += _align(size)
     return command, attributes
 
 
@@ -240,9 +240,9 @@ class FamilySocket:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
 
 
-def _aligned(size: int) -> int:
+def _align(size: int) -> int:
     return (size + 3) & ~3
 
 
-def _padded(value: bytes) -> bytes:
-    return value + bytes(_aligned(len(value)) - len(value))
+def _pad(value: bytes) -> bytes:
+    return value + bytes(_align(len(value)) - len(value))

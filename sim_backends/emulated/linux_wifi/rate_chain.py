@@ -36,13 +36,13 @@ class RateChain:
     Attributes:
         modes: Mode of each try.
         stages: For each try, the number of its stage.
-        skipped: For each stage, True if its mode is not in the radio model.
+        is_skipped: For each stage, True if its mode is not in the radio model.
         max_tries: For each stage, the number of tries that the chain has for it.
     """
 
     modes: tuple[WifiMode, ...]
     stages: tuple[int, ...]
-    skipped: tuple[bool, ...]
+    is_skipped: tuple[bool, ...]
     max_tries: tuple[int, ...]
 
     def tries_made(self, attempts: int) -> list[int]:
@@ -51,9 +51,9 @@ class RateChain:
         Skipped stages before the last attempt count as tried and failed. If no stage is in the radio model, all
         stages count as tried and failed.
         """
-        last = self.stages[attempts - 1] if attempts else len(self.skipped) - 1
+        last = self.stages[attempts - 1] if attempts else len(self.is_skipped) - 1
         on_air = Counter(self.stages[:attempts])
-        return [self.max_tries[stage] if self.skipped[stage] else on_air[stage] for stage in range(last + 1)]
+        return [self.max_tries[stage] if self.is_skipped[stage] else on_air[stage] for stage in range(last + 1)]
 
 
 def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: int = SHORT_RETRY_LIMIT) -> RateChain:
@@ -61,16 +61,16 @@ def rate_chain(stages: Sequence[RateStage], frequency_mhz: int, *, max_tries: in
     used_stages = list(stages) or [RateStage(0, 1)]
     modes: list[WifiMode] = []
     numbers: list[int] = []
-    skipped = []
+    is_skipped = []
     for number, stage in enumerate(used_stages):
         mode = mode_of(stage, frequency_mhz)
-        skipped.append(mode is None)
+        is_skipped.append(mode is None)
         if mode is not None:
             tries = min(max(stage.tries, 1), max_tries - len(modes))
             modes += [mode] * tries
             numbers += [number] * tries
     max_stage_tries = tuple(max(stage.tries, 1) for stage in used_stages)
-    return RateChain(tuple(modes), tuple(numbers), tuple(skipped), max_stage_tries)
+    return RateChain(tuple(modes), tuple(numbers), tuple(is_skipped), max_stage_tries)
 
 
 def mode_of(stage: RateStage, frequency_mhz: int) -> WifiMode | None:

@@ -24,7 +24,7 @@ _MAX_PENDING: Final = 2048
 
 
 class _ChannelStream:
-    """One stream: a socket pair, whose near end is given to the user of the stream, and received frames."""
+    """One stream: a socket pair, whose near end belongs to the user of the stream, and received frames."""
 
     def __init__(self) -> None:
         self.near, self.far = socket.socketpair()
@@ -108,7 +108,7 @@ class ChannelStreams:
             threading.Thread(target=work, args=(number, stream), daemon=True).start()
 
     def _send_data(self, number: int, stream: _ChannelStream) -> None:
-        """Send what is written to the near end."""
+        """Send the data that is written to the near end."""
         data = b""
         with contextlib.suppress(OSError):
             while data := stream.far.recv(_CHUNK_BYTES):

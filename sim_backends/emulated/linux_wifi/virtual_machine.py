@@ -97,8 +97,8 @@ class JobResult:
 
 def kernel_roots() -> tuple[Path, ...]:
     """Return the folders with `boot/`, `lib/modules/` and programs: the folder in `ROOT_VARIABLE`, and `/`."""
-    extracted = os.environ.get(ROOT_VARIABLE)
-    return (Path(extracted).absolute(), Path("/")) if extracted else (Path("/"),)
+    packages_folder = os.environ.get(ROOT_VARIABLE)
+    return (Path(packages_folder).absolute(), Path("/")) if packages_folder else (Path("/"),)
 
 
 def find_program(name: str, roots: Sequence[Path]) -> str | None:
@@ -129,7 +129,7 @@ def uncompressed_kernel(image: bytes) -> bytes:
     payload = image[start : start + size]
     if not payload.startswith(b"\xfd7zXZ\0"):
         return image
-    # The payload ends with its uncompressed size, which the decompressor leaves out.
+    # The payload ends with its uncompressed size, which the decompressor does not expect.
     return lzma.LZMADecompressor(lzma.FORMAT_XZ).decompress(payload)
 
 
@@ -321,8 +321,8 @@ def _command_line(folder: Path, memory_mib: int, results: Path | None) -> list[s
     shares = [("host", "/", ",readonly=on"), ("lab", str(folder / "shared"), "")]
     shares += [] if results is None else [(_RESULTS, str(results), "")]
     for tag, path, access in shares:
-        escaped = path.replace(",", ",,")  # a single comma separates options
-        argv += ["-fsdev", f"local,id={tag},path={escaped},security_model=none,multidevs=remap{access}"]
+        escaped_path = path.replace(",", ",,")  # a single comma separates options
+        argv += ["-fsdev", f"local,id={tag},path={escaped_path},security_model=none,multidevs=remap{access}"]
         argv += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
     return argv
 

@@ -48,7 +48,7 @@ class Media:
         """Return the number of packets of all media by lateness in ns. Raises the errors of `MediumClient.stats`."""
         counts: Counter[int] = Counter()
         for medium in (self.radio, *self.links.values()):
-            counts.update(medium.stats().late)
+            counts.update(medium.stats().packet_lateness_counts)
         return counts
 
     def check_alive(self) -> None:

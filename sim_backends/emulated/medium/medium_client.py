@@ -136,7 +136,7 @@ class MediumClient:
         self._worker.request({"do": "use", "options": self._options.model_dump(mode="json"), "world": world})
 
     def record(self, folder: Path | None) -> None:
-        """Record transmissions to files in `folder` from now on (see `air_log`), or stop recording with None.
+        """Record later transmissions in files in `folder` (see `air_log`), or stop recording with None.
 
         Raises:
             LinkError: The medium ended or did not answer.

@@ -86,18 +86,18 @@ class PortCounters:
     """Packet counters of the device of one robot.
 
     Attributes:
-        read: Packets that the robot sent.
-        written: Packets delivered to the robot.
-        refused: Packets that arrived but that the robot's kernel refused.
-        unroutable: Packets to an address that no robot has, or from or to a robot that is off the air.
-        not_ipv4: Packets of other protocols than IPv4, which a medium of bare IP packets does not carry.
+        sent_packets: Packets that the robot sent.
+        delivered_packets: Packets delivered to the robot.
+        refused_packets: Packets that arrived but that the robot's kernel refused.
+        unroutable_packets: Packets to an address that no robot has, or from or to a robot that is off the air.
+        other_packets: Packets of other protocols than IPv4, which a medium of bare IP packets does not carry.
     """
 
-    read: int
-    written: int
-    refused: int
-    unroutable: int
-    not_ipv4: int
+    sent_packets: int
+    delivered_packets: int
+    refused_packets: int
+    unroutable_packets: int
+    other_packets: int
 
 
 @dataclass(frozen=True)
@@ -106,30 +106,32 @@ class MediumStats:
 
     Attributes:
         scheduling: `fifo 1`, or the reason why the process has no real-time priority.
-        late: Number of packets per lateness in ns, rounded by `round_up`. Lateness is the longest time that the
-            packet can have waited to be read, plus the time from its arrival by the model until it was written.
+        packet_lateness_counts: Number of packets per lateness in ns, rounded by `round_up`. Lateness is the longest
+            time that the packet can have waited to be read, plus the time from its arrival by the model until it was
+            written.
         links: Counters per directed link.
         ports: Counters per robot.
         delays: Delays of the packets written to a robot, per pair of sender and receiver; lateness is counted as
             processing delay.
-        late_windows: Number of windows of a co-simulation per lateness in ns, rounded by `round_up`: the time from
-            the end of the window until its packets were written. Empty for a medium without windows.
+        window_lateness_counts: Number of windows of a co-simulation per lateness in ns, rounded by `round_up`. The
+            lateness is the time from the end of the window until its packets were written. Empty for a medium
+            without windows.
     """
 
     scheduling: str
-    late: dict[int, int]
+    packet_lateness_counts: dict[int, int]
     links: dict[Pair, LinkCounters]
     ports: dict[str, PortCounters]
     delays: dict[Pair, DelayParts]
-    late_windows: Mapping[int, int] = field(default_factory=dict)
+    window_lateness_counts: Mapping[int, int] = field(default_factory=dict)
 
 
 def pack_stats(stats: MediumStats) -> Message:
     """Return the message for `stats`."""
     return {
         "scheduling": stats.scheduling,
-        "late": [*stats.late.items()],
-        "late_windows": [*stats.late_windows.items()],
+        "packet_lateness_counts": [*stats.packet_lateness_counts.items()],
+        "window_lateness_counts": [*stats.window_lateness_counts.items()],
         "links": [[*pair, vars(counters)] for pair, counters in stats.links.items()],
         "ports": {name: vars(counters) for name, counters in stats.ports.items()},
         "delays": [[*pair, vars(parts)] for pair, parts in stats.delays.items()],
@@ -140,8 +142,8 @@ def unpack_stats(message: Message) -> MediumStats:
     """Return the statistics from a message of `pack_stats`."""
     return MediumStats(
         scheduling=message["scheduling"],
-        late=dict(message["late"]),
-        late_windows=dict(message["late_windows"]),
+        packet_lateness_counts=dict(message["packet_lateness_counts"]),
+        window_lateness_counts=dict(message["window_lateness_counts"]),
         links={(sender, receiver): LinkCounters(**values) for sender, receiver, values in message["links"]},
         ports={name: PortCounters(**values) for name, values in message["ports"].items()},
         delays={(source, robot): DelayParts(**values) for source, robot, values in message["delays"]},
@@ -181,14 +183,15 @@ class Port:
         self.name = name
         self.address = address
         self.fd = fd
-        self.read = 0
-        self.refused = 0
-        self.unroutable = 0
-        self.not_ipv4 = 0
+        self.sent_packets = 0
+        self.refused_packets = 0
+        self.unroutable_packets = 0
+        self.other_packets = 0
         # Number of the next packets that may have waited in the device since `backlog_since_ns`.
         self.backlog = 0
         self.backlog_since_ns = 0
-        # Delays of the written packets, by the robot that sent them. `refused` counts packets that were not written.
+        # Delays of the written packets, by the robot that sent them. `refused_packets` counts packets that were not
+        # written.
         self.delays: defaultdict[str, Delay] = defaultdict(int)
         self.routes: Routes = {}
 
@@ -199,5 +202,7 @@ class Port:
     @property
     def counters(self) -> PortCounters:
         """The current counters."""
-        written = sum(delay.packets for delay in self.delay_parts().values())
-        return PortCounters(self.read, written, self.refused, self.unroutable, self.not_ipv4)
+        delivered_packets = sum(delay.packets for delay in self.delay_parts().values())
+        return PortCounters(
+            self.sent_packets, delivered_packets, self.refused_packets, self.unroutable_packets, self.other_packets
+        )

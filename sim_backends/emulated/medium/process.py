@@ -101,13 +101,13 @@ class Medium(MediumServer):
                 # The robot's namespace and its device no longer exist; a socket returns no bytes in this case.
                 self._epoll.unregister(fd)
                 return
-            port.read += 1
+            port.sent_packets += 1
             if not is_carried:
-                port.not_ipv4 += 1
+                port.other_packets += 1
                 continue
             destination = destination_of(packet, routes)
             if destination == NO_ROBOT:
-                port.unroutable += 1
+                port.unroutable_packets += 1
                 continue
             if requested_flows and (inner := framing.ipv4(packet)) is not None:
                 flows.note_first_fragment(inner)
@@ -125,7 +125,7 @@ class Medium(MediumServer):
         now_ns = time.monotonic_ns()
         deliveries = self._model.deliveries(now_ns)
         if deliveries:
-            ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._late
+            ports, write, clock_ns, late = self._ports, os.write, time.monotonic_ns, self._packet_lateness_counts
             flows, requested_flows = self._flows, self._flows.delays_by_flow
             for at_ns, name, packet, source, delay in deliveries:
                 port = ports[name]
@@ -133,7 +133,7 @@ class Medium(MediumServer):
                     write(port.fd, packet)
                 except OSError:
                     # The interface is down, or the robot has stopped.
-                    port.refused += 1
+                    port.refused_packets += 1
                     continue
                 late_ns = clock_ns() - at_ns
                 port.delays[source] += delay + late_ns
@@ -159,7 +159,7 @@ class Medium(MediumServer):
         self._model.place(time.monotonic_ns(), positions_m, relay, self._layout.velocities_m_s)
 
     def _new_model(self) -> RadioModel[bytes]:
-        if self._options.fixed:
+        if self._options.is_fixed:
             return UniformLinks(self._seed, self._options)
         return WifiInWorld(self._seed, self._options, self._antennas, self._world)
 

@@ -42,7 +42,7 @@ _OWNER_TIMEOUT_S: Final = 5.0
 # The sampling interval of a robot's own link sampler.
 _SAMPLE_NS: Final = 200_000_000
 _MAX_SAMPLES: Final = 10_000
-"""Samples kept per robot: half an hour."""
+"""Maximum number of samples that are kept per robot: half an hour."""
 
 AttemptLog = Callable[[TransmissionAttempt], None]
 
@@ -96,7 +96,7 @@ class MediumServer(ABC):
         self._ports: dict[str, Port] = {}
         self._by_fd: dict[int, Port] = {}
         # Number of packets by lateness.
-        self._late: Counter[int] = Counter()
+        self._packet_lateness_counts: Counter[int] = Counter()
         self._flows = FlowDelays()
         self._scheduling = _raise_priority()
         self._timer = Timer()
@@ -112,7 +112,7 @@ class MediumServer(ABC):
 
     @abstractmethod
     def _log_attempts(self, log: AttemptLog | None) -> None:
-        """Pass every transmission attempt from now on to `log`; None stops it."""
+        """Pass every later transmission attempt to `log`; None stops logging."""
 
     @abstractmethod
     def _sample_links(self, now_ns: int) -> Mapping[str, LinkSample]:
@@ -238,7 +238,7 @@ class MediumServer(ABC):
             for name, port in self._ports.items()
             for source, parts in port.delay_parts().items()
         }
-        return MediumStats(self._scheduling, self._late, self._link_counters(), ports, delays)
+        return MediumStats(self._scheduling, self._packet_lateness_counts, self._link_counters(), ports, delays)
 
 
 def _raise_priority() -> str:

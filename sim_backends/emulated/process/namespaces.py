@@ -12,11 +12,11 @@ from fieldkit.core.errors import ConfigurationError
 from sim_backends.emulated.process.worker import PATH
 
 _NAMESPACES: Final = ("--net", "--mount", "--propagation", "private", "--pid", "--uts", "--ipc")
-# Root in the namespaces is this user outside of them; other accounts in them (of sshd and tcpdump) are subordinate
-# ids.
+# Outside of the namespaces, their root has the id of this user, and their other accounts (of sshd and tcpdump) have
+# subordinate ids.
 _AS_ROOT_INSIDE: Final = ("--user", "--map-root-user", "--map-auto")
-# The first attempt uses no subordinate ids, because `unshare --map-auto` leaves a process behind if the kernel
-# refuses.
+# The first attempt uses no subordinate ids, because `unshare --map-auto` does not end all its processes if
+# the kernel refuses.
 _PROBES: Final = (("--user", "--map-root-user"), _AS_ROOT_INSIDE)
 
 _SUBORDINATES: Final = 65534

@@ -48,9 +48,9 @@ def send(channel: socket.socket, message: Message, deadline: Deadline, descripto
         raise ValueError(f"a message of {len(line)} bytes is longer than {LINE_LIMIT_BYTES}")
     rights = [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", descriptors))] if descriptors else []
     channel.settimeout(deadline.remaining_s)
-    sent = channel.sendmsg([line], rights)
+    sent_bytes = channel.sendmsg([line], rights)
     channel.settimeout(deadline.remaining_s)
-    channel.sendall(line[sent:])
+    channel.sendall(line[sent_bytes:])
 
 
 def receive(channel: socket.socket, deadline: Deadline) -> tuple[Message, list[int]] | None:

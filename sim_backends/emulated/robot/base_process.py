@@ -38,7 +38,7 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
     CHANNEL.unlink(missing_ok=True)  # remains after a process was killed
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as channel:
         channel.bind(str(CHANNEL))
-        if base.simulated:
+        if base.is_simulated:
             ready.touch()
             _record_velocities(channel)
         channel.setblocking(False)

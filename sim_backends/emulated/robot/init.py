@@ -164,8 +164,8 @@ class Init:
                 self._supervisor.reap()
             if self._channel.fileno() in readable:
                 is_connected = self._serve()
-        # Until the interface is down, hwsim stores frames without a status, and these prevent that the kernel removes
-        # this network namespace.
+        # Until the interface is down, hwsim stores frames without a status, and these prevent the kernel from
+        # removing this network namespace.
         if self._wifi is not None:
             network.switch_off(self._interface)
 
@@ -287,7 +287,7 @@ def _motion_files(spec: RobotSpec) -> list[int]:
     inputs: list[tuple[Path, int]] = []
     if spec.simulated_flight:
         inputs = [(services.FLIGHT_COMMAND, os.O_RDONLY), (services.FLIGHT, os.O_RDWR)]
-    elif spec.base is not None and spec.base.simulated:
+    elif spec.base is not None and spec.base.is_simulated:
         inputs = [(VELOCITY_COMMAND, os.O_RDONLY)]
     if not inputs:
         return [os.open(services.MOTION_RECORD, os.O_RDONLY | os.O_CREAT, 0o600)]

@@ -17,7 +17,7 @@ from sim_backends.emulated.medium.framing import mac_of
 from sim_backends.emulated.robot.spec import LOOPBACK_INTERFACE, SHARED_NETWORK, STATE
 
 PID: Final = Path(STATE, "babeld.pid")
-"""Written when the daemon has its socket and its interface, before its first hello."""
+"""File that the daemon writes when it has its socket and its interface, before its first hello."""
 
 LINK_COST: Final = 1024
 """Cost of a further link in Babel; a radio without loss costs 256, so that it is preferred."""

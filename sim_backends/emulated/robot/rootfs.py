@@ -17,7 +17,8 @@ from sim_backends.emulated.robot.spec import HOME, NETCATS, STATE, RobotSpec
 
 SSHD_FOLDER: Final = "/run/sshd"
 BOOT_ID: Final = f"{STATE}/boot_id"
-"""File that is mounted over the kernel's boot id, which is the same for all robots and never changes."""
+"""File that is mounted over the kernel's boot id, which is the same for all robots and does not change when they
+reboot."""
 
 _RECORDERS: Final = {
     1: ("rosbag", "sim_backends.emulated.ros.rosbag"),

@@ -58,7 +58,7 @@ class Ros2Relay:
         self._publishers: dict[str, Publisher] = {}
         self._conversions: dict[str, Callable[[bytes], bytes]] = {}
         self._endpoints = 0
-        self._subscribed: set[str] = set()
+        self._subscribed_topics: set[str] = set()
         self._rosout = self._middleware.publisher(self._topic("/rosout", _LOG, offered_qos.ROSOUT))
         for topic, kind in types.items():
             description = self._topic(topic, kind, offered_qos.of_topic(topic, kind))
@@ -130,9 +130,9 @@ class Ros2Relay:
         listener = self._listener
         for topic, publisher in self._publishers.items():
             has_subscriber = publisher.matched() > 0
-            if has_subscriber != (topic in self._subscribed):
+            if has_subscriber != (topic in self._subscribed_topics):
                 self.log(f"{topic} has {'a subscriber' if has_subscriber else 'no subscribers'}")
-                self._subscribed ^= {topic}
+                self._subscribed_topics ^= {topic}
             if topic == static_frames.TOPIC or has_subscriber:
                 listener.wanted_topics.add(topic)
             else:

@@ -155,11 +155,11 @@ def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no
 
     If ROS's own class of that type is installed, its definition is announced, with comments, as on a real robot.
     """
-    installed = roslib.message.get_message_class(header["type"])
+    installed_class = roslib.message.get_message_class(header["type"])
     attributes = {
         "_type": header["type"],
         "_md5sum": header["md5sum"],
-        "_full_text": installed._full_text if installed else header["message_definition"],  # noqa: SLF001 (ROS's own name)
+        "_full_text": installed_class._full_text if installed_class else header["message_definition"],  # noqa: SLF001 (ROS's own name)
     }
     return type("Relayed", (rospy.AnyMsg,), attributes)
 

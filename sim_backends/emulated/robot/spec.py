@@ -51,7 +51,7 @@ class Base:
         speed_m_s: Maximum speed.
         acceleration_m_s2: Maximum acceleration.
         turn_rad_s: Maximum turn rate.
-        simulated: True if the physics of a co-simulation moves the robot: the base only records the velocities.
+        is_simulated: True if the physics of a co-simulation moves the robot: the base only records the velocities.
     """
 
     topic: str
@@ -59,7 +59,7 @@ class Base:
     speed_m_s: float
     acceleration_m_s2: float
     turn_rad_s: float
-    simulated: bool = False
+    is_simulated: bool = False
 
 
 @dataclass(frozen=True)

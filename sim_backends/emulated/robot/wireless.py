@@ -105,7 +105,7 @@ def rejoin(interface: str, wifi: WifiSpec) -> None:
     """Join the ad hoc cell or the mesh after the interface was down; hostapd and wpa_supplicant do this themselves.
 
     Raises:
-        RobotError: The kernel rejected it.
+        RobotError: The kernel rejected the command.
     """
     if wifi.mode in _JOIN:
         _run("iw", "dev", interface, *_JOIN[wifi.mode])

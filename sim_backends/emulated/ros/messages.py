@@ -197,10 +197,10 @@ def _battery_state(_: Sensor, noise: Random, _motion: OwnMotion) -> bytes:
     voltage, design_capacity, percentage = noise.gauss(11.1, 0.01), 1.8, 0.8
     unknown = math.nan  # sensor_msgs/BatteryState: "if unmeasured NaN"
     discharging, good, polymer, present = 2, 1, 3, True  # POWER_SUPPLY_STATUS, _HEALTH, _TECHNOLOGY
-    measured = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
+    measured_fields = struct.pack("<7f", voltage, *[unknown] * 4, design_capacity, percentage)
     state = struct.pack("<3B?", discharging, good, polymer, present)
     no_cells = _float32s(()) * 2  # voltages and temperatures of the cells
-    return measured + state + no_cells + packed_string("") * 2  # place and serial number of the battery
+    return measured_fields + state + no_cells + packed_string("") * 2  # place and serial number of the battery
 
 
 def _range(_: Sensor, noise: Random, motion: OwnMotion) -> bytes:

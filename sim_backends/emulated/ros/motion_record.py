@@ -64,7 +64,7 @@ class RecordedMotion(NamedTuple):
         ahead_m = self.speed_m_s * elapsed_s
         later = self._replace(
             time_ns=max(now_ns, self.time_ns),
-            place_m=_extrapolated(self.place_m, self.velocity_m_s, elapsed_s),
+            place_m=_extrapolate(self.place_m, self.velocity_m_s, elapsed_s),
             heading_rad=self.heading_rad + self.turn_rad_s * elapsed_s,
             odometry=(
                 x_m + ahead_m * math.cos(yaw_rad),
@@ -119,7 +119,7 @@ def _to_motion(time_ns: int, path_start_ns: int, *values: float) -> RecordedMoti
     return RecordedMotion(time_ns, path_start_ns, place, velocity, heading_rad, turn_rad_s, odometry)
 
 
-def _extrapolated(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
+def _extrapolate(place_m: Vector, velocity_m_s: Vector, for_s: float) -> Vector:
     (east, north, up), (e, n, u) = place_m, velocity_m_s
     return east + e * for_s, north + n * for_s, up + u * for_s
 

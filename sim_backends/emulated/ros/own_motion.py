@@ -92,7 +92,7 @@ class Odometer:
         if self._path is not None:
             motion = _motion_on(self._path, AT_REST, now_ns)
             yaw_rad = -motion.yaw_rad
-            x_m, y_m = _rotated(motion.x_m, motion.y_m, yaw_rad)
+            x_m, y_m = _rotate(motion.x_m, motion.y_m, yaw_rad)
             self._base = OwnMotion(-x_m, -y_m, yaw_rad)
 
     def at(self, now_ns: int) -> OwnMotion:
@@ -149,7 +149,7 @@ def _motion_on(path: AssignedPath, base: OwnMotion, now_ns: int) -> OwnMotion:
     elif elapsed_ns > 0 and len(points_m) > 1:
         before, last = points_m[-2:]
         heading_rad = math.atan2(last[1] - before[1], last[0] - before[0])
-    x_m, y_m = _rotated(east_m - points_m[0][0], north_m - points_m[0][1], base.yaw_rad - path.facing_rad)
+    x_m, y_m = _rotate(east_m - points_m[0][0], north_m - points_m[0][1], base.yaw_rad - path.facing_rad)
     return OwnMotion(
         base.x_m + x_m,
         base.y_m + y_m,
@@ -171,7 +171,7 @@ def _height_m(path: AssignedPath, elapsed_ns: int) -> float:
     return path.points_m[-1][2]
 
 
-def _rotated(x: float, y: float, angle_rad: float) -> tuple[float, float]:
+def _rotate(x: float, y: float, angle_rad: float) -> tuple[float, float]:
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     return cos * x - sin * y, sin * x + cos * y
 

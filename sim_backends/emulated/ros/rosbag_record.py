@@ -26,7 +26,7 @@ class Options:
         topics: Names of the topics.
         all_topics: Record every published topic.
         prefix: Prefix of the bag's name, before the date.
-        name: Name of the bag; None for a name from the prefix and the date.
+        name: Name of the bag; if it is None, the name consists of the prefix and the date.
         duration_s: Stop after this time.
         limit: Stop each topic after this number of messages; 0 for no limit.
         chunk_bytes: Size of a chunk of the bag.

@@ -74,7 +74,7 @@ class Record:
         fd: Descriptor of the file, which this object closes.
 
     Attributes:
-        layout: Layout of the values, as for `Slots`.
+        layout: Layout of the values; see `Slots`.
     """
 
     layout: ClassVar[str]

@@ -1,6 +1,6 @@
 """Static transforms of an emulated robot: the content of `/tf_static` (REP 105, tf2_ros.StaticTransformBroadcaster).
 
-All its sensors measure at the robot's position, whatever their frame is named, so every transform is the identity.
+All its sensors measure at the robot's position, whatever the name of their frame, so every transform is the identity.
 """
 
 import struct
@@ -31,8 +31,8 @@ def links(sensors: Iterable[Sensor]) -> tuple[Link, ...]:
         return ()
     child_frames = [sensor.child_frame for sensor in sensors if sensor.child_frame]
     base = child_frames[0] if child_frames else BASE
-    excluded = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
-    frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded)
+    excluded_frames = {base, BASE, *_WORLDS, *(sensor.frame for sensor in sensors if sensor.child_frame)}
+    frames = dict.fromkeys(sensor.frame for sensor in sensors if sensor.frame not in excluded_frames)
     base_links = [(base, BASE)] if base != BASE else []
     return (*base_links, *((BASE, frame) for frame in frames))
 

@@ -11,7 +11,7 @@ Check = Callable[[Target], None]
 
 
 @dataclass(frozen=True)
-class CheckResult:
+class ConformanceResult:
     """The result of a check.
 
     Attributes:
@@ -42,13 +42,13 @@ def checks(*, is_physics: bool) -> dict[str, Check]:
     }
 
 
-def run_checks(target: Target) -> Iterator[CheckResult]:
+def run_checks(target: Target) -> Iterator[ConformanceResult]:
     """Run all checks of the target's role, each with new federates, and yield their results."""
     for name, check in checks(is_physics=target.is_physics).items():
         yield run_check(target, name, check)
 
 
-def run_check(target: Target, name: str, check: Check) -> CheckResult:
+def run_check(target: Target, name: str, check: Check) -> ConformanceResult:
     """Run one check."""
     meaning = (check.__doc__ or "").partition("\n")[0]
     failure = skipped = ""
@@ -63,5 +63,5 @@ def run_check(target: Target, name: str, check: Check) -> CheckResult:
     finally:
         target.close()
     if not failure:
-        return CheckResult(name, meaning, skipped=skipped)
-    return CheckResult(name, meaning, failure, "", target.exchange["request"], target.exchange["answer"])
+        return ConformanceResult(name, meaning, skipped=skipped)
+    return ConformanceResult(name, meaning, failure, "", target.exchange["request"], target.exchange["answer"])

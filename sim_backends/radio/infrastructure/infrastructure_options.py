@@ -38,7 +38,7 @@ class RoamingOptions(Strict):
         home: Time on the current channel between two others.
         handshake: True for the 4-way handshake of WPA2 after each association; `false` for an open network.
         processing: Time of a station or access point from the reception of a frame of an association until it sends
-            the next one. Our choice.
+            the next one. The default is an assumption.
     """
 
     short: Annotated[Duration, Field(gt=0)] = 30.0
@@ -82,8 +82,8 @@ class MicrowaveOvenOptions(Strict):
     Attributes:
         at_m: Its position, metres east and north.
         mains_hz: Frequency of the mains.
-        power_dbm: Power that it radiates into the robots' channel while it is on. Our choice; ovens differ by tens of
-            dB.
+        power_dbm: Power that it radiates into the robots' channel while it is on. The default is an assumption; ovens
+            differ by tens of dB.
         height: Its height above the ground.
     """
 

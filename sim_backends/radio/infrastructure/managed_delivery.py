@@ -209,8 +209,10 @@ class ManagedDelivery(PacketDelivery[Payload]):
     def count_broadcast(self, now_ns: int, transmitter: int, frame: Frame[Payload], received: list[int]) -> None:
         if isinstance(frame.payload, ManagementFrame):
             return
-        accepted = [index for index in received if self._accepts(index, frame)]
-        self.count_receptions(now_ns, transmitter, frame, accepted, self._broadcast_receivers.pop(frame, self.robots))
+        accepting_robots = [index for index in received if self._accepts(index, frame)]
+        self.count_receptions(
+            now_ns, transmitter, frame, accepting_robots, self._broadcast_receivers.pop(frame, self.robots)
+        )
 
     @override
     def lose(self, now_ns: int, transmitter: int, frame: Frame[Payload], reason: str) -> None:

@@ -71,7 +71,7 @@ def test_expectations_of_trials_under_one_condition_are_judged_together(
         [" rtt_median_s > 1 us", "tcp"], [" rtt_median_s > 1 us", "udp"], [" tcp rtt_loss < 2 %", "tcp"],
     ]  # fmt: skip
     assert output.out.count("  holds\n") == 2
-    assert "1: an expectation is left out: the expected figure 'no_such' does not exist" in output.err.replace(
+    assert "1: an expectation is omitted: the expected figure 'no_such' does not exist" in output.err.replace(
         f"/{LOSSY.name}", ""
     )
     assert "expected" not in output_of(capsys, str(tmp_path), "--quantity", "datagram_loss")

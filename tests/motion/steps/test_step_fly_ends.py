@@ -148,7 +148,7 @@ def test_pilot_and_guard_notice_within_a_second_that_the_other_does_not_run(
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError):
             fly(shell, port, "60min", send_signal)
-        wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+        wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
         evidence.end_jobs(shell, FOLDER)
     (seen_s,) = (seen_s for seen_s, text in log_lines(shell, watcher) if text.startswith("land: the "))
     assert seen_s - at_s[0] < 1.0
@@ -164,12 +164,12 @@ def test_flight_continues_without_its_link_server(shell: Shell, number: signal.S
                 ended.extend(servers(connection))
                 os.kill(ended[0], number)
                 wait_until(lambda: bool({*servers(connection)} - {*ended}), Deadline.after(60))
-                assert autopilot.vehicle.armed, "the server was replaced in flight"
+                assert autopilot.vehicle.is_armed, "the server was replaced in flight"
 
         fly(shell, port, "5s", send_signal)
         assert len(ended) == 1
         assert autopilot.vehicle.body.on_ground
-        assert not autopilot.vehicle.armed
+        assert not autopilot.vehicle.is_armed
     wait_for_end(set(ended), within_s=30.0)
     assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
@@ -193,7 +193,7 @@ def test_flight_continues_after_restart_of_its_router(shell: Shell) -> None:
 
         fly(shell, f"tcp:127.0.0.1:{router.tcp}", "5s", restart)
         assert autopilot.vehicle.body.on_ground
-        assert not autopilot.vehicle.armed
+        assert not autopilot.vehicle.is_armed
         assert restarts
         assert router.accepted == 2, "the connection of the link server, and the one after the restart"
     assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
@@ -208,12 +208,12 @@ def test_flight_continues_after_serial_device_was_missing_for_two_seconds(shell:
             if not back.ident:
                 usb.pull_out()
                 back.start()
-                assert autopilot.vehicle.armed
+                assert autopilot.vehicle.is_armed
 
         fly(shell, f"{usb.path}:115200", "5s", pull_out)
         back.join()
         assert autopilot.vehicle.body.on_ground
-        assert not autopilot.vehicle.armed
+        assert not autopilot.vehicle.is_armed
     assert silent_lines(shell) >= 3, "no positions arrived during the interruption"
     assert [text for _, text in log_lines(shell, "fly")][-1] == "landed"
 
@@ -239,7 +239,7 @@ def test_guard_lands_drone_whose_pilot_does_not_run(shell: Shell, number: signal
     with drones.autopilot_at_udp(firmware=firmware) as (port, autopilot):
         with pytest.raises(RobotError, match="ended with exit code 137"):
             fly(shell, port, "60min", send_signal)
-        wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+        wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
         assert autopilot.vehicle.body.on_ground
         wait_until(lambda: any(text == "landed" for _, text in log_lines(shell, "guard")), Deadline.after(60))
     ((pid, at_s),) = target
@@ -259,7 +259,7 @@ def test_pilot_lands_drone_whose_guard_does_not_run(shell: Shell, number: signal
     with drones.autopilot_at_udp(firmware=ARDUCOPTER) as (port, autopilot):
         with pytest.raises(RobotError, match="its flight ended early: the guard "):
             fly(shell, port, "60min", send_signal)
-        wait_until(lambda: not autopilot.vehicle.armed, Deadline.after(60))
+        wait_until(lambda: not autopilot.vehicle.is_armed, Deadline.after(60))
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
         if number == signal.SIGSTOP:
             os.kill(guards[0], signal.SIGCONT)
@@ -277,7 +277,7 @@ def test_no_program_commands_a_drone_after_takeover_by_a_person(shell: Shell) ->
         evidence.end_jobs(shell, FOLDER)
         wait_until(lambda: jobs.list_running(shell, Deadline.after(30)) == (), Deadline.after(60))
         assert autopilot.vehicle.mode is Mode.LOITER
-        assert autopilot.vehicle.armed
+        assert autopilot.vehicle.is_armed
         assert not autopilot.vehicle.body.on_ground
 
 
@@ -293,7 +293,7 @@ def test_arducopter_returns_after_its_lease_expired(shell: Shell) -> None:
 
         with pytest.raises(LinkError, match="out of range"):
             fly(shell, port, "1ms", cut, OnAbort.RETURN)
-        wait_until(lambda: not vehicle.armed, Deadline.after(60))
+        wait_until(lambda: not vehicle.is_armed, Deadline.after(60))
         assert math.hypot(*vehicle.body.position_m[:2]) < NEAR_M, "at the take-off point"
         shell.is_cut = False
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
@@ -308,4 +308,4 @@ def test_stop_of_all_jobs_lets_the_pilot_land(shell: Shell) -> None:
             fly(shell, port, "60min", lambda: evidence.end_jobs(shell, FOLDER))
         wait_until(lambda: "landed" in log(shell), Deadline.after(60))
         assert "land: the job was cancelled" in log(shell)
-        assert not autopilot.vehicle.armed
+        assert not autopilot.vehicle.is_armed

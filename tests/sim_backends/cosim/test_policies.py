@@ -266,7 +266,7 @@ def test_a_window_that_is_not_a_positive_time_is_refused(window_s: float) -> Non
 
 
 def test_a_window_below_the_physics_step_is_refused() -> None:
-    with pytest.raises(PolicyError, match="own step of 1000000 ns"):
+    with pytest.raises(PolicyError, match="step of the physics, 1000000 ns"):
         passing(SlidingWindow(0.0005))
 
 

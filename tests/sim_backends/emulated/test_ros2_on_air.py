@@ -223,7 +223,7 @@ def test_a_real_ros_2_receives_the_right_values_over_the_medium(
     assert battery["percentage"] == pytest.approx(0.8)
     assert math.isnan(battery["current"])
     # A scan is 2.9 kB, in two fragments.
-    assert multicast.medium.stats().ports["turtlebot-1"].read >= 2 * COUNT
+    assert multicast.medium.stats().ports["turtlebot-1"].sent_packets >= 2 * COUNT
 
 
 @pytest.mark.emulated

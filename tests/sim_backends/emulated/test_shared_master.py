@@ -95,7 +95,7 @@ def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: Emulate
 @pytest.mark.emulated
 def test_subscriptions_to_another_robot_cross_the_medium(emulation: EmulatedTestbed, tmp_path: Path) -> None:
     receiver = emulation.shells[Role.RECEIVER]
-    before = emulation.medium.stats().ports["turtlebot-1"].read
+    before = emulation.medium.stats().ports["turtlebot-1"].sent_packets
     in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
     bag = tmp_path / "heard.bag"
     receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
@@ -106,7 +106,7 @@ def test_subscriptions_to_another_robot_cross_the_medium(emulation: EmulatedTest
         }
     assert count >= 5
     # 2.9 kB in segments of 1,448 bytes.
-    assert emulation.medium.stats().ports["turtlebot-1"].read - before >= 3 * count
+    assert emulation.medium.stats().ports["turtlebot-1"].sent_packets - before >= 3 * count
 
 
 @pytest.mark.emulated

@@ -12,7 +12,7 @@ import pytest
 from sim_backends.federates.answering import FederateService, _FederateCopy, _Run
 from sim_backends.federates.conformance import probe
 from sim_backends.federates.conformance.probe import Target
-from sim_backends.federates.conformance.suite import CheckResult, checks, run_check
+from sim_backends.federates.conformance.suite import ConformanceResult, checks, run_check
 from sim_backends.federates.frames import NETWORK, PHYSICS, MessageKind
 from sim_backends.network.disc import Disc
 from sim_backends.network.packets import Arrival, Drop, Packet
@@ -521,7 +521,7 @@ NETWORK_CASES = [
 ]
 
 
-def run(role: int, broken: BrokenFederate) -> CheckResult:
+def run(role: int, broken: BrokenFederate) -> ConformanceResult:
     target = Target(broken.pair, replace(HELLO, role=role), windows=100)
     return run_check(target, broken.check, checks(is_physics=role == PHYSICS)[broken.check])
 

@@ -337,7 +337,7 @@ def test_no_federate_within_the_deadline() -> None:
 
 
 def test_a_federate_of_the_other_role_is_named() -> None:
-    with pytest.raises(FederateError, match="it is a physics, and a network was requested"):
+    with pytest.raises(FederateError, match="it is a physics, but a network was requested"):
         open_network(CARTS, replace(HELLO, role=NETWORK), 20.0)
     assert HELLO.role == PHYSICS
 

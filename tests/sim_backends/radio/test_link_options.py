@@ -49,7 +49,7 @@ def test_given_values_apply_to_every_link() -> None:
 
 @pytest.mark.parametrize("text", ["loss: 0%", "delay: 0ms", "rate: unlimited", "jitter: 1ms"])
 def test_one_given_value_makes_every_link_fixed(text: str) -> None:
-    assert options(text).fixed
-    assert not options("{fading: true, queue_packets: 3}").fixed
+    assert options(text).is_fixed
+    assert not options("{fading: true, queue_packets: 3}").is_fixed
     assert options("rate: unlimited").link().rate_bit_s is None
     assert options("loss: 1%").link() == LinkParameters(rate_bit_s=54_000_000, delay_ns=200_000, loss=0.01)

@@ -70,7 +70,7 @@ def test_each_receiver_of_a_packet_is_reported_exactly_once(
     radio_options = RadioOptions.model_validate(options)
     model: RadioModel[int] = (
         UniformLinks(seed, radio_options)
-        if radio_options.fixed
+        if radio_options.is_fixed
         else WifiInWorld(seed, radio_options, dict.fromkeys(NAMES, ANTENNA), None)
     )
     reports: Counter[tuple[int, str]] = Counter()

@@ -385,7 +385,7 @@ def test_text_from_a_robot_cannot_garble_the_terminal(text: str) -> None:
     ("connection", "control", "status", "detail"),
     [
         ("10.42.0.254 51000 10.42.0.1 22", Control.RADIO, OK, "as the site file states"),
-        ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not say control: radio"),
+        ("10.42.0.254 51000 10.42.0.1 22", Control.SEPARATE, WARN, "does not contain control: radio"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.SEPARATE, OK, "it connects to 192.168.1.5"),
         ("192.168.1.9 51000 192.168.1.5 22", Control.RADIO, OK, "it connects to 192.168.1.5"),
         ("", Control.SEPARATE, OK, "does not report the addresses"),

@@ -84,7 +84,7 @@ def test_a_missing_or_unknown_tool_is_rejected_with_a_remedy(tool: str) -> None:
 def test_a_killed_recorder_is_not_reported_as_missing() -> None:
     with pytest.raises(RobotError, match="rosbag record --help did not exit in time") as slow:
         tools.parse(USER + section("recorder", b"", 137), TURTLEBOT)
-    assert "is the robot busy?" in slow.value.remedy
+    assert "the robot may be busy" in slow.value.remedy
 
 
 def test_a_ping_without_permission_is_rejected_with_a_remedy() -> None:

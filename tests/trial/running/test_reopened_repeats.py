@@ -138,5 +138,5 @@ def test_a_valid_repeat_is_not_planned_again(tmp_path: Path, incomplete: set[str
 def test_altered_evidence_of_a_failed_attempt_is_not_measured_again(tmp_path: Path, incomplete: set[str]) -> None:
     folder = with_a_failed_repeat(tmp_path, incomplete)
     (folder / store.REPEATS / "tcp-01.failed3" / "ping.txt").write_text(PING, encoding="utf-8")
-    with pytest.raises(EvidenceError, match="evidence is not what was measured"):
+    with pytest.raises(EvidenceError, match="evidence has changed since it was measured"):
         resume_failed(folder)

@@ -139,8 +139,8 @@ def test_only_rebuilt_tables_get_new_checksums(trial: Path, monkeypatch: pytest.
     with (trial / "preflight.txt").open("a", encoding="utf-8") as file:
         file.write("changed\n")
     reopened(trial).summarize()
-    head, line = rows.header, rows.line
-    monkeypatch.setattr(rows, "head", lambda table: f"more,{head(table)}")
+    header, line = rows.header, rows.line
+    monkeypatch.setattr(rows, "header", lambda table: f"more,{header(table)}")
     monkeypatch.setattr(rows, "line", lambda row, table: f",{line(row, table)}")
     monkeypatch.setattr(rows, "write_summary", lambda folder, plan, table: ())
     before = verification.verify(trial)
@@ -176,7 +176,7 @@ def test_checksums_are_kept_and_differences_reported(
     assert to.differences == changes
     to.summarize()
     assert set(output_text) <= set(verification.verify(trial))
-    with pytest.raises(EvidenceError, match="the tables are not changed") as caught:
+    with pytest.raises(EvidenceError, match="so the tables are not rebuilt") as caught:
         rebuild(trial)
     assert all(text in caught.value.what for text in output_text)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
@@ -206,7 +206,7 @@ def test_no_table_is_rebuilt_from_a_changed_plan_or_journal(trial: Path, name: s
     text = (trial / name).read_text(encoding="utf-8")
     cut = "".join(text.splitlines(keepends=True)[:-1])
     (trial / name).write_text(cut if name == journal.JOURNAL_FILE else text + "\n", encoding="utf-8")
-    with pytest.raises(EvidenceError, match=f"the tables are not changed: {name}: changed"):
+    with pytest.raises(EvidenceError, match=f"so the tables are not rebuilt: {name}: changed"):
         rebuild(trial)
     assert {name: (trial / name).read_bytes() for name in tables} == tables
 
@@ -229,7 +229,7 @@ def test_too_little_memory_leaves_the_table_unchanged(
 def test_a_table_is_not_rebuilt_from_changed_evidence(trial: Path) -> None:
     (trial / store.TRIAL_CSV).write_text("gone\n", encoding="utf-8")
     change_file(trial / CHANGED)
-    with pytest.raises(EvidenceError, match=rf"evidence is not what was measured: {CHANGED}: changed"):
+    with pytest.raises(EvidenceError, match=rf"evidence has changed since it was measured: {CHANGED}: changed"):
         reopened(trial)
 
 

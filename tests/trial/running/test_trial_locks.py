@@ -63,12 +63,12 @@ def test_a_locked_robot_names_its_holder_and_is_unlocked(robot: LocalShell) -> N
         begin(robot, ANNA)
         with (
             pytest.raises(
-                RobotError, match=r"turtlebot-1: anna@one holds it since \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
+                RobotError, match=r"turtlebot-1: anna@one locked it at \d\d:\d\d:\d\d UTC, \d\.0 s ago, for trial-a"
             ) as caught,
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
-        assert re.search(r"; expires in (1 h 00 min|59 min \d\d s)$", caught.value.what)
+        assert re.search(r"; the lock expires in (1 h 00 min|59 min \d\d s)$", caught.value.what)
         assert caught.value.remedy == "wait, resume that trial if it is yours, or end it: fieldkit abort"
     with locked({Role.SENDER: robot}, BERT, sink=fail_on_event):
         begin(robot, BERT)
@@ -81,7 +81,7 @@ def test_the_holder_is_read_without_locking_the_robot(robot: LocalShell) -> None
         lock = locks.read_lock(robot)
         assert lock is not None
         assert lock.holder == ANNA
-        assert 50 < lock.left_s <= 60
+        assert 50 < lock.remaining_s <= 60
         alter(robot, (4, "0"))
         assert locks.read_lock(robot) is None, "it has expired"
     assert locks.read_lock(robot) is None
@@ -140,7 +140,7 @@ def test_a_lock_of_an_earlier_boot_expires_by_the_clock(robot: LocalShell) -> No
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         alter(robot, (2, "another-boot"), (4, "1"))
         with (
-            pytest.raises(RobotError, match="anna@one holds it"),
+            pytest.raises(RobotError, match="anna@one locked it"),
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
@@ -182,7 +182,7 @@ def test_abort_ends_jobs_of_any_trial_and_notifies_the_holder(robot: LocalShell)
             ".fieldkit/trial-a/tcp-01-1/capture",
         ]
         assert jobs.list_running(robot, Deadline.after(30)) == ()
-        with pytest.raises(RobotError, match="comes too late"):
+        with pytest.raises(RobotError, match="cannot start: the jobs of"):
             jobs.run(robot, Job(folder=FOLDER, name="ping", argv=("true",), limit_s=5, log="log"))
         with pytest.raises(
             LockLostError, match=r"^turtlebot-1: the trial was aborted by bert@two at \d\d:\d\d:\d\d UTC"
@@ -204,7 +204,7 @@ def test_a_robot_without_a_working_date_can_be_locked(robot: LocalShell, tmp_pat
     (tmp_path / "bin" / "date").chmod(0o755)
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         with (
-            pytest.raises(RobotError, match="anna@one holds it"),
+            pytest.raises(RobotError, match="anna@one locked it"),
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken")
@@ -226,7 +226,7 @@ def test_an_empty_record_hides_no_lock(robot: LocalShell) -> None:
     with locked({Role.SENDER: robot}, ANNA, sink=fail_on_event):
         (robot.home / ".fieldkit" / "lock.9").touch()
         with (
-            pytest.raises(RobotError, match="anna@one holds it"),
+            pytest.raises(RobotError, match="anna@one locked it"),
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
@@ -240,7 +240,7 @@ def test_a_robot_that_lost_its_records_is_locked_again(robot: LocalShell) -> Non
             path.unlink()
         begin(robot, ANNA)
         with (
-            pytest.raises(RobotError, match=r"somebody holds it since .*, for trial-a"),
+            pytest.raises(RobotError, match=r"unknown-user locked it at .*, for trial-a"),
             locked({Role.SENDER: robot}, BERT, sink=fail_on_event),
         ):
             raise AssertionError("taken twice")
@@ -271,7 +271,7 @@ def test_a_lock_lasts_as_long_as_a_job_may(robot: LocalShell) -> None:
         jobs.run(robot, Job(folder=FOLDER, name="long", argv=("true",), limit_s=7200, log="log"))
         lock = locks.read_lock(robot)
         assert lock is not None
-        assert lock.left_s > 7200
+        assert lock.remaining_s > 7200
         fresh = record(robot)
         jobs.run(robot, Job(folder=FOLDER, name="short", argv=("true",), limit_s=60, log="log"))
         assert record(robot) == fresh
@@ -362,7 +362,7 @@ def cast(tmp_path: Path) -> dict[Role, RobotOutOfRange]:
 
 def test_all_robots_are_locked_or_none(cast: dict[Role, RobotOutOfRange]) -> None:
     with locked({Role.SENDER: cast[Role.SENDER]}, BERT, sink=fail_on_event):
-        with pytest.raises(RobotError, match="zoe: bert@two holds it"), locked(cast, ANNA, sink=fail_on_event):
+        with pytest.raises(RobotError, match="zoe: bert@two locked it"), locked(cast, ANNA, sink=fail_on_event):
             raise AssertionError("taken")
         assert record(cast[Role.RECEIVER])[0] == "free", "locked first, in the order of names, and unlocked"
 
@@ -402,7 +402,7 @@ def test_a_second_process_with_the_token_does_not_unlock_the_robots(cast: dict[R
     anna = Holder(uuid.uuid4().hex + "_of_a_long_procedure" * 10, "anna@one", "trial-a")
     with locked_exclusively(cast, anna, sink=fail_on_event):
         with (
-            pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+            pytest.raises(ConfigurationError, match="another fieldkit process runs this trial"),
             locked_exclusively(cast, anna, sink=fail_on_event),
         ):
             raise AssertionError("two run it")

@@ -20,7 +20,9 @@ def test_rows_of_different_code_are_not_mixed(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(resumption, "code_hash", lambda: PLAN.code_sha256)
     assert resumption.resumable(TRIAL) == PLAN
     monkeypatch.setattr(resumption, "code_hash", lambda: "another")
-    with pytest.raises(ConfigurationError, match=f"started by other code .fieldkit .*, {PLAN.code_sha256}") as caught:
+    with pytest.raises(
+        ConfigurationError, match=f"started with other code .fieldkit .*, {PLAN.code_sha256}"
+    ) as caught:
         resumption.resumable(TRIAL)
     assert caught.value.where == str(TRIAL)
     assert shell_command("fieldkit", "rebuild", TRIAL) in caught.value.remedy
@@ -64,7 +66,9 @@ def test_a_self_moving_robot_needs_permission_again() -> None:
     by_hand = {role: robot.model_copy(update={"abilities": frozenset()}) for role, robot in PLAN.cast.items()}
     plan = PLAN.model_copy(update={"procedure": shipped, "cast": driving})
     resumption.require_cast(plan, driving)
-    with pytest.raises(ConfigurationError, match="moved without a person in this trial, and may not now") as caught:
+    with pytest.raises(
+        ConfigurationError, match="moves without a person in this trial, which is not permitted now"
+    ) as caught:
         resumption.require_cast(plan, by_hand)
     assert "--allow-motion" in caught.value.remedy
     # Permission to move does not matter if nothing moves the robot, or if a person does.

@@ -174,7 +174,8 @@ def test_evidence_missing_after_a_kill_is_explained(tmp_path: Path, monkeypatch:
     first = journal.ended_attempts(journal.read(folder))[0]
     assert (first.status, first.excused) == (Status.VOID, True)
     assert (
-        first.reason == f"fieldkit was killed before it had the evidence, which could not be fetched later; {message}"
+        first.reason
+        == f"fieldkit was killed before it had fetched the evidence, which could not be fetched later; {message}"
     )
 
 
@@ -194,12 +195,12 @@ def test_evidence_left_on_a_robot_is_also_reported_after_resuming(
         run_trial(of_two(), IdleTestbed(), tmp_path, events.append)
     folder = only(tmp_path)
     note = Note(
-        f"turtlebot-1: evidence that was not fetched stays on it; delete it when it is not needed: "
+        f"turtlebot-1: evidence that was not fetched stays on the robot; delete it if you do not need it: "
         f"~/.fieldkit/{folder.name}/tcp-01-1, ~/.fieldkit/{folder.name}/tcp-01-2"
     )
     assert note in events
     unfetched = folder / "repeats/tcp-01.void1" / unfetched_file(Role.SENDER)
-    assert "the link broke ?\nturtlebot-1 has it in ~/.fieldkit/" in unfetched.read_text(encoding="utf-8")
+    assert "the link broke ?\nthe evidence is on turtlebot-1 in ~/.fieldkit/" in unfetched.read_text(encoding="utf-8")
     events.clear()
     monkeypatch.setattr(Robots, "fetch", fetch)
     resume_trial(folder, IdleTestbed(), events.append)
@@ -352,7 +353,7 @@ def test_a_running_trial_is_not_rebuilt(tmp_path: Path) -> None:
     run_trial(of_two(), IdleTestbed(), tmp_path, lambda _: None)
     with (
         journal.locked(only(tmp_path)),
-        pytest.raises(ConfigurationError, match="another fieldkit runs this trial"),
+        pytest.raises(ConfigurationError, match="another fieldkit process runs this trial"),
     ):
         rebuild(only(tmp_path))
 
@@ -375,7 +376,7 @@ def test_a_trial_started_with_another_version_of_a_step_package_is_not_resumed(
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.0", "fieldkit": "stale"})
     assert resumable(folder) == trial
     monkeypatch.setattr(plugins, "versions", lambda: {"lab-steps": "1.1"})
-    with pytest.raises(ConfigurationError, match=r"started by other code \(lab-steps 1\.0\)"):
+    with pytest.raises(ConfigurationError, match=r"started with other code \(lab-steps 1\.0\)"):
         resumable(folder)
 
 

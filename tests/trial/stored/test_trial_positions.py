@@ -117,7 +117,7 @@ def test_changed_or_running_trials_accept_no_positions(trial: Path, capsys: pyte
     file = next(trial.glob("repeats/*/ping.txt"))
     file.write_bytes(file.read_bytes() + b"\n")
     code, output = output_text(capsys, "receiver=walk.csv")
-    assert (code, "the evidence is not what was measured" in output) == (4, True)
+    assert (code, "the evidence has changed since it was measured" in output) == (4, True)
     assert not list(trial.glob("positions*"))
 
 

@@ -14,8 +14,8 @@ from sim_backends.physics.body import Velocity
 from sim_backends.world.motion import GRAVITY_M_S2, State
 
 FOOT_M, EAST_M, NORTH_M = 0.3048, 6_378_137.0, 6_335_439.0  # with radii of WGS 84 at the equator, along both axes
-HOVER_S = 3.0  # before time 0, until the motors have their speed
-RATE_RAD_S = 0.75  # the model controls its turning rates, up to this one
+HOVER_S = 3.0  # hovering before time 0, in which the motors reach their speed
+RATE_RAD_S = 0.75  # maximum turning rate that the model accepts as a command
 os.environ.setdefault("JSBSIM_DEBUG", "0")  # otherwise JSBSim writes to standard output
 jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
 
@@ -39,7 +39,7 @@ class Drone:
         self.offset_m = tuple(to - at for to, at in zip(start.position_m, self.state().position_m, strict=True))
 
     def state(self):
-        """Return its state."""
+        """Return the state of the drone."""
         fdm = self.fdm
         velocity_fps = fdm["velocities/v-east-fps"], fdm["velocities/v-north-fps"], -fdm["velocities/v-down-fps"]
         east_m, north_m = EAST_M * fdm["position/long-gc-rad"], NORTH_M * fdm["position/lat-geod-rad"]
@@ -48,7 +48,7 @@ class Drone:
         return State(position_m, tuple(FOOT_M * v for v in velocity_fps), math.pi / 2 - fdm["attitude/psi-rad"])
 
     def step(self):
-        """Control it, and advance by a step."""
+        """Update the controls, and advance by one step."""
         fdm, (_, (v_e, v_n, v_u), heading_rad) = self.fdm, self.state()
         (to_e, to_n, to_u), cos, sin = self.target.velocity_m_s, math.cos(heading_rad), math.sin(heading_rad)
         east, north, up = limited(to_e - v_e, 2.0), limited(to_n - v_n, 2.0), limited(to_u - v_u, 1.0)
@@ -79,7 +79,7 @@ class Drones:
         self.drones = {agent.name: Drone(agent.start, hello.step_ns / 1e9) for agent in hello.agents}
 
     def advance(self, to_ns, commands):
-        """Return the states at the last step until `to_ns`; commands apply from the last call's time."""
+        """Return the states at the last step that is not after `to_ns`; commands apply from the previous call on."""
         if commands:
             self.commands, self.from_ns = self.commands | commands, self.last_ns
         self.last_ns = to_ns

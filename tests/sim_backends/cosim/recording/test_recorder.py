@@ -238,7 +238,7 @@ def test_a_scenario_that_is_refused_leaves_no_files(tmp_path: Path) -> None:
 
 
 def test_a_recording_is_not_overwritten(recorded: Path) -> None:
-    with pytest.raises(ConfigurationError, match="a recording already"):
+    with pytest.raises(ConfigurationError, match="already a recording"):
         record(recorded)
 
 

@@ -162,7 +162,7 @@ def test_a_robot_that_drives_cannot_follow_several_leaders(tmp_path: Path) -> No
     error = error_of(text, tmp_path)
     assert "does not fly, and only robots that fly follow several leaders" in error.what
     assert error.where.endswith(":14")
-    assert error.remedy == "name one of one, three"
+    assert error.remedy == "choose one of one, three"
 
 
 def test_an_unknown_scenario_is_reported_with_the_existing_ones() -> None:
@@ -178,23 +178,35 @@ TOO_FAST = [
     (
         "husky",
         "kind: way-points, points_m: [[20, 10]], speed: 1.01m/s",
-        "a speed of 1.01 m/s, and husky reaches 1 m/s",
+        "a speed of 1.01 m/s, but husky reaches at most 1 m/s",
     ),
-    ("husky", "kind: velocity-profile, legs: [{duration: 1s, speed: 20m/s}]", "a speed of 20 m/s, .* reaches 1 m/s"),
+    (
+        "husky",
+        "kind: velocity-profile, legs: [{duration: 1s, speed: 20m/s}]",
+        "a speed of 20 m/s, .* reaches at most 1 m/s",
+    ),
     (
         "husky",
         "kind: velocity-profile, legs: [{duration: 1s, turn_deg_s: -120}]",
         "turn of 120 deg/s, .* 114.592 deg",
     ),
-    ("iris", "kind: way-points, points_m: [[20, 10]], speed: 12.5m/s", "a speed of 12.5 m/s, .* reaches 12 m/s"),
+    (
+        "iris",
+        "kind: way-points, points_m: [[20, 10]], speed: 12.5m/s",
+        "a speed of 12.5 m/s, .* reaches at most 12 m/s",
+    ),
     (
         "iris",
         "kind: way-points, points_m: [[11, 10, 90]], speed: 4m/s",
-        "a climb rate of 3.91.* m/s, .* 3 m/s at most",
+        "a climb rate of 3.91.* m/s, .* at most 3 m/s",
     ),
     ("iris", "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: -2}]", "a sink rate of 2 m/s, .* 1.5 m/s"),
-    ("husky", "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: 0.1}]", "climb rate of 0.1 m/s, .* 0 m/s at"),
-    ("iris", "kind: velocity-profile, legs: [{duration: 1s, turn_deg_s: -5}]", "turn of 5 deg/s, .* 0 deg/s at most"),
+    (
+        "husky",
+        "kind: velocity-profile, legs: [{duration: 1s, climb_m_s: 0.1}]",
+        "climb rate of 0.1 m/s, .* at most 0 m/s",
+    ),
+    ("iris", "kind: velocity-profile, legs: [{duration: 1s, turn_deg_s: -5}]", "turn of 5 deg/s, .* at most 0 deg/s"),
 ]
 
 
@@ -251,7 +263,7 @@ def test_a_run_that_needs_too_much_memory_is_refused_with_both_sizes(
     # bytes each; and there are three pairs of agents.
     assert checks.needed_bytes(load_scenario(_written(SCENARIO, tmp_path))) == 120 * 1200 + 3200 * 40 + 3 * 1600
     error = error_of(SCENARIO.replace("rate: 10Hz", "rate: 1kHz"), tmp_path)
-    assert "2 s of 3 agents would need 3.4 MB of memory, and 1.0 MB are available" in error.what
+    assert "2 s of 3 agents would need 3.4 MB of memory, but only 1.0 MB are available" in error.what
     assert "choose a shorter duration, or send less: one-stream alone has 2,000 packets" in error.remedy
     assert error.where.endswith(":4")
     monkeypatch.setattr(checks, "MEMINFO", tmp_path / "none")
@@ -268,7 +280,7 @@ def test_too_many_agents_for_the_memory_are_refused_before_they_are_built(
     monkeypatch.setattr(checks, "MEMINFO", meminfo)
     # 44,850 pairs need 72 MB. If the bodies were built, the error would be that all are in one place.
     error = error_of(f"{text}{agents}  one: {rest}", tmp_path)
-    assert "2 s of 303 agents would need 73 MB of memory, and 72 MB are available" in error.what
+    assert "2 s of 303 agents would need 73 MB of memory, but only 72 MB are available" in error.what
     assert error.where.endswith(":7")
     assert error.remedy == "use fewer agents"
 

@@ -168,8 +168,8 @@ def test_mavproxy_flies_it_with_arducopter_s_modes(tmp_path: Path) -> None:
         wait_until(lambda: b"STABILIZE>" in output, Deadline.after(60))
         enter("mode guided", lambda: drone.mode is Mode.OFFBOARD and b"GUIDED>" in output)
         enter("param set RTL_ALT 100", lambda: b"RTL_ALT" in output)
-        enter("arm throttle", lambda: drone.armed)
+        enter("arm throttle", lambda: drone.is_armed)
         enter("takeoff 2", lambda: drone.body.position_m[2] > 1.9)
-        enter("mode rtl", lambda: not drone.armed and b"RTL>" in output)
+        enter("mode rtl", lambda: not drone.is_armed and b"RTL>" in output)
         assert drone.body.on_ground
         assert b"DISARMED" in output

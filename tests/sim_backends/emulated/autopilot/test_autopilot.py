@@ -143,9 +143,9 @@ class TestFlight:
     def test_it_disarms_if_it_does_not_take_off(self, gcs: GroundStation) -> None:
         assert gcs.command(d.MAV_CMD_COMPONENT_ARM_DISARM, 1) == OK
         gcs.wait(9)
-        assert gcs.autopilot.vehicle.armed
+        assert gcs.autopilot.vehicle.is_armed
         gcs.wait(2)
-        assert not gcs.autopilot.vehicle.armed
+        assert not gcs.autopilot.vehicle.is_armed
 
     def test_it_follows_set_points_until_they_stop(self, gcs: GroundStation) -> None:
         take_off(gcs)
@@ -204,7 +204,7 @@ class TestFlight:
         assert gcs.command(d.MAV_CMD_NAV_RETURN_TO_LAUNCH) == OK
         heights = [-message.z for message in gcs.wait(40) if message.get_type() == "LOCAL_POSITION_NED"]
         assert max(heights) == pytest.approx(10.0, abs=0.2), "RTL_RETURN_ALT"
-        assert not gcs.autopilot.vehicle.armed
+        assert not gcs.autopilot.vehicle.is_armed
         assert math.hypot(*gcs.autopilot.vehicle.body.position_m[:2]) < 0.6
 
 
@@ -305,7 +305,7 @@ class TestMission:
             position = gcs.autopilot.vehicle.body.position_m
             nearest = {place: min(distance_m, math.dist(place, position)) for place, distance_m in nearest.items()}
         assert max(nearest.values()) < 0.5
-        assert not gcs.autopilot.vehicle.armed
+        assert not gcs.autopilot.vehicle.is_armed
         if not loss:
             reached = [message.seq for message in gcs.received if message.get_type() == "MISSION_ITEM_REACHED"]
             assert list(dict.fromkeys(reached)) == [0, 1, 2, 3]
@@ -413,7 +413,7 @@ class TestHostile:
     def test_messages_to_other_systems_are_ignored(self, gcs: GroundStation, system: int, component: int) -> None:
         message = d.MAVLink_command_long_message(system, component, d.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1, *(0,) * 6)
         assert gcs.send_message(message) == []
-        assert not gcs.autopilot.vehicle.armed
+        assert not gcs.autopilot.vehicle.is_armed
 
     def test_clients_beyond_the_maximum_are_not_served(self, gcs: GroundStation) -> None:
         for port in range(2, 40):

@@ -202,7 +202,7 @@ def test_spool_up_landing_and_the_mode_afterwards(copter: Station) -> None:
             break
     down_s = (copter.now_ns - start_ns) / 1e9
     for _ in copter.poll("disarmed", 5):
-        if not copter.autopilot.vehicle.armed:
+        if not copter.autopilot.vehicle.is_armed:
             break
     assert down_s == pytest.approx(6.4, abs=0.6), "as real ArduCopter from 3 m"
     assert (copter.now_ns - start_ns) / 1e9 - down_s == pytest.approx(2.1, abs=0.2)
@@ -339,7 +339,7 @@ def test_px4_lands_with_a_low_battery_as_its_parameter_requires(px4: Station, ac
     px4.wait(20)
     assert (CRITICAL, "Critical battery") in px4.texts()
     px4.wait(15)
-    assert px4.autopilot.vehicle.armed != lands
+    assert px4.autopilot.vehicle.is_armed != lands
 
 
 @pytest.mark.parametrize(("action", "sub"), [(0, 3), (3, 5), (4, 6)])

@@ -15,4 +15,4 @@ def test_the_first_cases_pass() -> None:
             ("telemetry is recorded", True, ""),
             ("out and back", True, ""),
         ]
-        assert not autopilot.vehicle.armed
+        assert not autopilot.vehicle.is_armed

@@ -41,11 +41,11 @@ def emulation() -> Iterator[EmulatedTestbed]:
 def fly(emulation: EmulatedTestbed, program: str) -> dict[str, Any]:
     """Let a program on the sender's robot fly the drone; return its report."""
     drone = emulation.robots[Role.RELAY].spec
-    carried = emulation.medium.stats().ports[drone.name].read
+    carried = emulation.medium.stats().ports[drone.name].sent_packets
     words = (sys.executable, "-m", f"tests.helpers.{program}", drone.ip, str(drone.mavlink_port), LOSS)
     argv = ("env", f"PYTHONPATH={ROOT}", *words)
     result = emulation.shells[Role.SENDER].run(argv, deadline=Deadline.after(240))
-    assert emulation.medium.stats().ports[drone.name].read - carried > 100
+    assert emulation.medium.stats().ports[drone.name].sent_packets - carried > 100
     log = emulation.shells[Role.RELAY].run(("cat", "/run/robot/autopilot.log"), deadline=Deadline.after(10))
     assert log.stdout == b""
     report: dict[str, Any] = json.loads(result.stdout.decode().splitlines()[-1])

@@ -38,10 +38,10 @@ def test_pings_cross_the_network_with_every_policy(policy: str, tmp_path: Path) 
         bench.medium.delays(*ends)
         assert len(bench.ping()) == 20
         stats = bench.medium.stats()
-        assert stats.ports["b"].written == 20
+        assert stats.ports["b"].delivered_packets == 20
         assert stats.links["a", "b"].delivered == 20
-        assert sum(stats.late.values()) == 40
-        assert sum(stats.late_windows.values()) > 2
+        assert sum(stats.packet_lateness_counts.values()) == 40
+        assert sum(stats.window_lateness_counts.values()) > 2
 
 
 def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
@@ -53,8 +53,8 @@ def test_ns3_carries_unicast_and_broadcast_packets(tmp_path: Path) -> None:
         (sample,) = bench.medium.links(continue_sampling=False)["a"]
         bench.ping("-b", count=3, address="10.9.0.255")
         stats = bench.medium.stats()
-        assert stats.ports["b"].written == 23
-        assert stats.ports["a"].written == 20
+        assert stats.ports["b"].delivered_packets == 23
+        assert stats.ports["a"].delivered_packets == 20
     assert parts.packets == 20
     assert 20 * 30_000 < parts.transmission_ns < 20 * 20_000_000, "84 bytes, from 65 Mbit/s to 1 Mbit/s with retries"
     assert 20 * 20 < parts.propagation_ns < 20 * 40, "9 m at the speed of light"
@@ -122,11 +122,13 @@ def test_a_network_that_cannot_keep_up_makes_packets_and_windows_late(tmp_path: 
     """Each window of 1 ms takes 20 ms; after 1 s of lag the rest is given up, so that the lab still answers."""
     sync = SyncOptions.model_validate({"name": "sliding_window", "window": "1ms"})
     with cosim_bench(tmp_path, network=disc_command(tmp_path, 0.02), sync=sync) as bench:
-        wait_until(lambda: max(bench.medium.stats().late_windows, default=0) > 100_000_000, Deadline.after(60))
+        wait_until(
+            lambda: max(bench.medium.stats().window_lateness_counts, default=0) > 100_000_000, Deadline.after(60)
+        )
         bench.ping(count=2)
         stats = bench.medium.stats()
-        assert max(stats.late) > 100_000_000
-        late = Lateness(bound_ns=100_000_000, packets={}, windows=stats.late_windows)
+        assert max(stats.packet_lateness_counts) > 100_000_000
+        late = Lateness(bound_ns=100_000_000, packets={}, windows=stats.window_lateness_counts)
         reason = oracle_delays.lateness_problem(late)
         assert reason is not None
         assert re.fullmatch(r"\d+ windows of the .* too late, by up to [\d.e+]+ ms; the bound is 100 ms", reason)

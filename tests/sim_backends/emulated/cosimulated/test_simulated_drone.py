@@ -148,6 +148,6 @@ def test_a_wall_stops_it_and_without_its_autopilot_it_falls(physics: str, tmp_pa
 
         flown.bench.driven.assign((*START_M[:2], ANTENNA_M))
         flown.bench.medium.place({**PLACES, "a": (*START_M[:2], ANTENNA_M)})
-        flown.fly(lambda: not vehicle.armed)
+        flown.fly(lambda: not vehicle.is_armed)
         assert vehicle.body.place_m == START_M
         flown.take_off()

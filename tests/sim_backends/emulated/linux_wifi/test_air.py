@@ -61,7 +61,7 @@ def test_a_frame_takes_its_airtime_and_that_of_its_acknowledgement(stage: RateSt
     air.transmit(START_NS, frame(stage), "a", "b")
     events, end_ns = run(air)
     (status,), (reception,) = events.statuses, events.receptions
-    assert status.acknowledged
+    assert status.is_acknowledged
     assert (reception.receiver, reception.mode) == ("b", mode)
     assert reception.signal_dbm == status.signal_dbm == round(signal_dbm(3.0))
     expected_ns = reception.mode.airtime_ns(LENGTH_BYTES + 4) + SIFS_NS + ack_ns(reception.mode)
@@ -97,7 +97,7 @@ def test_all_tries_fail_out_of_range_and_need_airtime() -> None:
     events, end_ns = run(air)
     (status,) = events.statuses
     assert not events.receptions
-    assert not status.acknowledged
+    assert not status.is_acknowledged
     assert status.chain.tries_made(status.attempts) == [2, 3]
     assert end_ns - START_NS > 2 * G54.airtime_ns(LENGTH_BYTES) + 3 * G6.airtime_ns(LENGTH_BYTES)
 
@@ -107,7 +107,7 @@ def test_a_frame_to_an_address_of_no_other_radio_is_not_acknowledged(receiver: s
     air = air_with(3.0)
     air.transmit(START_NS, frame(RateStage(11, 4)), "a", receiver)
     (status,) = run(air)[0].statuses
-    assert (status.acknowledged, status.attempts) == (False, 4)
+    assert (status.is_acknowledged, status.attempts) == (False, 4)
 
 
 def test_a_frame_that_wants_no_acknowledgement_is_tried_once() -> None:
@@ -124,7 +124,7 @@ def test_a_broadcast_arrives_at_all_in_range_without_acknowledgement() -> None:
     events, _ = run(air)
     assert sorted(reception.receiver for reception in events.receptions) == ["b", "c"]
     (status,) = events.statuses
-    assert (status.acknowledged, status.chain.tries_made(status.attempts)) == (False, [1])
+    assert (status.is_acknowledged, status.chain.tries_made(status.attempts)) == (False, [1])
 
 
 def test_a_rate_that_the_model_does_not_have_fails_without_airtime() -> None:
@@ -132,7 +132,7 @@ def test_a_rate_that_the_model_does_not_have_fails_without_airtime() -> None:
     air.transmit(START_NS, frame(RateStage(15, 2, RATE_MCS)), "a", "b")
     events = air.pop_events(START_NS)
     (status,) = events.statuses
-    assert (status.acknowledged, status.attempts, events.receptions) == (False, 0, [])
+    assert (status.is_acknowledged, status.attempts, events.receptions) == (False, 0, [])
 
 
 def test_radios_hear_each_other_only_on_one_channel_until_they_return_to_it() -> None:
@@ -141,7 +141,7 @@ def test_radios_hear_each_other_only_on_one_channel_until_they_return_to_it() ->
     def is_acknowledged(source: str, receiver: str, frequency_mhz: int) -> bool:
         air.transmit(next(times_ns), frame(RateStage(4, 1), frequency_mhz=frequency_mhz), source, receiver)
         (status,) = run(air)[0].statuses
-        return status.acknowledged
+        return status.is_acknowledged
 
     results = [
         is_acknowledged("a", "b", 2437),  # b has not sent, so it may be on any channel
@@ -161,7 +161,7 @@ def test_frames_sent_together_wait_for_each_other() -> None:
     assert not air.pop_events(START_NS).statuses  # a is on the air
     air.transmit(START_NS + 100_000, frame(RateStage(4, 1)), "c", "b")
     events, end_ns = run(air)
-    assert [status.acknowledged for status in events.statuses] == [True, True]
+    assert [status.is_acknowledged for status in events.statuses] == [True, True]
     assert end_ns - START_NS > 2 * G6.airtime_ns(LENGTH_BYTES)
 
 
@@ -172,9 +172,9 @@ def test_hidden_radios_collide() -> None:
     air.place(0, {"a": (-distance_m, 0.0, 1.0), "b": (0.0, 0.0, 1.0), "c": (distance_m, 0.0, 1.0)})
     for source in "ac":
         air.transmit(START_NS, frame(RateStage(4, 1)), source, "b")
-    assert [status.acknowledged for status in run(air)[0].statuses] == [False, False]
+    assert [status.is_acknowledged for status in run(air)[0].statuses] == [False, False]
     air.transmit(1_000_000_000, frame(RateStage(4, 1)), "a", "b")
-    assert [status.acknowledged for status in run(air)[0].statuses] == [True]
+    assert [status.is_acknowledged for status in run(air)[0].statuses] == [True]
 
 
 def test_more_frames_than_the_queue_holds_are_reported_as_failed() -> None:
@@ -182,7 +182,7 @@ def test_more_frames_than_the_queue_holds_are_reported_as_failed() -> None:
     for _ in range(6):
         air.transmit(START_NS, frame(RateStage(11, 1)), "a", "b")
     statuses: list[FrameOnAir] = run(air)[0].statuses
-    assert sorted(status.acknowledged for status in statuses) == [False] * 3 + [True] * 3
+    assert sorted(status.is_acknowledged for status in statuses) == [False] * 3 + [True] * 3
 
 
 @pytest.mark.parametrize("names", ["", ("a", "")])

@@ -145,7 +145,7 @@ def test_errors_of_the_kernel_and_messages_of_unknown_radios_are_counted() -> No
     medium.receive(START_NS, sent(9, interface(1)))
     medium.receive(START_NS, message(encode_generic(CMD_ADD_MAC_ADDR, 1, {1: interface(9), 2: radio(9)})))
     assert medium.counts.errors == {22: 1}
-    assert medium.counts.rejected == 3
+    assert medium.counts.rejected_messages == 3
     assert not list(results(medium))
 
 
@@ -154,7 +154,7 @@ def test_a_frame_on_no_wifi_channel_is_rejected(frequency_mhz: int) -> None:
     medium = new_medium()
     frame = SentFrame(radio(0), bytes(30), 0, frequency_mhz, (), 1)
     medium.receive(START_NS, message(encode_sent(frame)))
-    assert medium.counts.rejected == 1
+    assert medium.counts.rejected_messages == 1
 
 
 @given(st.binary(max_size=200))
@@ -187,4 +187,4 @@ def test_messages_of_a_real_kernel_get_a_status_each() -> None:
             assert commands.count(CMD_FRAME) == 2 * is_frame
             frames += is_frame
     assert frames == 24
-    assert medium.counts.rejected == 0
+    assert medium.counts.rejected_messages == 0

@@ -16,7 +16,7 @@ from sim_backends.emulated.linux_wifi.hwsim_messages import (
     RateStage,
     SentFrame,
     decode_event,
-    encode_received,
+    encode_reception,
     encode_register,
     encode_sent,
     encode_status,
@@ -54,13 +54,13 @@ def test_a_received_frame_has_the_bytes_computed_by_hand() -> None:
         + bytes.fromhex("0800 0500 0b000000  0800 0600 b0ffffff  0800 1300 85090000")
     )
     receiver = RadioAddress(bytes.fromhex("420000000000"))
-    assert encode_received(SENT, receiver, rate_index=11, signal_dbm=-80) == expected
+    assert encode_reception(SENT, receiver, rate_index=11, signal_dbm=-80) == expected
 
 
 def test_a_control_frame_is_not_passed_on_because_the_kernel_rejects_it() -> None:
     acknowledgement = SentFrame(RADIO, FRAME[:10], 0, 2437, (), 1)
     assert acknowledgement.transmitter is None
-    assert encode_received(acknowledgement, RADIO, rate_index=0, signal_dbm=-50) is None
+    assert encode_reception(acknowledgement, RADIO, rate_index=0, signal_dbm=-50) is None
 
 
 def test_a_sent_frame_is_decoded_with_its_rate_chain() -> None:
@@ -82,7 +82,7 @@ def test_a_kernel_that_sends_no_rate_flags_is_understood() -> None:
 def test_the_address_of_an_interface_is_the_attribute_receiver() -> None:
     interface = bytes.fromhex("020000000100")
     event = decode_event(encode_generic(CMD_ADD_MAC_ADDR, 1, {1: interface, 2: RADIO}))
-    assert event == InterfaceAddress(RADIO, interface, added=True)
+    assert event == InterfaceAddress(RADIO, interface, is_added=True)
 
 
 def test_other_commands_are_no_events() -> None:

@@ -74,6 +74,6 @@ def test_any_chain_has_few_tries_and_its_report_adds_up(
     assert len(chain.modes) <= max_tries
     for attempts in range(1, len(chain.modes) + 1):
         tries = chain.tries_made(attempts)
-        on_air = sum(count for count, skipped in zip(tries, chain.skipped, strict=False) if not skipped)
+        on_air = sum(count for count, skipped in zip(tries, chain.is_skipped, strict=False) if not skipped)
         assert on_air == attempts
         assert all(0 <= count <= 255 for count in tries)

@@ -126,4 +126,4 @@ def test_a_frame_out_of_range_is_lost_and_an_unknown_address_is_counted(
     assert ends["b"].recv(2000) == last
     stats = medium.stats()
     assert stats.links["a", "c"].lost == 1
-    assert (stats.ports["a"].unroutable, stats.ports["c"].written) == (1, 0)
+    assert (stats.ports["a"].unroutable_packets, stats.ports["c"].delivered_packets) == (1, 0)
