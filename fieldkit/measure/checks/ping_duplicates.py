@@ -5,7 +5,7 @@ The captures are on all interfaces (`LINUX_SLL2`), so each packet has the index 
 
 from collections import Counter
 from collections.abc import Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from fieldkit.core.units import format_count
 from fieldkit.measure.captures.arrays import Ints
 from fieldkit.measure.captures.headers import NO_INTERFACE
 from fieldkit.measure.captures.packets import ECHO_REPLY, NO_ECHO, Packets
+from fieldkit.measure.captures.pcap import Capture
 from fieldkit.measure.evidence.ping import Ping
 
 COLUMNS: Final = columns(
@@ -35,23 +36,60 @@ _WAIT_SHARE: Final = 0.9
 """As in `ping_checks`: the part of the last interval in which ping certainly prints replies."""
 
 
-def measure(requests: Packets | None, replies: Packets | None) -> Measured:
+class Echoes(NamedTuple):
+    """Echoes of a ping in one capture.
+
+    Attributes:
+        requests: Its requests.
+        replies: The replies to them.
+    """
+
+    requests: Packets
+    replies: Packets
+
+    @property
+    def are_fragmented(self) -> bool:
+        """Whether an echo is fragmented."""
+        return bool(self.requests.more_fragments.any() or self.replies.more_fragments.any())
+
+
+def captured_echoes(capture: Capture | None, source: str, destination: str, size_bytes: int) -> Echoes | None:
+    """Return the echoes between two addresses in a capture; None without a capture.
+
+    Args:
+        capture: The capture.
+        source: Source address of the requests.
+        destination: Their destination address.
+        size_bytes: Their ICMP size; echoes of another size belong to another ping.
+    """
+    if capture is None:
+        return None
+    outgoing, returning = capture.packets.icmp(source, destination), capture.packets.icmp(destination, source)
+    requests = outgoing.where((outgoing.echo != NO_ECHO) & (outgoing.echo < ECHO_REPLY))
+    replies = returning.where(returning.echo >= ECHO_REPLY)
+    requests, replies = (
+        echoes.where(echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes))
+        for echoes in (requests, replies)
+    )
+    return Echoes(requests, replies)
+
+
+def measure(sender: Echoes | None, receiver: Echoes | None) -> Measured:
     """Return the column of the copies.
 
     Args:
-        requests: Requests in the receiver's capture; None if it is missing or incomplete.
-        replies: Replies in the sender's capture; None as above.
+        sender: Echoes in the sender's capture; None if it is missing or incomplete.
+        receiver: Echoes in the receiver's capture; None as above.
     """
-    reason = ""
-    if requests is None or replies is None:
-        reason = "a robot has no complete capture around the ping"
-    elif any((echoes.interface == NO_INTERFACE).any() for echoes in (requests, replies)):
+    if sender is None or receiver is None:
+        return Measured.all_missing(COLUMNS, "a robot has no complete capture around the ping")
+    if sender.are_fragmented or receiver.are_fragmented:
+        return Measured.all_missing(COLUMNS, "the requests are fragmented")
+    arrived = receiver.requests, sender.replies
+    if any((echoes.interface == NO_INTERFACE).any() for echoes in arrived):
         reason = "a capture does not contain interfaces: it needs a link with the interface lo, and tcpdump 4.99"
-    elif any(echoes.more_fragments.any() for echoes in (requests, replies)):
-        reason = "the requests are fragmented"
-    if reason or requests is None or replies is None:
         return Measured.all_missing(COLUMNS, reason)
-    return Measured({"rtt_duplicates": count_copies(requests) + count_copies(replies)})
+    return Measured({"rtt_duplicates": sum(map(count_copies, arrived))})
 
 
 def count_copies(echoes: Packets) -> int:
@@ -60,19 +98,17 @@ def count_copies(echoes: Packets) -> int:
     return len(np.unique(rows, axis=1).T) - len(np.unique(rows[0]))
 
 
-def contradictions(
-    output: Ping, interval_s: float, sender: tuple[Packets, Packets], receiver: tuple[Packets, Packets]
-) -> Iterator[str]:
+def contradictions(output: Ping, interval_s: float, sender: Echoes | None, receiver: Echoes | None) -> Iterator[str]:
     """Yield the contradictions between the copies in the captures, the output of ping, and the answers.
 
     Args:
         output: The output.
         interval_s: Time between requests.
-        sender: Requests and replies in the sender's capture.
-        receiver: Requests and replies in the receiver's capture.
+        sender: Echoes in the sender's capture; None if it is missing or incomplete.
+        receiver: Echoes in the receiver's capture; None as above.
     """
-    if any(echoes.more_fragments.any() for echoes in (*sender, *receiver)):
-        return  # a copy may lack fragments
+    if sender is None or receiver is None or sender.are_fragmented or receiver.are_fragmented:
+        return  # a copy of a fragmented echo may be incomplete
     sent, arrived = sender
     if len(sent):
         until_ns = int(sent.time_ns.max()) + round(1e9 * (_WAIT_SHARE * interval_s - _UNREAD_S))
@@ -88,13 +124,6 @@ def contradictions(
     if unrequested:
         answers_text = format_count(unrequested.total(), "answer")
         yield f"the receiver's capture has {answers_text} to requests that it lacks"
-
-
-def sized_echoes(packets: Packets, source: str, destination: str, size_bytes: int | None) -> Packets:
-    """Return the echoes from one address to another, of one ICMP size or fragmented."""
-    echoes = packets.icmp(source, destination)
-    has_size = echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes)
-    return echoes.where((echoes.echo != NO_ECHO) & has_size)
 
 
 def _keys(echoes: Packets) -> Ints:

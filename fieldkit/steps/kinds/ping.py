@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Annotated, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final, Self
 
 import numpy as np
 from typing_extensions import override
@@ -30,6 +30,9 @@ from fieldkit.steps.scene import Announce, Flow, Need, PingSource, Planned, Refu
 from fieldkit.steps.surroundings import EarlierStep, EnclosingStep
 from fieldkit.steps.variants import PingTool, Tool
 from fieldkit.steps.view import View, capture_around
+
+if TYPE_CHECKING:
+    from fieldkit.measure.checks.ping_duplicates import Echoes
 
 LAST_REPLY_S: Final = 2
 MAX_SEQUENCE_COUNT: Final = 0xFFFF
@@ -207,7 +210,10 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             for reason in ping_checks.check_output(result, self.count, payload_bytes, window)
         )
         if self.duplicates:
-            yield from self._duplicate_contradictions(result, view)
+            from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+
+            reasons = ping_duplicates.contradictions(result, self.interval, *self._captured_echoes(view))
+            yield from (f"{self._file}: {reason}" for reason in reasons)
         if result.received is not None and result.received != len(result.answers):
             yield f"{self._file}: ping counted {result.received} answers and printed {len(result.answers)}"
         # iputils reports 0 for a negative time, and "time of day goes back" in its log.
@@ -247,28 +253,14 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             ]
             yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
 
-    def _echoes(self, role: Role, view: View) -> tuple[Packets, Packets] | None:
-        """Return the requests and the replies in a robot's capture; None if it is missing or incomplete."""
-        from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
+    def _captured_echoes(self, view: View) -> "tuple[Echoes | None, ...]":
+        """Return the echoes in the captures of sender and receiver; None if one is missing or incomplete."""
+        from fieldkit.measure.checks.ping_duplicates import captured_echoes  # noqa: PLC0415 (only if needed)
 
-        capture = view.capture(role)
-        if capture is None:
-            return None
         source, destination = (view.scene.link(end, self.over).address for end in (self.sender, self.receiver))
         size_bytes = self.payload_of(view.scene.protocol) + _HEADER_BYTES
-        requests, replies = (
-            ping_duplicates.sized_echoes(capture.packets, *ends, size_bytes)
-            for ends in ((source, destination), (destination, source))
-        )
-        return requests.where(requests.echo < ECHO_REPLY), replies.where(replies.echo >= ECHO_REPLY)
-
-    def _duplicate_contradictions(self, result: Ping, view: View) -> Iterator[str]:
-        from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (as above)
-
-        sender, receiver = (self._echoes(role, view) for role in (self.sender, self.receiver))
-        if sender is not None and receiver is not None:
-            reasons = ping_duplicates.contradictions(result, self.interval, sender, receiver)
-            yield from (f"{self._file}: {reason}" for reason in reasons)
+        captures = (view.capture(role) for role in (self.sender, self.receiver))
+        return tuple(captured_echoes(capture, source, destination, size_bytes) for capture in captures)
 
     def _packets_missing_in_capture(self, result: Ping, role: Role, view: View) -> Iterator[str]:
         """Yield a reason if ping printed more answers, or more answered requests, than a capture contains.
@@ -342,8 +334,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
         if self.duplicates:
             from fieldkit.measure.checks import ping_duplicates  # noqa: PLC0415 (only with `duplicates: true`)
 
-            sent, received = (self._echoes(role, view) for role in (self.sender, self.receiver))
-            duplicates = ping_duplicates.measure(received and received[0], sent and sent[1])
+            duplicates = ping_duplicates.measure(*self._captured_echoes(view))
         return (
             ping.measure(result)
             | gap

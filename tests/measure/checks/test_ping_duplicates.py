@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.headers import COOKED_V2
-from fieldkit.measure.captures.packets import Packets
 from fieldkit.measure.checks import ping_duplicates
+from fieldkit.measure.checks.ping_duplicates import Echoes
 from fieldkit.measure.evidence.ping import Ping, Reply
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4
 
@@ -40,11 +40,16 @@ class Echo:
         return Frame(START_NS + round(1e9 * INTERVAL_S) * self.seq + self.at_ns, cooked + packet)
 
 
-def captured(*echoes: Echo) -> tuple[Packets, Packets]:
-    """Return the requests and the replies in a capture of these echoes."""
-    packets = pcap.parse(file_bytes([echo.frame() for echo in echoes], link_type=COOKED_V2), where="x").packets
-    requests = ping_duplicates.sized_echoes(packets, SENDER, RECEIVER, PAYLOAD_BYTES + 8)
-    return requests, ping_duplicates.sized_echoes(packets, RECEIVER, SENDER, PAYLOAD_BYTES + 8)
+def captured(*echoes: Echo, more: bool = False) -> Echoes:
+    """Return the echoes in a capture on all interfaces."""
+    frames = [echo.frame(more=more) for echo in echoes]
+    return echoes_of(pcap.parse(file_bytes(frames, link_type=COOKED_V2), where="x"))
+
+
+def echoes_of(capture: pcap.Capture) -> Echoes:
+    echoes = ping_duplicates.captured_echoes(capture, SENDER, RECEIVER, PAYLOAD_BYTES + 8)
+    assert echoes is not None
+    return echoes
 
 
 def printed(*replies: tuple[int, bool]) -> Ping:
@@ -58,7 +63,7 @@ def exchange(seqs: Sequence[int]) -> list[Echo]:
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([WIFI, CELL, 1 << 20])), max_size=30))
 def test_each_further_interface_of_a_packet_is_a_copy(arrivals: list[tuple[int, int]]) -> None:
-    requests, _ = captured(*(Echo(REQUEST, seq, interface) for seq, interface in arrivals))
+    requests = captured(*(Echo(REQUEST, seq, interface) for seq, interface in arrivals)).requests
     interfaces: dict[int, set[int]] = {}
     for seq, interface in arrivals:
         interfaces.setdefault(seq, set()).add(interface)
@@ -66,33 +71,25 @@ def test_each_further_interface_of_a_packet_is_a_copy(arrivals: list[tuple[int, 
     assert ping_duplicates.count_copies(requests) == sum(len(links) - 1 for links in interfaces.values())
 
 
-def test_copies_of_requests_and_replies_are_added() -> None:
-    requests, _ = captured(*exchange([1, 2]), Echo(REQUEST, 2, CELL), Echo(REQUEST, 1, WIFI))
-    _, replies = captured(*exchange([1, 2]), Echo(REPLY, 2, CELL), Echo(REPLY, 1, CELL))
-    measured = ping_duplicates.measure(requests, replies)
-    assert dict(measured.values) == {"rtt_duplicates": 1 + 2}
+def test_copies_of_received_requests_and_replies_are_added() -> None:
+    receiver = captured(*exchange([1, 2]), Echo(REQUEST, 2, CELL), Echo(REQUEST, 1, WIFI), Echo(REPLY, 1, CELL))
+    sender = captured(*exchange([1, 2]), Echo(REPLY, 2, CELL), Echo(REPLY, 1, CELL), Echo(REQUEST, 1, CELL))
+    assert dict(ping_duplicates.measure(sender, receiver).values) == {"rtt_duplicates": 1 + 2}
 
 
 def test_captures_without_interfaces_or_with_fragments_give_no_number() -> None:
-    requests, replies = captured(*exchange([1]))
-    plain = pcap.parse(
-        file_bytes([Frame(frame.time_ns, frame.data[20:]) for frame in (echo.frame() for echo in exchange([1]))]),
-        where="x",
-    ).packets
-    fragments = file_bytes([Echo(REQUEST, 1, WIFI).frame(more=True)], link_type=COOKED_V2)
-    for first, second, reason in (
-        (None, replies, "no complete capture"),
-        (requests, None, "no complete capture"),
-        (
-            ping_duplicates.sized_echoes(plain, SENDER, RECEIVER, PAYLOAD_BYTES + 8),
-            replies,
-            "does not contain interf",
-        ),
-        (pcap.parse(fragments, where="x").packets, replies, "fragmented"),
+    whole = captured(*exchange([1]))
+    bare = [Frame(frame.time_ns, frame.data[20:]) for frame in (echo.frame() for echo in exchange([1]))]
+    for sender, receiver, reason in (
+        (None, whole, "no complete capture"),
+        (whole, None, "no complete capture"),
+        (echoes_of(pcap.parse(file_bytes(bare), where="x")), whole, "does not contain interfaces"),
+        (whole, captured(Echo(REQUEST, 1, WIFI), more=True), "fragmented"),
     ):
-        measured = ping_duplicates.measure(first, second)
+        measured = ping_duplicates.measure(sender, receiver)
         assert not measured.values
         assert reason in measured.missing["rtt_duplicates"]
+    assert ping_duplicates.captured_echoes(None, SENDER, RECEIVER, PAYLOAD_BYTES + 8) is None
 
 
 @pytest.mark.parametrize(
