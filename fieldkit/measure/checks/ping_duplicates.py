@@ -67,11 +67,12 @@ def captured_echoes(capture: Capture | None, source: str, destination: str, size
     outgoing, returning = capture.packets.icmp(source, destination), capture.packets.icmp(destination, source)
     requests = outgoing.where((outgoing.echo != NO_ECHO) & (outgoing.echo < ECHO_REPLY))
     replies = returning.where(returning.echo >= ECHO_REPLY)
-    requests, replies = (
-        echoes.where(echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes))
-        for echoes in (requests, replies)
-    )
-    return Echoes(requests, replies)
+    return Echoes(_sized(requests, size_bytes), _sized(replies, size_bytes))
+
+
+def _sized(echoes: Packets, size_bytes: int) -> Packets:
+    """Return the echoes of an ICMP size, and the first fragments of fragmented echoes."""
+    return echoes.where(echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes))
 
 
 def measure(sender: Echoes | None, receiver: Echoes | None) -> Measured:
