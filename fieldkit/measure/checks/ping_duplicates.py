@@ -36,8 +36,8 @@ _WAIT_SHARE: Final = 0.9
 """As in `ping_checks`: the part of the last interval in which ping certainly prints replies."""
 
 
-class Echoes(NamedTuple):
-    """Echoes of a ping in one capture.
+class PingEchoes(NamedTuple):
+    """PingEchoes of a ping in one capture.
 
     Attributes:
         requests: Its requests.
@@ -53,7 +53,7 @@ class Echoes(NamedTuple):
         return bool(self.requests.more_fragments.any() or self.replies.more_fragments.any())
 
 
-def captured_echoes(capture: Capture | None, source: str, destination: str, size_bytes: int) -> Echoes | None:
+def captured_echoes(capture: Capture | None, source: str, destination: str, size_bytes: int) -> PingEchoes | None:
     """Return the echoes between two addresses in a capture; None without a capture.
 
     Args:
@@ -67,7 +67,7 @@ def captured_echoes(capture: Capture | None, source: str, destination: str, size
     outgoing, returning = capture.packets.icmp(source, destination), capture.packets.icmp(destination, source)
     requests = outgoing.where((outgoing.echo != NO_ECHO) & (outgoing.echo < ECHO_REPLY))
     replies = returning.where(returning.echo >= ECHO_REPLY)
-    return Echoes(_sized(requests, size_bytes), _sized(replies, size_bytes))
+    return PingEchoes(_sized(requests, size_bytes), _sized(replies, size_bytes))
 
 
 def _sized(echoes: Packets, size_bytes: int) -> Packets:
@@ -75,12 +75,12 @@ def _sized(echoes: Packets, size_bytes: int) -> Packets:
     return echoes.where(echoes.more_fragments | (echoes.ip_payload_bytes == size_bytes))
 
 
-def measure(sender: Echoes | None, receiver: Echoes | None) -> Measured:
+def measure(sender: PingEchoes | None, receiver: PingEchoes | None) -> Measured:
     """Return the column of the copies.
 
     Args:
-        sender: Echoes in the sender's capture; None if it is missing or incomplete.
-        receiver: Echoes in the receiver's capture; None as above.
+        sender: PingEchoes in the sender's capture; None if it is missing or incomplete.
+        receiver: PingEchoes in the receiver's capture; None as above.
     """
     if sender is None or receiver is None:
         return Measured.all_missing(COLUMNS, "a robot has no complete capture around the ping")
@@ -99,14 +99,16 @@ def count_copies(echoes: Packets) -> int:
     return len(np.unique(rows, axis=1).T) - len(np.unique(rows[0]))
 
 
-def contradictions(output: Ping, interval_s: float, sender: Echoes | None, receiver: Echoes | None) -> Iterator[str]:
+def contradictions(
+    output: Ping, interval_s: float, sender: PingEchoes | None, receiver: PingEchoes | None
+) -> Iterator[str]:
     """Yield the contradictions between the copies in the captures, the output of ping, and the answers.
 
     Args:
         output: The output.
         interval_s: Time between requests.
-        sender: Echoes in the sender's capture; None if it is missing or incomplete.
-        receiver: Echoes in the receiver's capture; None as above.
+        sender: PingEchoes in the sender's capture; None if it is missing or incomplete.
+        receiver: PingEchoes in the receiver's capture; None as above.
     """
     if sender is None or receiver is None or sender.are_fragmented or receiver.are_fragmented:
         return  # a copy of a fragmented echo may be incomplete

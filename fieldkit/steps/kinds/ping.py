@@ -32,7 +32,7 @@ from fieldkit.steps.variants import PingTool, Tool
 from fieldkit.steps.view import View, capture_around
 
 if TYPE_CHECKING:
-    from fieldkit.measure.checks.ping_duplicates import Echoes
+    from fieldkit.measure.checks.ping_duplicates import PingEchoes
 
 LAST_REPLY_S: Final = 2
 MAX_SEQUENCE_COUNT: Final = 0xFFFF
@@ -253,7 +253,7 @@ class PingStep(AlongStep, OverLink, ChecksPlacement, HasRefusals, HasNeeds, Send
             ]
             yield from (f"{self._file}: {reason}" for reason in min(reasons, key=len, default=[]))
 
-    def _captured_echoes(self, view: View) -> "tuple[Echoes | None, ...]":
+    def _captured_echoes(self, view: View) -> "tuple[PingEchoes | None, ...]":
         """Return the echoes in the captures of sender and receiver; None if one is missing or incomplete."""
         from fieldkit.measure.checks.ping_duplicates import captured_echoes  # noqa: PLC0415 (only if needed)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fieldkit.measure.captures import pcap
 from fieldkit.measure.captures.headers import COOKED_V2
 from fieldkit.measure.checks import ping_duplicates
-from fieldkit.measure.checks.ping_duplicates import Echoes
+from fieldkit.measure.checks.ping_duplicates import PingEchoes
 from fieldkit.measure.evidence.ping import Ping, Reply
 from tests.helpers.captures import RECEIVER, SENDER, Frame, file_bytes, ipv4
 
@@ -40,13 +40,13 @@ class Echo:
         return Frame(START_NS + round(1e9 * INTERVAL_S) * self.seq + self.at_ns, cooked + packet)
 
 
-def captured(*echoes: Echo, more: bool = False) -> Echoes:
+def captured(*echoes: Echo, more: bool = False) -> PingEchoes:
     """Return the echoes in a capture on all interfaces."""
     frames = [echo.frame(more=more) for echo in echoes]
     return echoes_of(pcap.parse(file_bytes(frames, link_type=COOKED_V2), where="x"))
 
 
-def echoes_of(capture: pcap.Capture) -> Echoes:
+def echoes_of(capture: pcap.Capture) -> PingEchoes:
     echoes = ping_duplicates.captured_echoes(capture, SENDER, RECEIVER, PAYLOAD_BYTES + 8)
     assert echoes is not None
     return echoes
