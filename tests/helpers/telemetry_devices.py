@@ -88,7 +88,8 @@ def modem_bus(folder: Path) -> Iterator[str]:
         wait_until(bus.exists, Deadline.after(60))
         # Debian's Python has dbusmock.
         environment = os.environ | {"DBUS_SYSTEM_BUS_ADDRESS": address}
-        mock = subprocess.Popen(("/usr/bin/python3", str(_MODEM), str(ready)), env=environment, stderr=sys.stderr)
+        words = ("/usr/bin/python3", str(_MODEM), str(ready))
+        mock = subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL, stderr=sys.stderr)
         wait_until(lambda: ready.exists() or mock.poll() is not None, Deadline.after(60))
         assert mock.poll() is None
         yield address
