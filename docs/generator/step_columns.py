@@ -53,7 +53,7 @@ def step_columns() -> str:
         for step, columns in STEP_COLUMNS.items()
         for column in columns
     )
-    return table(("column", "unit", "repeats give", "step", "meaning"), lines)
+    return table(("column", "unit", "estimate", "step", "meaning"), lines)
 
 
 def table_rows() -> str:

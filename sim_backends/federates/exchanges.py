@@ -15,7 +15,7 @@ next index in the first message that mentions it, for this copy and its copies.
   world file](reference/world-file.md)), `robots` (limits of each agent's body, and its radio) and `options`. A simple
   federate ignores it and uses the agents of hello. A network declared with `writes_captures` gets `captures` if the
   run has an output folder: the `folder` for one `AGENT.pcap` each, of raw IP; `addresses` by agent; and `flows` by
-  name: `port` of the destination (0: its own), `ping` (identifier of ICMP echo; 0: none), `reply`.
+  name: `port` of the destination (0: the network chooses it), `ping` (identifier of ICMP echo; 0: none), `reply`.
 - **Physics: states.** `at_ns` is `to_ns` rounded down to a multiple of the `step_ns` in welcome; the states are valid
   at this time. Positions are of the antenna. `heading_rad` is from east towards north, NaN if undefined. `limit_m_s2`
   is the largest change of velocity per second after this time, infinity if unknown; in requests to a network it has
@@ -32,7 +32,8 @@ next index in the first message that mentions it, for this copy and its copies.
 - **Dead reckoning.** If `reckoning_ns` is above 0, which needs the capability *extrapolates*, the position at t is
   `position_m` + n `reckoning_ns` `velocity_m_s`, where n is (t - `since_ns`) / `reckoning_ns`, rounded down.
   Otherwise agents stay at their positions until the next request.
-- **Absent agents** have no state. A physics with the capability 32 omits agents that it has removed; they may return.
+- **Absent agents** have no state. A physics federate with the capability 32 omits agents that it has removed;
+  they may return.
   With the scenario's keys `appears` and `disappears` the coordinator ignores states of absent agents, sends them no
   commands, and drops their packets as `agent absent`; the network still reports the fates of those that it already
   carries. A network without the capability 32 receives the last states of absent agents, or their start states.

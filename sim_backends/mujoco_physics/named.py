@@ -26,7 +26,7 @@ def load() -> FederateService:
 
 
 class MujocoOptions(SimulatorOptions):
-    """The physics [MuJoCo](mujoco.md) has no options."""
+    """The physics simulator [MuJoCo](mujoco.md) has no options."""
 
 
 MUJOCO = PythonFederate(PHYSICS, load, "MuJoCo: robots with wheels and rotors, ground and contacts", MujocoOptions)

@@ -72,6 +72,8 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
     Writes `ROLE.pcap` and `ROLE-capture.log`.
 
     Attributes:
+        over: Link to capture, by its name in [the profiles of the robots](links.md); without it, the radio under
+            test.
         robots: Roles that capture.
         port: A port to capture in addition to the ports of the steps inside.
         during: Steps to capture.

@@ -32,14 +32,14 @@ def _field(name: str, kind: pa.DataType, unit: str, meaning: str) -> pa.Field:
 
 def _end_fields(prefix: str, meaning: str) -> list[pa.Field]:
     kinds = (
-        ("m", _VECTOR, "m", "position, east, north, up"),
-        ("m_s", _VECTOR, "m/s", "velocity, east, north, up"),
-        ("heading_rad", pa.float64(), "rad", "heading from east towards north, empty if there is none"),
+        ("m", _VECTOR, "m", "position (east, north, up)", ""),
+        ("m_s", _VECTOR, "m/s", "velocity (east, north, up)", ""),
+        ("heading_rad", pa.float64(), "rad", "heading (from east towards north)", "; empty if there is none"),
     )
     return [
-        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{meaning} {end}, {name}")
-        for end in ("source", "destination")
-        for quantity, kind, unit, name in kinds
+        _field(f"{prefix}_{end}_{quantity}", kind, unit, f"{name} of the {agent} {meaning}{note}")
+        for end, agent in (("source", "sending agent"), ("destination", "receiving agent"))
+        for quantity, kind, unit, name, note in kinds
     ]
 
 
@@ -63,7 +63,11 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "time of arrival by the network's clock; empty if the packet never arrived",
             ),
             _field(
-                "counted_ns", pa.int64(), "ns", "time of arrival by the policy; empty if the packet never arrived"
+                "counted_ns",
+                pa.int64(),
+                "ns",
+                "time from which the sync policy counts the packet as arrived: `arrived_ns`, or the end of the "
+                "window if the policy defers arrivals; empty if the packet never arrived",
             ),
             _field(
                 "late_ns",
@@ -78,8 +82,8 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "reason why the packet never arrived; empty if it did, or was under way at the end",
             ),
             _field("ended_window", pa.int64(), "", "number of the window in which the packet arrived or was dropped"),
-            *_end_fields("known", "as the network assumed it when the packet entered:"),
-            *_end_fields("true", "true value when the packet was sent:"),
+            *_end_fields("known", "that the network assumed when the packet entered it"),
+            *_end_fields("true", "when the packet was sent (true value)"),
         ]
     ),
     "states": pa.schema(

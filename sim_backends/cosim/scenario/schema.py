@@ -40,13 +40,15 @@ def _list_policies(json_schema: dict[str, Any]) -> None:
 
 
 class PolicyChoice(Strict):
-    """The sync policy of a scenario. Its parameters apply to every policy that has them, also in a shootout.
+    """The sync policy of a scenario.
+
+    Its parameters apply to every policy that has them, also in `fieldkit cosim shootout`.
 
     Attributes:
         name: The default policy of a run.
         window: Length of a window, or the parameter w of the velocity-aware policies.
         longest: Longest window of policies with variable windows.
-        bound: For `error_bounded`: largest error of the relative position in the network of two agents that transmit.
+        bound: For `error_bounded`: largest error of the relative position of two transmitting agents in the network.
         bound_db: Instead of `bound`: largest error of the path loss between them in free line of sight, in dB.
         exponent: Exponent of the log-distance law for `bound_db`.
     """
@@ -210,20 +212,21 @@ class CosimScenario(Named):
         summary: Description in one line.
         world: Surroundings of the agents: a file of the lab's folder `worlds/`, or a shipped one.
         line: The line of the world along which agents start.
-        duration: Its duration, in simulated time.
+        duration: Duration of a run, in simulated time.
         seeds: Seeds of the random draws, one for each run.
-        physics: The physics.
-        network: The network.
-        radio: The radio.
+        physics: The physics simulator.
+        network: The network simulator.
+        radio: The radio model.
         tcp: The TCP of all agents, also for ROS 1 topics.
-        topology: `masterless`, or `master`: all packets pass the relay, which is also the host of a ROS 1 master.
+        topology: `masterless`, or `master`: all packets go through the relay, which also runs
+            the ROS 1 master, if any.
         relay: The agent whose access point relays packets.
-        policy: The sync policy.
+        policy: The [sync policy](method-cosim.md#sync-policies).
         emane: If given, a run publishes its positions to the network emulator EMANE.
         agents: The agents by name.
-        traffic: The traffic between them.
-        faults: The faults.
-        trial: The trial of robots that it reproduces.
+        traffic: The traffic between the agents.
+        faults: Faults during a run.
+        trial: The trial of robots that the scenario reproduces.
     """
 
     world: str
