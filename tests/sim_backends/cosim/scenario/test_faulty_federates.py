@@ -1,4 +1,4 @@
-"""Each fault of a federate, over each transport and for both roles: the run ends, names it, and is readable."""
+"""Each fault of a federate, over each transport and in both roles: the run names it and its recording is readable."""
 
 import json
 import os
@@ -74,10 +74,10 @@ def check_run(lab: Path, role: str, fault: str, address: str) -> None:
 @pytest.mark.parametrize("role", ["physics", "network"])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_over_a_pipe(fault: str, role: str, tmp_path: Path) -> None:
-    began_s = now_s()
+    start_s = now_s()
     words = (sys.executable, "-m", "tests.helpers.faulty_federates", role, fault)
     check_run(tmp_path, role, fault, shlex.join(words))
-    assert children(began_s) == set()
+    assert children(start_s) == set()
 
 
 @pytest.mark.parametrize("role", ["physics", "network"])

@@ -37,36 +37,35 @@ WITHIN = low_discrepancy_times_ns(4_000 * MS, 7_500 * MS, 30, STEP_NS)
 """Beginnings of windows that are within range until their end."""
 
 
-def half(window_s: float) -> float:
-    return window_s / 2
-
-
 def mean_wait_s(window_s: float) -> float:
     """Return the mean time that packets which arrive in a window wait for its end, over all affected packets."""
     return window_s**2 / 2 / (window_s + DELAY_S)
 
 
-def held_twice(window_s: float) -> float:
-    """Return the same if packets also wait for the end of the window in which they are sent."""
+def mean_wait_at_both_ends_s(window_s: float) -> float:
+    """Return the mean wait if packets also wait for the end of the window in which they are sent."""
     return (window_s**2 / 2 + DELAY_S * (window_s - DELAY_S / 2)) / (window_s + DELAY_S)
 
 
-def path(window_s: float) -> float:
+def path_error_m(window_s: float) -> float:
     return SPEED_M_S * window_s / 2
 
 
-HELD_M = SPEED_M_S * STEP_NS / 1e9
-"""Motion during a step of the physics, for which states are held."""
+STEP_MOTION_M = SPEED_M_S * STEP_NS / 1e9
+"""Motion during a step of the physics; states do not change within a step."""
 
 
 Law = Callable[[float], float]
 LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
-    "time_stepped": (TimeStepped, {"delivery_s": held_twice, "position_m": path}),
-    "scheduled": (Scheduled, {"delivery_s": mean_wait_s, "position_m": path}),
-    "sliding_window": (SlidingWindow, {"late_s": mean_wait_s, "position_m": path}),
-    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": mean_wait_s, "position_m": path}),
-    "velocity_aware": (lambda window_s: VelocityAware(window_s, 1.0), {"late_s": mean_wait_s, "position_m": path}),
-    # Both keep their velocities, so the extrapolation is exact, and windows have their maximum length.
+    "time_stepped": (TimeStepped, {"delivery_s": mean_wait_at_both_ends_s, "position_m": path_error_m}),
+    "scheduled": (Scheduled, {"delivery_s": mean_wait_s, "position_m": path_error_m}),
+    "sliding_window": (SlidingWindow, {"late_s": mean_wait_s, "position_m": path_error_m}),
+    "velocity_aware_raw": (VelocityAwareRaw, {"late_s": mean_wait_s, "position_m": path_error_m}),
+    "velocity_aware": (
+        lambda window_s: VelocityAware(window_s, 1.0),
+        {"late_s": mean_wait_s, "position_m": path_error_m},
+    ),
+    # Both velocities are constant, so the extrapolation is exact, and windows have their maximum length.
     "error_bounded": (lambda window_s: ErrorBounded(1e-9, window_s), {"delivery_s": mean_wait_s}),
     "variable_stepped": (lambda _: VariableStepped(), {}),
     "event_driven": (lambda _: EventDriven(), {}),
@@ -82,7 +81,7 @@ def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
         lengths_s = errors.window_s.mean(axis=1)
         for measure in MEASURES:
             if measure not in laws:
-                limit = HELD_M * errors.counts[measure] if measure == "position_m" else 1e-9
+                limit = STEP_MOTION_M * errors.counts[measure] if measure == "position_m" else 1e-9
                 assert (errors.sums[measure] <= limit).all(), f"{name} has no error in {measure}"
                 continue
             expected = [laws[measure](length_s) for length_s in lengths_s]
@@ -151,7 +150,7 @@ def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordin
 
 
 def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_order() -> None:
-    """It accelerates by 2 m/s^2; without datagrams in a window w its path is shorter by w^2: half of 2 m/s^2."""
+    """The chaser accelerates by 2 m/s^2; without datagrams during a window w, its path is shorter by 2 m/s^2 w^2 / 2."""
     begins_ns = low_discrepancy_times_ns(100 * MS, 900 * MS, 6, STEP_NS)
     errors = local_errors(chase, {"scheduled": Scheduled}, WINDOWS_S, begins_ns, tail_ns=5 * MS)["scheduled"]
     # The mean over two agents, one of which does not move.
@@ -160,7 +159,7 @@ def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_orde
 
 
 def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> None:
-    """As with solvers of differential equations. The mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
+    """As in solvers of differential equations; the mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
 
     def tracks(policy: SyncPolicy) -> Tracks:
         sampled = SampledPhysics(CommandedMotion(), 50 * MS)

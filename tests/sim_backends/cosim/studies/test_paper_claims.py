@@ -1,4 +1,4 @@
-"""The paper's claims: changes computed by hand, and systems that differ only in the claimed property."""
+"""The claims of the paper: changes computed by hand, and systems that differ only in the claimed property."""
 
 import math
 from functools import cache
@@ -69,20 +69,20 @@ def test_claims_by_hand() -> None:
     assert loss.ours.value == pytest.approx(-0.10)
     assert loss.agreement is Agreement.AGREES
     assert (fixed.rows, loss.rows) == (10, 10)
-    assert math.isnan(fixed.tabled_change), "no table of the paper has it"
+    assert math.isnan(fixed.tabled_change), "no table of the paper has this change"
     master = by_key["master-based", "nlos", "delay"]
     assert master.ours.value == pytest.approx(1.0)
     assert master.agreement is Agreement.ABOVE
     # The arrivals differ by 50 and by 10 points with the two seeds.
     assert by_key["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
-    assert by_key["fixed window", "los", "delay"].agreement is None, "the paper states none"
+    assert by_key["fixed window", "los", "delay"].agreement is None, "the paper states no change"
 
 
 def test_the_papers_own_tables_contradict_its_statements() -> None:
     systems = "adaptive", "fixed window", "master-based"
     by_key = claims_of({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
     los, nlos = (by_key["master-based", line, "loss"] for line in Sight)
-    assert los.tabled_change == pytest.approx((20 - 40) / 5 / 100), "0 0 0 10 10 instead of 0 0 10 10 20"
+    assert los.tabled_change == pytest.approx((20 - 40) / 5 / 100), "losses of 0 0 0 10 10 instead of 0 0 10 10 20"
     assert nlos.tabled_change == pytest.approx((70 - 140) / 5 / 100)
     delay = by_key["master-based", "los", "delay"]
     expected = (0.01 * 0.1 * 0.4 * 0.4 * 0.6) / (0.01 * 0.1 * 0.48 * 0.6 * 0.8)

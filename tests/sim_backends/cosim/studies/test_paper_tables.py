@@ -51,7 +51,9 @@ NAN = math.nan
         (Printed("0.4"), IntervalEstimate(NAN, NAN, NAN), Agreement.NO_VALUE),
     ],
 )
-def test_cases_by_hand(printed: Printed, ours: IntervalEstimate, expected: Agreement) -> None:
+def test_agreements_equal_those_determined_by_hand(
+    printed: Printed, ours: IntervalEstimate, expected: Agreement
+) -> None:
     assert agreement(printed, ours) is expected
 
 
@@ -73,14 +75,14 @@ def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, 
     st.booleans(),
 )
 def test_a_number_more_than_half_a_step_away_disagrees(
-    number: Decimal, step: str, deviation: float, above: bool
+    number: Decimal, step: str, deviation: float, is_above: bool
 ) -> None:
     printed = Printed(str(number), step=step)
-    ours = printed.value + deviation * float(step) * (1 if above else -1)
-    expected = Agreement.ABOVE if above else Agreement.BELOW
+    ours = printed.value + deviation * float(step) * (1 if is_above else -1)
+    expected = Agreement.ABOVE if is_above else Agreement.BELOW
     assert agreement(printed, IntervalEstimate(ours, NAN, NAN)) is expected
-    ends = printed.value, ours
-    assert agreement(printed, IntervalEstimate(ours, min(ends), max(ends))) is Agreement.AGREES
+    bounds = printed.value, ours
+    assert agreement(printed, IntervalEstimate(ours, min(bounds), max(bounds))) is Agreement.AGREES
 
 
 SHORT = {"duration": "1200ms"}
@@ -149,9 +151,9 @@ def test_the_delays_of_pings_are_round_trips() -> None:
 def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     study = paper_table("1", SHORT)
     flow = only_flow(study.setups["los 40 m topic"])
-    some = FlowSample(500, 490, 0.1, {"pushed out": 6, UNDER_WAY: 4})
-    none = FlowSample(500, 0, math.nan, {"not matched yet": 500})
-    seeds = [some, replace(some, delay_sum_s=0.3), none]
+    partial_sample = FlowSample(500, 490, 0.1, {"pushed out": 6, UNDER_WAY: 4})
+    empty_sample = FlowSample(500, 0, math.nan, {"not matched yet": 500})
+    seeds = [partial_sample, replace(partial_sample, delay_sum_s=0.3), empty_sample]
     samples = {name: [{only_flow(setup): sample} for sample in seeds] for name, setup in study.setups.items()}
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}

@@ -64,16 +64,22 @@ def test_one_worker_and_other_orders_give_the_same_table(all_outcomes: Outcomes)
 
 
 def test_the_mean_over_seeds_has_means_and_the_largest_maximum(all_outcomes: Outcomes) -> None:
-    of_seeds = rows(all_outcomes)[1].by_seed
-    mean = mean_errors(of_seeds)
+    errors_by_seed = rows(all_outcomes)[1].by_seed
+    mean = mean_errors(errors_by_seed)
     assert mean.late_s == Spread(0, 0, 0)
-    assert mean.delivery_error_s.mean == pytest.approx(np.mean([of.delivery_error_s.mean for of in of_seeds]))
-    assert mean.delivery_error_s.largest == max(of.delivery_error_s.largest for of in of_seeds)
-    assert mean.fate_disagreement == pytest.approx(np.mean([of.fate_disagreement for of in of_seeds]))
-    assert mean.packets == sum(of.packets for of in of_seeds)
-    first_s = min(of.first_disagreement_s for of in of_seeds)
+    assert mean.delivery_error_s.mean == pytest.approx(
+        np.mean([run_errors.delivery_error_s.mean for run_errors in errors_by_seed])
+    )
+    assert mean.delivery_error_s.largest == max(run_errors.delivery_error_s.largest for run_errors in errors_by_seed)
+    assert mean.fate_disagreement == pytest.approx(
+        np.mean([run_errors.fate_disagreement for run_errors in errors_by_seed])
+    )
+    assert mean.packets == sum(run_errors.packets for run_errors in errors_by_seed)
+    first_s = min(run_errors.first_disagreement_s for run_errors in errors_by_seed)
     assert mean.first_disagreement_s == first_s
-    assert mean.first_disagreement in {of.first_disagreement for of in of_seeds if of.first_disagreement_s == first_s}
+    assert mean.first_disagreement in {
+        run_errors.first_disagreement for run_errors in errors_by_seed if run_errors.first_disagreement_s == first_s
+    }
 
 
 def test_the_first_disagreement_has_its_time_and_is_nan_without_one() -> None:
@@ -82,9 +88,9 @@ def test_the_first_disagreement_has_its_time_and_is_nan_without_one() -> None:
     # A window begins at 3.5 s, and the range limit is reached at 3.529 s.
     assert late.first_disagreement == ("a", -(-3_529_411_765 // PERIOD_NS))
     assert late.first_disagreement_s == pytest.approx(3.529, abs=0.005)
-    none = mean_errors([errors(reference, reference)])
-    assert none.first_disagreement is None
-    assert math.isnan(none.first_disagreement_s)
+    equal_errors = mean_errors([errors(reference, reference)])
+    assert equal_errors.first_disagreement is None
+    assert math.isnan(equal_errors.first_disagreement_s)
 
 
 def test_a_bias_is_relative_to_the_reference_and_has_the_needed_seeds(all_outcomes: Outcomes) -> None:

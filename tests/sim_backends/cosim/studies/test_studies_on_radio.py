@@ -44,9 +44,9 @@ def test_exact_policies_agree_on_the_radio_and_a_fixed_window_does_not() -> None
     assert merged.delivery_error_s == merged.late_s == Spread(0, 0, 0)
     assert merged.position_error_m == errors(reference, reference).position_error_m, "states are held for equal steps"
     assert (merged.fate_disagreement, merged.causality_violations) == (0, 0)
-    windowed = errors(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
-    assert windowed.delivery_error_s.mean > 0.005
-    assert windowed.fate_disagreement > 0
+    fixed_window = errors(reference, three_robots(Scheduled(0.02)).advance(600 * MS))
+    assert fixed_window.delivery_error_s.mean > 0.005
+    assert fixed_window.fate_disagreement > 0
 
 
 def test_the_papers_rule_reports_the_pair_for_which_time_runs_backwards() -> None:
