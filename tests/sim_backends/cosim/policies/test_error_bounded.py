@@ -115,7 +115,7 @@ def test_a_collision_with_a_wall_does_not_exceed_the_bound() -> None:
 
 
 def test_a_window_continues_while_positions_are_not_used() -> None:
-    """At 1 m/s, the error reaches the bound of 1 mm in one step; a window with an event begins less than a step before."""
+    """At 1 m/s, one step reaches the bound of 1 mm; a window with an event begins at most one step before it."""
     states = {"a": State((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), "b": State((5.0, 0.0, 0.0))}
     limits = dict.fromkeys("ab", 0.0)
     policy = ErrorBounded(0.001, longest_s=0.1)

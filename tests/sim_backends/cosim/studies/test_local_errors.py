@@ -150,7 +150,7 @@ def chase(policy: SyncPolicy, physics: PhysicsFederate | None = None) -> Coordin
 
 
 def test_the_position_error_of_one_window_in_a_closed_loop_is_of_the_second_order() -> None:
-    """The chaser accelerates by 2 m/s^2; without datagrams during a window w, its path is shorter by 2 m/s^2 w^2 / 2."""
+    """The chaser accelerates by 2 m/s^2; without datagrams in a window w, its path is shorter by 2 m/s^2 w^2 / 2."""
     begins_ns = low_discrepancy_times_ns(100 * MS, 900 * MS, 6, STEP_NS)
     errors = local_errors(chase, {"scheduled": Scheduled}, WINDOWS_S, begins_ns, tail_ns=5 * MS)["scheduled"]
     # The mean over two agents, one of which does not move.

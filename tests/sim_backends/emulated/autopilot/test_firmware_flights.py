@@ -1,4 +1,4 @@
-"""The script that flies a user's simulated firmware, against the emulated ArduCopter."""
+"""The script that flies a user's simulated firmware, tested with the emulated ArduCopter."""
 
 from itertools import islice
 

@@ -46,8 +46,10 @@ def test_messages_of_one_datagram_are_separated() -> None:
     st.dictionaries(st.integers(0, 0x3FFF), st.binary(max_size=70), max_size=8),
     st.integers(0, 0xFFFF),
 )
-def test_what_is_encoded_is_decoded(command: int, attributes: dict[int, bytes], kind: int) -> None:
-    message = NetlinkMessage(kind, 1, 2, encode_generic(command, 1, attributes))
+def test_an_encoded_message_is_decoded_without_change(
+    command: int, attributes: dict[int, bytes], message_type: int
+) -> None:
+    message = NetlinkMessage(message_type, 1, 2, encode_generic(command, 1, attributes))
     (decoded,) = decode_messages(message.encode())
     # The padding of the last attribute is part of the payload.
     assert decoded == message
