@@ -92,14 +92,16 @@ print(json.dumps(rospy.wait_for_message("/scan", LaserScan, 60).ranges))
 
 @pytest.mark.emulated
 def test_the_laser_detects_the_wall_next_to_the_sender(emulation: EmulatedTestbed) -> None:
-    """In the lawn at (3, 18) facing west, the wall's near face 0.9 m behind it, from 4 m south to 4 m north."""
+    """The sender is at (3, 18) and faces west; the wall is 0.9 m behind it, from 4 m south to 4 m north."""
     emulation.place(Placement(Scenario.NLOS, Topology.MASTERLESS, parse_distance("5m")))
     ranges_m = json.loads(in_ros(emulation, "python3", "-c", ONE_SCAN))
     assert len(ranges_m) == 360
     for beam, range_m in enumerate(ranges_m):
-        off_rad = math.radians(beam - 180)
-        true_m = 0.9 / math.cos(off_rad) if math.cos(off_rad) > 0 else math.inf
-        if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:  # noise decides at this distance
+        angle_rad = math.radians(beam - 180)
+        true_m = 0.9 / math.cos(angle_rad) if math.cos(angle_rad) > 0 else math.inf
+        if (
+            abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M
+        ):  # at this distance, noise decides between a range and infinity
             expected_m = true_m if true_m < LASER_RANGE_M[1] else math.inf
             assert range_m == pytest.approx(expected_m, abs=6 * LASER_NOISE_M), beam
     emulation.place(PLACED)
@@ -130,9 +132,9 @@ def test_bagpy_reads_a_recording_as_rosbags_does(emulation: EmulatedTestbed, tmp
     environment = os.environ | {"PYTHONPATH": str(BAGPY)}
     result = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    read = json.loads(result.stdout.splitlines()[-1])
-    assert read["topics"] == {topic: [types[topic], counts[topic]] for topic in topics}
-    rows = [dict(zip(read["columns"], row, strict=True)) for row in read["rows"]]
+    bagpy_report = json.loads(result.stdout.splitlines()[-1])
+    assert bagpy_report["topics"] == {topic: [types[topic], counts[topic]] for topic in topics}
+    rows = [dict(zip(bagpy_report["columns"], row, strict=True)) for row in bagpy_report["rows"]]
     assert [int(row["header.stamp.nsecs"]) for row in rows] == [message.header.stamp.nanosec for message in odom]
     for row, message in zip(rows, odom, strict=True):
         assert (row["header.frame_id"], row["child_frame_id"]) == ("odom", "base_footprint")

@@ -61,13 +61,13 @@ def in_ros(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
     return output_of(emulation.shells[role], *with_environment(argv, setup=emulation.robots[role].spec.setup))
 
 
-def names(shell: Shell) -> set[str]:
+def process_names(shell: Shell) -> set[str]:
     return set(
         output_of(shell, "sh", "-c", "cat /proc/[0-9]*/comm 2>/dev/null || true").split()
     )  # some exit meanwhile
 
 
-def answer_to(shell: Shell, need: Need) -> CommandResult:
+def run_probe(shell: Shell, need: Need) -> CommandResult:
     result = shell.run(need.argv, deadline=Deadline.after(LONG_S), check=False)
     return CommandResult((result.stdout + result.stderr).decode().strip(), result.exit_code)
 
@@ -75,9 +75,9 @@ def answer_to(shell: Shell, need: Need) -> CommandResult:
 @pytest.mark.emulated
 def test_the_relay_runs_roscore_and_the_others_no_master(emulation: EmulatedTestbed) -> None:
     masters = {"roscore", "rosmaster", "rosout"}
-    wait(lambda: masters <= names(emulation.shells[Role.RELAY]))
+    wait(lambda: masters <= process_names(emulation.shells[Role.RELAY]))
     for role in (Role.SENDER, Role.RECEIVER):
-        assert not masters & names(emulation.shells[role])
+        assert not masters & process_names(emulation.shells[role])
 
 
 @pytest.mark.emulated
@@ -114,11 +114,13 @@ def test_the_preflight_probe_detects_a_master_and_its_absence(emulation: Emulate
     cast = backend().cast(Topology.MASTER)
     scene = Scene(Protocol.TCP, cast, "f")
     (need,) = ros_master.needs(scene, Role.SENDER, program="rosbag")
-    answer = answer_to(emulation.shells[Role.SENDER], need)
+    answer = run_probe(emulation.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RELAY], answer)[0] is Verdict.OK, answer
-    wrong = {role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()}
-    (need,) = ros_master.needs(Scene(Protocol.TCP, wrong, "f"), Role.SENDER, program="rosbag")
-    answer = answer_to(emulation.shells[Role.SENDER], need)
+    cast_with_another_master = {
+        role: robot.model_copy(update={"ros_master": "10.42.0.2"}) for role, robot in cast.items()
+    }
+    (need,) = ros_master.needs(Scene(Protocol.TCP, cast_with_another_master, "f"), Role.SENDER, program="rosbag")
+    answer = run_probe(emulation.shells[Role.SENDER], need)
     assert ros_master.judge(cast[Role.RECEIVER], answer)[0] is Verdict.FAIL
     assert "Connection refused" in answer.text
 
@@ -126,10 +128,10 @@ def test_the_preflight_probe_detects_a_master_and_its_absence(emulation: Emulate
 @pytest.mark.emulated
 def test_a_restarted_master_has_no_topics_until_nodes_register(emulation: EmulatedTestbed) -> None:
     relay, sender = emulation.shells[Role.RELAY], emulation.shells[Role.SENDER]
-    wait(lambda: "rosmaster" in names(relay))
+    wait(lambda: "rosmaster" in process_names(relay))
     emulation.inject(Fault(FaultKind.KILL, Role.RELAY, process="rosmaster"))
     wait(lambda: "/scan" not in topics_of(sender))
-    wait(lambda: {"rosmaster", "rosout"} <= names(relay))
+    wait(lambda: {"rosmaster", "rosout"} <= process_names(relay))
     assert "/scan" not in topics_of(sender)
     emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="ros_relay"))
     wait(lambda: "/scan" in topics_of(sender))
@@ -140,7 +142,7 @@ def topics_of(shell: Shell) -> list[str]:
     return shell.run(argv, deadline=Deadline.after(LONG_S), check=False).stdout.decode().split()
 
 
-def test_a_robot_alone_has_its_own_master() -> None:
+def test_a_robot_without_a_shared_master_has_a_separate_one() -> None:
     cast = backend().cast(Topology.MASTERLESS)
     keys = KeyPair.make(), KeyPair.make()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.DEBIAN, login=keys[0], host_key=keys[1])

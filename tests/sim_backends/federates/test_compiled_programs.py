@@ -23,7 +23,7 @@ def program(tmp_path: Path, text: str = "int main() { return 7; }\n", *packages:
     return CompiledProgram("seven", source, packages, INSTALL, flags=("-O0",))
 
 
-def test_it_is_compiled_once_and_again_if_its_source_changes(
+def test_a_program_is_compiled_once_and_again_if_its_source_changes(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     seven = program(tmp_path)

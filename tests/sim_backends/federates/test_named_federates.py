@@ -62,7 +62,7 @@ def test_a_python_class_runs_in_this_process_and_a_program_in_another(tmp_path: 
         assert simulation.run().windows_ns
 
 
-def test_builtin_names_the_built_in_federates() -> None:
+def test_the_name_builtin_means_the_built_in_federates() -> None:
     scenario = load_scenario("convoy", {"physics.federate": "builtin", "network.federate": "builtin"})
     assert (scenario.physics.federate, scenario.network.federate) == (None, None)
 

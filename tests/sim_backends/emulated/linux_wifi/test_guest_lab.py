@@ -75,9 +75,7 @@ def test_ssh_logs_in_on_a_robot_through_the_channel(lab: GuestLab, directory: Pa
     key, known_hosts = tmp_path / "key", tmp_path / "known"
     key.touch(mode=0o600)
     key.write_text(lab.login.private_key)
-    known_hosts.write_text(
-        "".join(f"{name} {host_key}\n" for name, host_key in lab.login.host_keys.items())
-    )
+    known_hosts.write_text("".join(f"{name} {host_key}\n" for name, host_key in lab.login.host_keys.items()))
     robot_socket = lab.connect("robot-2", LIMIT_S)
     robot_socket.settimeout(None)
     listener = socket.create_server(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""`fieldkit trial los 30ft` with Linux's Wi-Fi, as a user runs it: in the virtual machine, with results on the host."""
+"""`fieldkit trial los 30ft` with Linux's Wi-Fi in the virtual machine, as a user runs it; results are on the host."""
 
 import csv
 import gzip
