@@ -262,9 +262,9 @@ class DeliversToAll(DelayNetwork):
 
 class ReckoningNetwork(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
-        add_to_first_integer = MS if isinstance(states, DeadReckoned) else 0
+        delay_ns = MS if isinstance(states, DeadReckoned) else 0
         return super().advance(
-            to_ns, [packet._replace(enters_ns=packet.enters_ns + add_to_first_integer) for packet in packets], states
+            to_ns, [packet._replace(enters_ns=packet.enters_ns + delay_ns) for packet in packets], states
         )
 
 

@@ -1,4 +1,4 @@
-"""UDP over analytically solvable links: loss of fragments, delay, queues, range."""
+"""UDP over links with closed-form results: loss of fragments, delay, queues, and range."""
 
 import pytest
 import scipy

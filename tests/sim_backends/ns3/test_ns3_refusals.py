@@ -1,4 +1,4 @@
-"""What the program of ns-3 refuses, with the reason: the coordinator prevents most of it, another client may not."""
+"""Requests that the ns-3 program refuses with a reason; the coordinator sends few of them, but other clients may."""
 
 import json
 import shlex
@@ -46,8 +46,8 @@ def hello_frame(hello: Hello, changes: Mapping[str, object] = MappingProxyType({
         for key in parents:
             item = item[key]
         item[last] = value
-    changed = replace(hello, configuration=json.dumps(configuration).encode())
-    return encode(MessageKind.HELLO, 1, 0, changed.encode())
+    changed_hello = replace(hello, configuration=json.dumps(configuration).encode())
+    return encode(MessageKind.HELLO, 1, 0, changed_hello.encode())
 
 
 def advance_frame(
@@ -65,18 +65,18 @@ def advance_frame(
 
 def refusal(*frames: bytes) -> str:
     """Return the text of the error with which the program answers the last frame."""
-    done = subprocess.run(
+    process = subprocess.run(
         shlex.split(command()), input=b"".join(frames), stdout=subprocess.PIPE, check=False, timeout=60
     )
-    rest, kinds, body = done.stdout, [], b""
-    while rest:
-        size = int.from_bytes(rest[:4], "little")
-        kinds.append(rest[4])
-        body, rest = rest[HEADER_BYTES : HEADER_BYTES + size], rest[HEADER_BYTES + size :]
-    answers = [kind for kind in kinds if kind != MessageKind.BUSY]
+    remaining, message_kinds, body = process.stdout, [], b""
+    while remaining:
+        size = int.from_bytes(remaining[:4], "little")
+        message_kinds.append(remaining[4])
+        body, remaining = remaining[HEADER_BYTES : HEADER_BYTES + size], remaining[HEADER_BYTES + size :]
+    answers = [kind for kind in message_kinds if kind != MessageKind.BUSY]
     assert len(answers) == len(frames)
     assert answers[-1] == MessageKind.ERROR
-    assert done.returncode == 1
+    assert process.returncode == 1
     return body[2:].decode()
 
 
@@ -104,7 +104,7 @@ TOPIC = {"protocol": "topic", "from": "ann", "to": ["bob"]}
     ],
     ids=lambda value: None if isinstance(value, str) else next(iter(value)),
 )
-def test_a_configuration_that_it_cannot_simulate_is_refused(
+def test_a_configuration_that_ns3_cannot_simulate_is_refused(
     changes: Mapping[str, object], message: str, hello: Hello
 ) -> None:
     assert refusal(hello_frame(hello, changes)).startswith(message)

@@ -28,7 +28,7 @@ from sim_backends.radio.modes import ack_ns, control_mode
         ("HE", 80, 1, 3200, (30.6, 61.3, 91.9, 122.5, 183.8, 245, 275.6, 306.3, 367.5, 408.3, 459.4, 510.4)),
     ],
 )
-def test_rates_are_those_of_the_tables(
+def test_rates_equal_those_of_the_tables(
     phy_format: HighThroughput, width_mhz: int, streams: int, guard_ns: int, rates: Sequence[float]
 ) -> None:
     modes = format_modes(phy_format, "5 GHz", width_mhz, streams, guard_ns)
@@ -89,7 +89,7 @@ N40 = Antenna("802.11g", 17.0, -82.0, PhyCapability("n", "2.4 GHz", 40, 2, 400))
 G, N = Antenna("802.11g", 17.0, -82.0), Antenna("802.11n", 17.0, -82.0)
 
 
-def test_two_stations_use_what_both_support() -> None:
+def test_two_stations_use_modes_that_both_support() -> None:
     assert {mode.name.split("-")[0] for mode in modes_between(AX80, AC40)} == {"vht40"}
     assert {mode.streams for mode in modes_between(AX80, AC40)} == {1}
     assert {mode.guard_interval_ns for mode in modes_between(AX80, AC40)} == {800}
@@ -115,6 +115,6 @@ def test_a_fixed_mode_must_exist_at_every_station() -> None:
         fixed_mode("vht80-mcs7-1ss-800ns", {"a": AX80, "b": AC40})
 
 
-def test_an_antenna_survives_its_encoding() -> None:
+def test_an_encoded_antenna_is_decoded_without_change() -> None:
     for antenna in (AX80, G):
         assert decode_antenna(asdict(antenna)) == antenna

@@ -77,14 +77,14 @@ def test_each_receiver_of_a_packet_is_reported_exactly_once(
     model.log_losses(lambda _, number, name, __: reports.update([(number, name)]))
     model.place(0, places_m, relay)
     sent: set[tuple[int, str]] = set()
-    off: frozenset[str] = frozenset()
+    stations_off: frozenset[str] = frozenset()
     for number, (at_ns, event) in enumerate(events):
         if len(event) == 2:
-            off, cut = event
-            model.disturb(at_ns, off, cut)
+            stations_off, cut_links = event
+            model.disturb(at_ns, stations_off, cut_links)
             continue
         source, destination, size_bytes = event
-        if source in off or source == destination:
+        if source in stations_off or source == destination:
             continue
         sent |= {(number, name) for name in (destination or NAMES) if name != source}
         model.send(at_ns, source, number, size_bytes, destination)
@@ -93,27 +93,27 @@ def test_each_receiver_of_a_packet_is_reported_exactly_once(
     assert reports == Counter(sent)
 
 
-def losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
+def record_losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
     lost: list[tuple[int, str, str]] = []
     wifi.log_losses(lambda _, number, name, reason: lost.append((number, name, reason)))
     return lost
 
 
 def test_exhausted_retries_are_reported_at_the_sender_and_the_relay() -> None:
-    for unheard_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
-        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[unheard_link]), 1)
+    for missing_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
+        wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[missing_link]), 1)
         wifi.set_relay("r")
-        lost = losses(wifi)
+        lost = record_losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
         assert wifi.deliveries(10**9) == []
         assert lost == [(1, "b", RETRIES_EXHAUSTED)], lost_at
 
 
-def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
+def test_a_frame_whose_acks_are_lost_is_delivered_and_not_lost() -> None:
     channel = FixedPowers("ab", G54)
     channel.rows[1][0] = 0.0
     wifi: Wifi[int] = Wifi(channel, 1)
-    lost, attempts = losses(wifi), Counter[int]()
+    lost, attempts = record_losses(wifi), Counter[int]()
     wifi.log_attempts(lambda attempt: attempts.update([attempt.number]))
     wifi.send(0, "a", 1, 100, "b")
     assert [payload for _, _, payload, _, _ in wifi.deliveries(10**9)] == [1]
@@ -124,7 +124,7 @@ def test_a_frame_whose_acks_are_lost_was_delivered_not_lost() -> None:
 def test_queue_drops_and_undecoded_broadcasts_are_reported() -> None:
     channel = FixedPowers("abc", G54, without_link=[("a", "c")])
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=1)
-    lost = losses(wifi)
+    lost = record_losses(wifi)
     for number in range(3):
         wifi.send(0, "a", number, 100, None)
     wifi.deliveries(10**9)
@@ -133,7 +133,7 @@ def test_queue_drops_and_undecoded_broadcasts_are_reported() -> None:
 
 def test_a_radio_that_is_switched_off_loses_its_queue_and_current_frame() -> None:
     wifi: Wifi[int] = Wifi(FixedPowers("ab", G54), 1)
-    lost, decoded_by = losses(wifi), list[tuple[str, ...]]()
+    lost, decoded_by = record_losses(wifi), list[tuple[str, ...]]()
     wifi.log_attempts(lambda attempt: decoded_by.append(attempt.received))
     for number in range(3):
         wifi.send(0, "a", number, 1500, "b")

@@ -85,27 +85,27 @@ def test_packet_error_from_the_table_equals_the_formula(mode: WifiMode) -> None:
 
 
 def test_faster_modes_need_a_higher_snr() -> None:
-    def needed_db(mode: WifiMode) -> float:
+    def required_snr_db(mode: WifiMode) -> float:
         return next(ratio for ratio in np.arange(-5, 40, 0.05) if packet_error(mode, ratio, 1000) < 0.1)
 
     for modes in (G_MODES, N_MODES):
-        needed = [needed_db(mode) for mode in modes]
-        assert needed == sorted(needed)
-        assert 3 < needed[0] < 5
-        assert 21 < needed[-1] < 25
+        required_snrs_db = [required_snr_db(mode) for mode in modes]
+        assert required_snrs_db == sorted(required_snrs_db)
+        assert 3 < required_snrs_db[0] < 5
+        assert 21 < required_snrs_db[-1] < 25
 
 
 PLACES = st.tuples(st.floats(1, 300), st.floats(0.1, 3), st.floats(0.1, 3))
 
 
 @given(PLACES)
-def test_two_ray_loss_is_near_the_direct_path_and_symmetric(place: tuple[float, ...]) -> None:
-    distance_m, start_height_m, end_height_m = place
+def test_two_ray_loss_is_near_the_direct_path_and_symmetric(heights_and_distance: tuple[float, ...]) -> None:
+    distance_m, start_height_m, end_height_m = heights_and_distance
     start, end = np.array([[0, 0, start_height_m]]), np.array([[distance_m, 0, end_height_m]])
-    direct = propagation.free_space_db(start, end, WIFI_HZ)[0]
-    both = propagation.two_ray_db(start, end, WIFI_HZ)[0]
-    assert direct - 6.03 <= both <= direct + 40.01
-    assert both == pytest.approx(propagation.two_ray_db(end, start, WIFI_HZ)[0])
+    direct_db = propagation.free_space_db(start, end, WIFI_HZ)[0]
+    two_ray_db = propagation.two_ray_db(start, end, WIFI_HZ)[0]
+    assert direct_db - 6.03 <= two_ray_db <= direct_db + 40.01
+    assert two_ray_db == pytest.approx(propagation.two_ray_db(end, start, WIFI_HZ)[0])
 
 
 def test_far_two_ray_loss_is_40_db_per_decade() -> None:
@@ -180,13 +180,13 @@ def assert_clarke_correlation(power_gains: Floats, *paths: tuple[float, float]) 
     centred = power_gains - power_gains.mean()
     for steps in (2, 4, 8, 20):
         turns = 2 * math.pi * PATHS_M[steps] / WAVELENGTH_M
-        among_many = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
+        many_links = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
         echoes = np.ones(12, dtype=complex)
         for (share, angle), pairing in zip(paths, (5, 1, 7), strict=False):
             angles = (np.arange(12)[:, None] * pairing % 12 + np.linspace(0, 1, 101)) * math.pi / 6
             echoes *= np.exp(1j * share * turns * np.cos(angles - angle)).mean(axis=1)
         expected = (abs(echoes.sum()) ** 2 - (abs(echoes) ** 2).sum()) / (12**2 - 12)
-        assert expected == pytest.approx(among_many, abs=1 / 12)
+        assert expected == pytest.approx(many_links, abs=1 / 12)
         measured = (centred[:, :-steps] * centred[:, steps:]).mean() / centred.var()
         assert measured == pytest.approx(expected, abs=0.08)
 
@@ -232,5 +232,5 @@ def test_a_link_at_rest_does_not_fade() -> None:
 
 
 def test_fading_of_a_link_does_not_depend_on_other_links() -> None:
-    alone, among_many = fading(1, ("a", "b")), fading(1, ("a", "c"), ("a", "b"), ("b", "c"))
-    assert gains(alone, *RANDOM_ENDS[0], k=1.0) == gains(among_many, *RANDOM_ENDS[0], k=1.0, link=1)
+    single_link, many_links = fading(1, ("a", "b")), fading(1, ("a", "c"), ("a", "b"), ("b", "c"))
+    assert gains(single_link, *RANDOM_ENDS[0], k=1.0) == gains(many_links, *RANDOM_ENDS[0], k=1.0, link=1)

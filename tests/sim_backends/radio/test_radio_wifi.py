@@ -70,7 +70,7 @@ def bianchi_bit_s(stations: int, mode: WifiMode) -> float:
 
 
 @pytest.mark.parametrize("stations", [2, 5, 10, 20])
-def test_the_goodput_of_many_stations_equals_bianchi_s_model(stations: int) -> None:
+def test_the_goodput_of_many_stations_equals_that_of_bianchis_model(stations: int) -> None:
     names = [f"s{n}" for n in range(stations)]
     goodput = saturate(FixedPowers([*names, "r"], G54), names, "r", seconds=4)
     total = sum(goodput.values())
@@ -81,16 +81,16 @@ def test_the_goodput_of_many_stations_equals_bianchi_s_model(stations: int) -> N
 
 
 def test_hidden_stations_collide_more_than_visible_ones() -> None:
-    visible = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
+    visible_goodput = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
     hidden = saturate(FixedPowers("abr", G6, without_link=[("a", "b")]), "ab", "r", seconds=4)
-    assert sum(hidden.values()) < 0.75 * sum(visible.values())
+    assert sum(hidden.values()) < 0.75 * sum(visible_goodput.values())
 
 
 def test_an_access_point_needs_twice_the_airtime() -> None:
     direct = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
-    relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
+    is_relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
     # The access point competes with the station for each second hop, so a little is lost to collisions.
-    assert relayed == pytest.approx(direct / 2, rel=0.06)
+    assert is_relayed == pytest.approx(direct / 2, rel=0.06)
 
 
 def test_an_ack_follows_each_received_frame_after_sifs() -> None:
@@ -147,9 +147,7 @@ def test_a_full_queue_drops_the_newest_packets() -> None:
 
 
 def test_interference_that_starts_late_corrupts_a_frame() -> None:
-    """The stations are hidden from each other; the second starts during the first's frame, and is equally strong at
-    r.
-    """
+    """The stations are hidden from each other; the second starts during the frame of the first, and is as strong."""
     log: list[TransmissionAttempt] = []
     wifi: Wifi[str] = Wifi(FixedPowers("abr", G6, without_link=[("a", "b")]), 1)
     wifi.log_attempts(log.append)
@@ -169,7 +167,7 @@ def test_a_strong_frame_survives_weak_interference() -> None:
 
 
 def test_the_loss_of_a_weak_link_equals_its_packet_error() -> None:
-    """Broadcasts, so that no retry hides a loss."""
+    """Packets are broadcast, so that no retry hides a loss."""
     channel, ratio_db, size_bytes, frames = FixedPowers("ab", G6), 4.05, 1500, 4000
     channel.rows[0][1] = NOISE_MW * 10 ** (ratio_db / 10)
     channel.sensitivity_mw = [NOISE_MW] * 2
@@ -236,10 +234,10 @@ def test_the_number_of_events_per_frame_is_bounded() -> None:
     while (now_ns := wifi.next_event_ns()) is not None:
         wifi.deliveries(now_ns)
         steps += 1
-    sent = sum(attempt.number > 0 for attempt in log)
-    assert sent >= 400
+    data_attempts = sum(attempt.number > 0 for attempt in log)
+    assert data_attempts >= 400
     # Start and end of the frame, start and end of its ACK, and the timeout that the ACK made void.
-    assert steps <= 5 * sent
+    assert steps <= 5 * data_attempts
 
 
 def test_received_powers_follow_changes_of_the_channel() -> None:
@@ -264,8 +262,8 @@ def test_no_station_starts_while_it_detects_a_frame(seed: int, pairs_without_lin
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers(names, G54, without_link=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
     hidden = {*pairs, *((second, first) for first, second in pairs)}
-    sent = [attempt for attempt in log if attempt.number]
-    frames = sorted(sent, key=lambda attempt: attempt.start_ns)
+    data_attempts = [attempt for attempt in log if attempt.number]
+    frames = sorted(data_attempts, key=lambda attempt: attempt.start_ns)
     for number, first in enumerate(frames):
         for second in frames[number + 1 :]:
             if second.start_ns >= first.end_ns:
@@ -304,7 +302,7 @@ def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
 
 @given(st.sets(st.integers(0, 59)), st.booleans())
 @settings(max_examples=30)
-def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed: bool) -> None:
+def test_a_missing_packet_does_not_change_the_others(missing: set[int], is_relayed: bool) -> None:
     """Every draw is keyed by the packet and the attempt, also with packets of other flows."""
 
     def attempts(numbers: Sequence[int]) -> dict[int, list[tuple[int, str, bool]]]:
@@ -313,7 +311,7 @@ def test_a_missing_packet_does_not_change_the_others(missing: set[int], relayed:
         log: list[TransmissionAttempt] = []
         wifi: Wifi[int] = Wifi(channel, 1)
         wifi.log_attempts(log.append)
-        wifi.set_relay("r" if relayed else None)
+        wifi.set_relay("r" if is_relayed else None)
         for number in numbers:
             wifi.send(number * 100_000_000, "a", number, 1000, "b", packet=(f"flow {number % 3}", number // 3))
         wifi.deliveries(10**12)

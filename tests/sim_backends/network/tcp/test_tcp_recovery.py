@@ -70,7 +70,7 @@ def test_integer_arithmetic_stays_close_to_the_real_equations(samples_ns: list[i
         assert round_trips.timeout_ns == pytest.approx(smoothed + max(1, 4 * variation), abs=100)
 
 
-def test_after_one_loss_half_as_much_is_sent_as_arrives() -> None:
+def test_after_one_loss_every_second_ack_allows_a_segment() -> None:
     # 100 in flight, of which one is lost, and a threshold of 50: every second ACK allows one segment.
     reduction, pipe, sent = ProportionalReduction(50, 100, 1), 96, []
     for _ in range(90):
@@ -82,7 +82,7 @@ def test_after_one_loss_half_as_much_is_sent_as_arrives() -> None:
     assert pipe == 51  # 96 - 90 + 45
 
 
-def test_after_many_losses_as_much_is_sent_as_arrives_and_one_more_per_safe_ack() -> None:
+def test_after_many_losses_each_ack_allows_what_it_delivers_and_a_safe_ack_one_more() -> None:
     # 60 of 100 are lost: the bytes in flight are below the threshold from the start.
     reduction = ProportionalReduction(50, 100, 1)
     assert reduction.window_bytes(37, 1, is_safe=False) == 38
@@ -107,8 +107,8 @@ def test_no_more_is_sent_than_arrives_while_losses_are_detected(acks: list[tuple
         assert 0 <= sent <= arrived
 
 
-def test_at_the_threshold_nothing_more_is_sent() -> None:
-    # By the proportional share, which applies above the threshold, one would be sent.
+def test_at_the_threshold_no_segment_is_sent() -> None:
+    # The proportional share, which applies above the threshold, would allow one segment.
     assert ProportionalReduction(50, 100, 1).window_bytes(50, 1, is_safe=True) == 50
     assert ProportionalReduction(50, 100, 1).window_bytes(51, 1, is_safe=True) == 52
 
@@ -121,12 +121,12 @@ def test_a_sender_that_sent_more_than_arrived_waits() -> None:
 
 
 def test_a_safe_ack_allows_one_segment_more_than_it_delivers() -> None:
-    """For any amount sent before: MAX(prr_delivered - prr_out, DeliveredData) + MSS, in bytes."""
+    """The allowed amount is MAX(prr_delivered - prr_out, DeliveredData) + MSS, in bytes, for any earlier amount."""
     reduction = ProportionalReduction(50_000, 100_000, 1448)
     reduction.on_sent(9 * 1448)
     assert reduction.window_bytes(10_000, 2 * 1448, is_safe=True) == 10_000 + 3 * 1448
     assert reduction.window_bytes(10_000, 2 * 1448, is_safe=False) == 10_000
-    # With 15 more that arrived, 10 may be sent in addition to the one.
+    # After 15 more segments were delivered, 16 may be sent: DeliveredData + MSS.
     assert reduction.window_bytes(10_000, 15 * 1448, is_safe=True) == 10_000 + 16 * 1448
     reduction.on_sent(5 * 1448)
     assert reduction.window_bytes(10_000, 1448, is_safe=True) == 10_000 + 7 * 1448
@@ -139,16 +139,16 @@ STEPS = st.lists(st.tuples(st.integers(0, 120), st.integers(0, 9), st.booleans()
 def test_the_window_equals_the_equations_of_the_rfc(
     threshold: int, flight: int, segment: int, steps: list[tuple[int, int, bool, int]]
 ) -> None:
-    reduction, delivered_so_far, sent_so_far = ProportionalReduction(threshold, flight, segment), 0, 0
+    reduction, total_delivered, total_sent = ProportionalReduction(threshold, flight, segment), 0, 0
     for pipe, delivered, is_safe, sent in steps:
-        delivered_so_far += delivered
+        total_delivered += delivered
         if pipe > threshold:
-            count = math.ceil(Fraction(delivered_so_far * threshold, flight)) - sent_so_far
+            count = math.ceil(Fraction(total_delivered * threshold, flight)) - total_sent
         else:
-            limit = delivered_so_far - sent_so_far
+            limit = total_delivered - total_sent
             if is_safe:
                 limit = max(limit, delivered) + segment
             count = min(threshold - pipe, limit)
         assert reduction.window_bytes(pipe, delivered, is_safe=is_safe) == max(pipe, pipe + count)
         reduction.on_sent(sent)
-        sent_so_far += sent
+        total_sent += sent

@@ -1,3 +1,5 @@
+"""Ranges of sequence numbers, compared with sets of numbers."""
+
 from collections.abc import Sequence
 from itertools import pairwise
 
@@ -13,9 +15,9 @@ spans = st.tuples(st.integers(0, 60), st.integers(1, 12)).map(lambda span: (span
 def test_ranges_are_sets_of_numbers(added: Sequence[tuple[int, int]], before: int) -> None:
     ranges, numbers = Ranges(), set[int]()
     for first, end in added:
-        new = {number for part in ranges.add(first, end) for number in range(*part)}
-        assert new == set(range(first, end)) - numbers
-        numbers |= new
+        new_numbers = {number for part in ranges.add(first, end) for number in range(*part)}
+        assert new_numbers == set(range(first, end)) - numbers
+        numbers |= new_numbers
     stored = list(ranges)
     assert {number for part in stored for number in range(*part)} == numbers
     # They are sorted and neither overlap nor touch.

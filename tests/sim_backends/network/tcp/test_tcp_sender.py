@@ -47,8 +47,10 @@ class Transfer:
         self.wire.run(until_ns)
 
     def sent(self, *, times: int | None = None) -> list[tuple[int, int]]:
-        """Return time and number of each transmitted data segment; with `times` only those retransmitted so many
-        times.
+        """Return time and number of each transmission of a data segment.
+
+        Args:
+            times: Return only transmissions with this number of earlier ones, or all.
         """
         return [
             (transmission.at_ns, transmission.packet.body[1].number)
@@ -90,7 +92,7 @@ def test_reno_counts_acks_if_configured() -> None:
     assert list(per_round.values())[:4] == [16, 24, 36, 54]
 
 
-def test_a_link_is_used_at_its_full_rate() -> None:
+def test_a_transfer_uses_the_full_rate_of_a_link() -> None:
     transfer = Transfer(3000, TcpOptions(), rate_bit_s=20_000_000)
     # 20 Mbit/s for 20 ms are 33 segments; slow start is over long before the thousandth.
     arrivals_ns = list(transfer.wire.delivered.values())
@@ -130,12 +132,12 @@ def test_limited_transmit_sends_two_segments_before_a_loss_is_detected() -> None
     ack_times_ns = [first_ack_ns + number * MS for number in range(3)]
     sent = [(at_ns, number) for at_ns, number in transfer.sent() if at_ns > start_ns][:3]
     assert sent == list(zip(ack_times_ns, [10, 11, 0], strict=True))
-    # They do not count when the window is halved (RFC 5681, 3.2, step 2).
+    # These two segments do not count when the window is halved (RFC 5681, 3.2, step 2).
     assert transfer.events("loss")[0].window_bytes == 5 * MSS
 
 
 def test_a_segment_overtaken_by_two_others_is_not_sent_again() -> None:
-    # Two later segments overtake it (RFC 5681: three would make it lost).
+    # Two later segments overtake segment 20; RFC 5681 considers it lost only after three.
     def script(packet: IpPacket, *_: object) -> Sequence[int]:
         return (2 * MS + 1,) if packet.body[1].number == 20 and packet.body[1].length else (0,)
 
@@ -158,7 +160,7 @@ def test_the_last_segment_is_retransmitted_with_exponential_backoff(times: int) 
 
 
 def test_after_a_timeout_slow_start_retransmits_only_missing_segments() -> None:
-    # All segments of a window but the last two are lost, so there are no three later ones that indicate the loss.
+    # All segments of a window except the last two are lost, so fewer than three later segments indicate the loss.
     lost = set(range(30, 68))
     transfer = Transfer(70, ACK_EACH_SEGMENT, script=losing_data(lost))
     assert len(transfer.events("timeout")) == 1
@@ -307,7 +309,7 @@ def test_renos_sawtooth_has_the_throughput_of_mathis(period: int) -> None:
 
 @pytest.mark.parametrize("congestion", ["cubic", "cubic-rfc9438"])
 def test_cubic_follows_its_curve_with_acks_over_a_link(congestion: Literal["cubic", "cubic-rfc9438"]) -> None:
-    # The receive window of 200 segments limits the window until the loss.
+    # The receive window limits the window to 200 segments until the loss.
     options = TcpOptions(segments_per_ack=1, receive_window_bytes=200 * MSS, congestion=congestion)
     delay_ns, until_ns = 50 * MS, 6 * SECOND
     transfer = Transfer(20_000, options, script=losing_data({1500}), delay_ns=delay_ns, until_ns=until_ns)
