@@ -80,7 +80,7 @@ def test_a_robot_moves_along_its_path_and_returns_to_its_place(mobility: Mobilit
         assert medium.position_of(Role.SENDER) == pytest.approx((place[0] - 0.4, *place[1:]))
         assert medium.calls[-1][1][CAST[Role.SENDER].name] == (0.0, 0.0, 0.0)
     assert medium.position_of(Role.SENDER) == place
-    eastings_m = [start_m[0] for start_m in medium.positions_of(Role.SENDER)[1:-1] if start_m is not None]
+    eastings_m = [position_m[0] for position_m in medium.positions_of(Role.SENDER)[1:-1] if position_m is not None]
     assert eastings_m == sorted(eastings_m, reverse=True)
     velocities = [velocity[CAST[Role.SENDER].name] for _, velocity in medium.calls[1:-2]]
     assert velocities
@@ -155,7 +155,7 @@ def test_the_track_equals_the_positions_of_the_medium_and_discards_old_ones(
         wait(lambda: not motion_threads())
     track = mobility.track(0)
     assert [point.position_m for point in track if point.role is Role.SENDER] == medium.positions_of(Role.SENDER)
-    assert all(point.utc_ns <= other_name.utc_ns for point, other_name in pairwise(track))
+    assert all(point.utc_ns <= next_point.utc_ns for point, next_point in pairwise(track))
     assert [point.role for point in track].count(Role.RELAY) == 1
     last_points = mobility.track(time.time_ns())
     assert sorted(point.role for point in last_points) == sorted(CAST)

@@ -99,9 +99,8 @@ def test_the_laser_detects_the_wall_next_to_the_sender(emulation: EmulatedTestbe
     for beam, range_m in enumerate(ranges_m):
         angle_rad = math.radians(beam - 180)
         true_m = 0.9 / math.cos(angle_rad) if math.cos(angle_rad) > 0 else math.inf
-        if (
-            abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M
-        ):  # at this distance, noise decides between a range and infinity
+        # At the greatest distance, noise decides between a range and infinity.
+        if abs(true_m - LASER_RANGE_M[1]) > 6 * LASER_NOISE_M:
             expected_m = true_m if true_m < LASER_RANGE_M[1] else math.inf
             assert range_m == pytest.approx(expected_m, abs=6 * LASER_NOISE_M), beam
     emulation.place(PLACED)

@@ -41,11 +41,11 @@ def test_the_processor_is_chosen_again_after_an_exchange_on_any_processor(
     child: "subprocess.Popen[bytes]", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(processor_sharing, "_PERIOD_S", 0.0)
-    sharing, is_shared = ProcessorSharing(child.pid), []
+    sharing, were_shared = ProcessorSharing(child.pid), []
     for _ in range(4):
         with sharing:
-            is_shared.append(len(os.sched_getaffinity(0)) == 1)
-    assert is_shared == [False, True, False, True]
+            were_shared.append(len(os.sched_getaffinity(0)) == 1)
+    assert were_shared == [False, True, False, True]
 
 
 def test_this_thread_may_use_all_processors_after_an_exchange_that_fails(child: "subprocess.Popen[bytes]") -> None:

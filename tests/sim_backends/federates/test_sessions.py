@@ -196,7 +196,7 @@ def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:
     program.write_text("import sys\nsys.exit('\\n'.join(f'at line {n}\\x1b' for n in range(20)))\n", encoding="utf-8")
     with pytest.raises(FederateError) as caught:
         open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
-    lines = "".join(f"\n    at line {signal_number} " for signal_number in range(10, 20))
+    lines = "".join(f"\n    at line {number} " for number in range(10, 20))
     assert caught.value.what.endswith(f"it has exited with code 1; its last output:{lines}")
     with pytest.raises(ConfigurationError, match="the federate /nowhere/at-all cannot be started"):
         open_physics("/nowhere/at-all", HELLO, 20.0)
@@ -376,8 +376,8 @@ def test_mutated_requests_end_the_session_of_a_federate_or_are_answered() -> Non
         thread.start()
         mutated_number = rng.randrange(len(frames))
         with peer, suppress(BrokenPipeError, ConnectionResetError):
-            for signal_number, frame in enumerate(frames):
-                peer.sendall(mutate(frame, rng) if signal_number == mutated_number else frame)
+            for number, frame in enumerate(frames):
+                peer.sendall(mutate(frame, rng) if number == mutated_number else frame)
             peer.shutdown(socket.SHUT_WR)
         thread.join(20)
         assert not thread.is_alive(), seed

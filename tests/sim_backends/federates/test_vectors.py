@@ -23,7 +23,7 @@ VECTORS = {name: bytes.fromhex(text) for name, text in ROWS}
 UGV = (0, 0, 1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 0.25)
 
 
-class FrameReader:
+class ManualFrameReader:
     """A reader of frames by the tables of the documentation, without the code under test."""
 
     def __init__(self, frame: bytes) -> None:
@@ -49,9 +49,9 @@ def test_the_documentation_has_a_vector_of_each_layout() -> None:
 
 
 def test_the_handshake_is_read_by_hand() -> None:
-    join = FrameReader(VECTORS["join"])
+    join = ManualFrameReader(VECTORS["join"])
     assert (join.kind, join.unpack_values("8sH"), join.text(), join.remaining) == (1, (b"FIELDKIT", 1), "s3cret", b"")
-    hello = FrameReader(VECTORS["hello"])
+    hello = ManualFrameReader(VECTORS["hello"])
     assert (hello.kind, hello.request) == (2, 3)
     assert hello.unpack_values("8sHBBIQqq") == (b"FIELDKIT", 1, 1, 0, 1000, 7, 1_000_000, 2_000_000_000)
     assert hello.unpack_values("32s") == (hashlib.sha256(b"{}").digest(),)
@@ -59,7 +59,7 @@ def test_the_handshake_is_read_by_hand() -> None:
     assert (hello.text(), hello.text(), hello.unpack_values("Bd")) == ("ugv", "husky", (0, 0.5))
     assert hello.unpack_values("IIddddddd d") == (*UGV, 3.0)
     assert (hello.unpack_values("I"), hello.remaining) == ((2,), b"{}")
-    welcome = FrameReader(VECTORS["welcome"])
+    welcome = ManualFrameReader(VECTORS["welcome"])
     assert welcome.kind == 3
     assert welcome.unpack_values("HBBIqq") == (1, 1, 0, 1 + 16, 1_000_000, -1)
     assert welcome.unpack_values("32s") == (hashlib.sha256(b"{}").digest(),)
@@ -73,23 +73,23 @@ def test_the_handshake_is_read_by_hand() -> None:
 
 
 def test_requests_and_answers_are_read_by_hand() -> None:
-    request = FrameReader(VECTORS["advance physics"])
+    request = ManualFrameReader(VECTORS["advance physics"])
     assert (request.kind, request.unpack_values("qqI")) == (4, (11_100_000, 10_000_000, 2))
     assert request.unpack_values("IHHdd") == (0, 1, 16, 0.5, -0.125)
     *velocity, yaw_rad = request.unpack_values("IHHdddd")
     assert (velocity, math.isnan(yaw_rad), request.remaining) == ([1, 2, 32, 1.0, 0.0, 0.25], True, b"")
-    states = FrameReader(VECTORS["states"])
+    states = ManualFrameReader(VECTORS["states"])
     assert (states.kind, states.unpack_values("qII"), states.text()) == (5, (11_000_000, 1, 1), "uav")
     assert (states.unpack_values("I"), states.unpack_values("II8d")) == ((2,), (*UGV, 3.0))
     *drone, heading_rad, limit_m_s2 = states.unpack_values("II8d")
     assert drone == [1, 0, -1.5, 0.0, 10.0, 0.0, 0.5, -0.25]
     assert (math.isnan(heading_rad), limit_m_s2, states.remaining) == (True, math.inf, b"")
-    network = FrameReader(VECTORS["advance network"])
+    network = ManualFrameReader(VECTORS["advance network"])
     assert (network.kind, network.unpack_values("qqqII")) == (6, (11_099_999, 10_000_000, 1_000_000, 0, 1))
     assert (network.unpack_values("II8d"), network.unpack_values("I")) == ((*UGV, math.inf), (1,))
     assert network.unpack_values("QqQqqII") == (9, 4, 300, 10_000_000, 10_500_000, 0, 1)
     assert (network.text(), network.text(), network.remaining) == ("pose", "udp", b"")
-    outcomes = FrameReader(VECTORS["outcomes"])
+    outcomes = ManualFrameReader(VECTORS["outcomes"])
     assert (outcomes.kind, outcomes.unpack_values("qqI")) == (7, (11_099_999, 12_000_000, 1))
     assert (outcomes.unpack_values("QqII"), outcomes.unpack_values("IQ")) == ((9, 11_000_250, 1, 0), (1, 8))
     assert (outcomes.text(), outcomes.unpack_values("3q"), outcomes.remaining) == (
@@ -97,7 +97,7 @@ def test_requests_and_answers_are_read_by_hand() -> None:
         (100_000, 350_000, 33),
         b"",
     )
-    links = FrameReader(VECTORS["links"])
+    links = ManualFrameReader(VECTORS["links"])
     assert (links.kind, links.unpack_values("IIIdqq")) == (17, (1, 0, 0, -95.0, 11_099_999, 2_000_000))
     *link, rx_rate_bit_s = links.unpack_values("IIIdd d")
     assert (link, math.isnan(rx_rate_bit_s)) == ([1, 0, 1, -61.5, 54e6], True)
@@ -106,14 +106,14 @@ def test_requests_and_answers_are_read_by_hand() -> None:
 
 def test_short_messages_are_read_by_hand() -> None:
     for name, kind, number in (("ping", 8, 42), ("pong", 9, 42), ("busy", 10, 10_000_000)):
-        frame = FrameReader(example_frames()[name])
+        frame = ManualFrameReader(example_frames()[name])
         assert (frame.kind, frame.unpack_values("Q"), frame.remaining) == (kind, (number,), b"")
-    fork = FrameReader(VECTORS["fork"])
+    fork = ManualFrameReader(VECTORS["fork"])
     assert (fork.kind, fork.unpack_values("I"), fork.remaining) == (11, (2,), b"")
     for name, kind, copy in (("done", 12, 0), ("release", 13, 2), ("bye", 15, 0)):
-        frame = FrameReader(example_frames()[name])
+        frame = ManualFrameReader(example_frames()[name])
         assert (frame.kind, frame.copy, frame.remaining) == (kind, copy, b"")
-    error = FrameReader(VECTORS["error"])
+    error = ManualFrameReader(VECTORS["error"])
     assert (error.kind, error.text(), error.remaining) == (14, "ValueError: no wheels", b"")
 
 

@@ -174,10 +174,10 @@ def bianchi_bit_s(mode: WifiMode, stations: int) -> float:
     airtime_ns, aifs_ns = mode.airtime_ns(aggregate.size_bytes), mode.band.best_effort_aifs_ns
     success_ns = airtime_ns + mode.band.sifs_ns + response_ns(mode, aggregate.response_bytes) + aifs_ns
     collision_ns = airtime_ns + mode.band.sifs_ns + SLOT_NS + 20_000 + aifs_ns
-    idle, single_frame = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
-    slot_ns = idle * SLOT_NS + single_frame * success_ns + (1 - idle - single_frame) * collision_ns
+    idle, single = (1 - tau) ** stations, stations * tau * (1 - tau) ** (stations - 1)
+    slot_ns = idle * SLOT_NS + single * success_ns + (1 - idle - single) * collision_ns
     assert CCA_TIME_NS < SLOT_NS
-    return single_frame * len(aggregate.frames) * 8000 / slot_ns * 1e9
+    return single * len(aggregate.frames) * 8000 / slot_ns * 1e9
 
 
 # ns-3 3.37, `benchmarks.high_throughput_vs_ns3`: payloads of 1000 bytes, Mbit/s.
@@ -244,7 +244,7 @@ def test_frames_are_sent_again_until_their_block_ack_arrives() -> None:
     wifi: Wifi[int] = Wifi(channel, 1)
     wifi.use_meter()
     losses: list[int] = []
-    wifi.log_losses(lambda _, payload, *remaining_frames: losses.append(payload))
+    wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
     starts_ns: set[int] = set()
     wifi.log_attempts(lambda attempt: starts_ns.add(attempt.start_ns) if attempt.number else None)
     for number in range(3):
@@ -276,7 +276,7 @@ def test_a_dropped_frame_does_not_block_the_frames_after_it() -> None:
 def test_frames_of_a_station_that_is_switched_off_are_lost_once() -> None:
     wifi: Wifi[int] = Wifi(AggregatingPowers("ab", HT20_7), 1)
     losses: list[int] = []
-    wifi.log_losses(lambda _, payload, *remaining_frames: losses.append(payload))
+    wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
     for number in range(200):
         wifi.send(0, "a", number, 1028, "b")
     arrived = [payload for _, _, payload, _, _ in wifi.deliveries(3_000_000)]

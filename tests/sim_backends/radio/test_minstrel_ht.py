@@ -77,8 +77,8 @@ def test_at_a_fixed_signal_the_mode_has_the_highest_expected_rate(
         for mode in group
     }
     expected_rate = {
-        mode: min(share_of, 0.9) / (108_000 / 16 + 9600 / mode.rate_bit_s * 1e9) * (share_of >= 0.1)
-        for mode, share_of in received_shares.items()
+        mode: min(share, 0.9) / (108_000 / 16 + 9600 / mode.rate_bit_s * 1e9) * (share >= 0.1)
+        for mode, share in received_shares.items()
     }
     modes = first_modes(make_control(*groups(*radio)), 1500, received_shares.__getitem__, step_ns=5_000_000)
     used_mode = Counter(modes[1000:]).most_common(1)[0][0]

@@ -180,13 +180,13 @@ def assert_clarke_correlation(power_gains: Floats, *paths: tuple[float, float]) 
     centred = power_gains - power_gains.mean()
     for steps in (2, 4, 8, 20):
         turns = 2 * math.pi * PATHS_M[steps] / WAVELENGTH_M
-        many_links = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
+        of_many_echoes = math.prod(scipy.special.j0(share * turns) ** 2 for share, _ in paths)
         echoes = np.ones(12, dtype=complex)
         for (share, angle), pairing in zip(paths, (5, 1, 7), strict=False):
             angles = (np.arange(12)[:, None] * pairing % 12 + np.linspace(0, 1, 101)) * math.pi / 6
             echoes *= np.exp(1j * share * turns * np.cos(angles - angle)).mean(axis=1)
         expected = (abs(echoes.sum()) ** 2 - (abs(echoes) ** 2).sum()) / (12**2 - 12)
-        assert expected == pytest.approx(many_links, abs=1 / 12)
+        assert expected == pytest.approx(of_many_echoes, abs=1 / 12)
         measured = (centred[:, :-steps] * centred[:, steps:]).mean() / centred.var()
         assert measured == pytest.approx(expected, abs=0.08)
 

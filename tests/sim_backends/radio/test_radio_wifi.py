@@ -88,9 +88,9 @@ def test_hidden_stations_collide_more_than_visible_ones() -> None:
 
 def test_an_access_point_needs_twice_the_airtime() -> None:
     direct = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
-    is_relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
+    relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
     # The access point competes with the station for each second hop, so a little is lost to collisions.
-    assert is_relayed == pytest.approx(direct / 2, rel=0.06)
+    assert relayed == pytest.approx(direct / 2, rel=0.06)
 
 
 def test_an_ack_follows_each_received_frame_after_sifs() -> None:

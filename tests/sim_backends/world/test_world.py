@@ -79,7 +79,7 @@ def test_the_loss_depends_on_the_position_of_a_wall() -> None:
 def test_a_path_above_or_beside_a_wall_has_no_crossings() -> None:
     starts = np.array([[0, 5, 0.2], [0, 5, 3.0], [0, 1, 0.2], [0, 8.5, 0.2]])
     ends = np.array([[10, 5, 0.2], [10, 5, 3.0], [10, 1, 0.2], [10, 8.5, 0.2]])
-    assert [not crossed_parts for crossed_parts in world().crossings(starts, ends)] == [False, True, True, True]
+    assert [not parts for parts in world().crossings(starts, ends)] == [False, True, True, True]
 
 
 def test_crossings_are_computed_separately_for_each_path() -> None:

@@ -272,8 +272,13 @@ def test_a_report_of_many_settings_has_heat_maps_in_the_order_of_numbers(lab: Pa
 
 
 def test_factors_with_units_are_numbers() -> None:
-    label = ["radio.loss=2%,10%", "traffic.0.rate=1kHz,10Hz", "radio.tx_power=-3dBm,20dBm", "agents.a.along=-5m,5m"]
-    loss, rate, power, along = parse_factors(label)
+    factor_texts = [
+        "radio.loss=2%,10%",
+        "traffic.0.rate=1kHz,10Hz",
+        "radio.tx_power=-3dBm,20dBm",
+        "agents.a.along=-5m,5m",
+    ]
+    loss, rate, power, along = parse_factors(factor_texts)
     assert loss.numbers == ("radio_loss_value", "1", (0.02, 0.1))
     assert rate.numbers == ("traffic_0_rate_hz", "Hz", (1000, 10))
     assert power.numbers == ("radio_tx_power_dbm", "dBm", (-3, 20))

@@ -45,8 +45,8 @@ def checksum_extra(name: str, fields: list[tuple[str, str, int]]) -> int:
     """Return the CRC_EXTRA of a message (https://mavlink.io/en/guide/serialization.html#crc_extra)."""
     sizes = {"uint32_t": 4, "uint16_t": 2}
     crc = d.x25crc(f"{name} ".encode())
-    for message_id, field, length in sorted(fields, key=lambda field: -sizes.get(field[0], 1)):
-        crc.accumulate(f"{message_id} {field} ".encode() + bytes([length] * (length > 0)))
+    for field_type, field, length in sorted(fields, key=lambda field: -sizes.get(field[0], 1)):
+        crc.accumulate(f"{field_type} {field} ".encode() + bytes([length] * (length > 0)))
     return int(crc.crc & 0xFF ^ crc.crc >> 8)
 
 

@@ -151,8 +151,8 @@ def test_a_partly_written_slot_is_ignored(writer: PlacesWriter) -> None:
     old_bytes = os.pread(writer.fd, 1 << 10, 0)
     writer.write({"other": (4.0, 5.0, 6.0)})
     new_bytes = os.pread(writer.fd, 1 << 10, 0)
-    different_bytes = [index for index in range(len(old_bytes)) if old_bytes[index] != new_bytes[index]]
-    for end in different_bytes[1:]:  # all bytes that differ except the first may be missing
+    different_indices = [index for index in range(len(old_bytes)) if old_bytes[index] != new_bytes[index]]
+    for end in different_indices[1:]:  # all of these bytes except the first may be missing
         os.pwrite(writer.fd, new_bytes[:end] + old_bytes[end:], 0)
         assert Neighbourhood(writer.fd, len(NAMES)).targets(BODIES) == expected_targets(first_places_m)
 

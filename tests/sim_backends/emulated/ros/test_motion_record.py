@@ -121,8 +121,8 @@ def test_a_restarted_reporter_continues_at_the_last_position(tmp_path: Path) -> 
     reporter = MotionReporter(paths, record, 2 * S)
     reporter.poll_placement(2 * S)
     reporter.write(3 * S, (4.0, 0.0, 0.2), (1.0, 0.0, 0.0), odometry=(4.0, 0.0, 0.0))
-    age_ns = 60 * S
-    motion = MotionReporter(paths, record, age_ns).poll_placement(age_ns)
+    restart_ns = 60 * S
+    motion = MotionReporter(paths, record, restart_ns).poll_placement(restart_ns)
     assert motion is not None
     assert motion.place_m == pytest.approx((4.0 + SILENT_NS / 1e9, 0.0, 0.2))
     assert motion.speed_m_s == 0.0
