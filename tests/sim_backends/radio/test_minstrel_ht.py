@@ -28,8 +28,8 @@ def groups(
     return mode_groups(phy, phy)
 
 
-def make_control(*mode_groups: Sequence[WifiMode]) -> MinstrelHt:
-    return MinstrelHt(mode_groups, PacketDraws(1, "a", "b"))
+def make_control(*rate_groups: Sequence[WifiMode]) -> MinstrelHt:
+    return MinstrelHt(rate_groups, PacketDraws(1, "a", "b"))
 
 
 def first_modes(
