@@ -102,9 +102,9 @@ def test_an_agent_that_appears_during_a_run_can_receive_with_every_policy(policy
     network = Disc(10.0, 1000, extrapolates=extrapolates)
     sync_policy = make_policy(policy, window_s=0.005, longest_s=0.02)
     run = Coordinator(Agents(physics, programs), network, sync_policy, [("b", "a")]).advance(60 * MS)
-    to_late = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
-    assert len(to_late) >= 5
-    assert all(fate.assumed_states[1].position_m == (3.0, 4.0, 0.0) for fate in to_late)
+    fates_to_late_agent = [fate for fate in run.fates.values() if fate.packet.destination == "late"]
+    assert len(fates_to_late_agent) >= 5
+    assert all(fate.assumed_states[1].position_m == (3.0, 4.0, 0.0) for fate in fates_to_late_agent)
     assert not any(fate.reason for fate in run.fates.values())
 
 

@@ -69,18 +69,18 @@ def pair(
 )
 def test_a_timeout_names_the_federate_and_the_request(federate: str, message: str) -> None:
     stall = Stall(7 * MS, ENDLESS_S, LIMIT_S)
-    stalled = {
+    stalled_coordinator = {
         "physics": lambda: pair(physics=with_stall(paths(), stall)),
         "network": lambda: pair(network=with_stall(Disc(1.0, MS), stall)),
         "program": lambda: pair(program=with_stall(periodic(), stall)),
     }[federate]()
-    with pytest.raises(UnansweredError) as raised:
-        stalled.advance(1000 * MS)
-    assert raised.value.what == message
-    assert raised.value.remedy
+    with pytest.raises(UnansweredError) as error_info:
+        stalled_coordinator.advance(1000 * MS)
+    assert error_info.value.what == message
+    assert error_info.value.remedy
     last_window_ns = {"physics": 6, "network": 6, "program": 9}[federate] * MS
-    assert stalled.run.windows_ns[-1] == last_window_ns, "the run contains the earlier windows"
-    assert stalled.run.digest == pair().advance(last_window_ns).digest
+    assert stalled_coordinator.run.windows_ns[-1] == last_window_ns, "the run contains the earlier windows"
+    assert stalled_coordinator.run.digest == pair().advance(last_window_ns).digest
 
 
 def test_an_error_of_a_policy_that_extends_windows_states_the_time_that_the_window_has_reached() -> None:
@@ -90,9 +90,11 @@ def test_an_error_of_a_policy_that_extends_windows_states_the_time_that_the_wind
                 next(iter(()))
             return situation.now_ns + MS
 
-    with pytest.raises(FederateError, match=r"policy error_bounded failed at the request .* StopIteration") as raised:
+    with pytest.raises(
+        FederateError, match=r"policy error_bounded failed at the request .* StopIteration"
+    ) as error_info:
         pair(policy=FaultyPolicy()).advance(1000 * MS)
-    assert "extend the window beyond 0.007 s" in str(raised.value)
+    assert "extend the window beyond 0.007 s" in str(error_info.value)
 
 
 @pytest.mark.parametrize("part", ["agents", "network"])
@@ -185,9 +187,9 @@ class NetworkWithoutEvents(Disc):
     ],
 )
 def test_a_failure_names_the_federate_and_its_last_time(parts: dict[str, Any], message: str) -> None:
-    with pytest.raises(FederateError, match=message) as raised:
+    with pytest.raises(FederateError, match=message) as error_info:
         pair(**parts).advance(1000 * MS)
-    assert raised.value.__cause__ is not None
+    assert error_info.value.__cause__ is not None
 
 
 class FixedAnswerNetwork:

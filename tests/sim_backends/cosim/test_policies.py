@@ -243,12 +243,14 @@ def test_position_errors_are_half_a_window_for_any_step_of_the_physics(
 def test_half_the_window_has_half_the_error(policy: type[Scheduled | SlidingWindow | TimeStepped]) -> None:
     """All fixed windows are of the first order, in time or in space."""
     reference = passing_run(EventDriven())
-    coarse, fine = (errors(reference, passing_run(policy(window_s))) for window_s in (0.08, 0.04))
+    errors_of_long_windows, errors_of_short_windows = (
+        errors(reference, passing_run(policy(window_s))) for window_s in (0.08, 0.04)
+    )
     orders = [
         math.log2(coarse_error / fine_error)
         for coarse_error, fine_error in (
-            (coarse.delivery_error_s.mean, fine.delivery_error_s.mean),
-            (coarse.position_error_m.mean, fine.position_error_m.mean),
+            (errors_of_long_windows.delivery_error_s.mean, errors_of_short_windows.delivery_error_s.mean),
+            (errors_of_long_windows.position_error_m.mean, errors_of_short_windows.position_error_m.mean),
         )
         if coarse_error
     ]

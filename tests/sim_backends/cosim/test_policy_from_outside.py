@@ -67,10 +67,10 @@ def test_a_policy_that_cannot_be_used_is_refused_with_its_package(
 ) -> None:
     module = f"lazy_{len(message)}"
     install(source, "lazy", f"{module}:Lazy")
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         registry.make_policy("lazy")
     assert registry.make_policy("scheduled").name == "scheduled"
-    assert caught.value.where == f"entry point lazy = {module}:Lazy of contact-policy 1.0"
+    assert error_info.value.where == f"entry point lazy = {module}:Lazy of contact-policy 1.0"
 
 
 def test_a_policy_cannot_replace_a_built_in_one(install: Install) -> None:

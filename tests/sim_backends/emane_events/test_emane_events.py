@@ -186,10 +186,10 @@ def test_a_malformed_datagram_is_refused(datagram: bytes) -> None:
 )
 def test_altered_bytes_give_an_event_or_the_error(position: int, replacement: bytes, content: bytes) -> None:
     datagram = EventDatagram(UUID, 1, [SerializedEvent(1, 100, content)]).encode()
-    altered = datagram[:position] + replacement + datagram[position + len(replacement) :]
+    altered_datagram = datagram[:position] + replacement + datagram[position + len(replacement) :]
     for decode in (EventDatagram.decode, lambda data: EventDatagram.decode(with_size(data[2:]))):
         with suppress(MalformedEventError):
-            for event in decode(altered).events:
+            for event in decode(altered_datagram).events:
                 for decode_content in (decode_locations, decode_pathlosses):
                     with suppress(MalformedEventError):
                         assert isinstance(decode_content(event.content), list)

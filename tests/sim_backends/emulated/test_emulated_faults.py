@@ -165,9 +165,9 @@ def test_a_killed_server_restarts_with_another_process_id(emulation: EmulatedTes
 
 
 def test_a_process_that_does_not_run_cannot_be_killed(emulation: EmulatedTestbed) -> None:
-    with pytest.raises(RobotError, match="no process named roscore runs") as caught:
+    with pytest.raises(RobotError, match="no process named roscore runs") as error_info:
         emulation.inject(Fault(FaultKind.KILL, Role.SENDER, process="roscore"))
-    assert "/proc/[0-9]*/comm" in caught.value.remedy
+    assert "/proc/[0-9]*/comm" in error_info.value.remedy
 
 
 def test_a_request_with_a_short_timeout_does_not_affect_later_ones(emulation: EmulatedTestbed) -> None:

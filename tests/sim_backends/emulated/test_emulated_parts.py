@@ -200,9 +200,9 @@ class TestRequirements:
         monkeypatch.setattr("os.geteuid", lambda: 0)
         missing = {"sshd", "ping"}
         monkeypatch.setattr("shutil.which", lambda name, **_: None if name in missing else f"/usr/bin/{name}")
-        with pytest.raises(ConfigurationError, match="sshd, ping") as caught:
+        with pytest.raises(ConfigurationError, match="sshd, ping") as error_info:
             requirements.check()
-        assert caught.value.remedy.endswith("iputils-ping openssh-server")
+        assert error_info.value.remedy.endswith("iputils-ping openssh-server")
 
     def test_debians_ros_is_used_if_it_is_installed(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setattr(emulated_options, "ROS_FILES", (str(tmp_path),))
@@ -284,12 +284,12 @@ class TestTcpros:
     def test_a_header_is_read_from_chunks_of_any_size(self, fields: dict[str, str], cut: int) -> None:
         stream = framing.pack(framing.pack_header(fields)) + framing.pack(b"message")
         packets = framing.PacketSplitter()
-        received: list[bytes] = []
+        received_packets: list[bytes] = []
         for start in range(0, len(stream), cut):
             packets.feed(stream[start : start + cut])
-            received += packets
-        assert framing.unpack_header(received[0]) == fields
-        assert received[1:] == [b"message"]
+            received_packets += packets
+        assert framing.unpack_header(received_packets[0]) == fields
+        assert received_packets[1:] == [b"message"]
         assert packets.pending == 0
 
     def test_a_truncated_header_is_rejected(self) -> None:

@@ -164,7 +164,7 @@ def test_the_laptop_announces_only_its_address() -> None:
 
 def test_a_missing_daemon_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "which", lambda name, **_: None if name == "babeld" else f"/bin/{name}")
-    with pytest.raises(ConfigurationError) as raised:
+    with pytest.raises(ConfigurationError) as error_info:
         requirements.check({"babeld"})
-    assert raised.value.what == "emulated robots need programs that are not installed: babeld"
-    assert raised.value.remedy.endswith("apt-get install --no-install-recommends babeld")
+    assert error_info.value.what == "emulated robots need programs that are not installed: babeld"
+    assert error_info.value.remedy.endswith("apt-get install --no-install-recommends babeld")

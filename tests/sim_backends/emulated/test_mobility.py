@@ -200,16 +200,18 @@ class SteeringRobot:
 
     spec: SimpleNamespace = field(default_factory=lambda: SimpleNamespace(steers=True))
     paths: list[AssignedPath] = field(default_factory=list)
-    recorded: RecordedMotion | None = None
+    last_recorded_motion: RecordedMotion | None = None
 
     def move(self, path: AssignedPath) -> None:
         self.paths.append(path)
 
     def recorded_motion(self) -> RecordedMotion | None:
-        return self.recorded
+        return self.last_recorded_motion
 
     def record(self, place_m: Vector, velocity_m_s: Vector = STILL) -> None:
-        self.recorded = RecordedMotion(time.monotonic_ns(), self.paths[-1].start_ns, place_m, velocity_m_s)
+        self.last_recorded_motion = RecordedMotion(
+            time.monotonic_ns(), self.paths[-1].start_ns, place_m, velocity_m_s
+        )
 
 
 @pytest.fixture
@@ -236,7 +238,7 @@ def test_the_medium_follows_a_robot_that_steers_itself_until_the_lab_places_it(
         assert medium.position_of(Role.RELAY) == (7.0, 8.0, 12.0)
         mobility.place(Placement(Scenario.LOS, Topology.MASTER, parse_distance("10m")))
         assert medium.position_of(Role.RELAY) == place
-        robot.recorded = RecordedMotion(time.monotonic_ns(), robot.paths[0].start_ns, (1.0, 2.0, 3.0))
+        robot.last_recorded_motion = RecordedMotion(time.monotonic_ns(), robot.paths[0].start_ns, (1.0, 2.0, 3.0))
         mobility.set_out_of_range(None)
         assert medium.position_of(Role.RELAY) == place, "motion from before the placement is ignored"
     assert len(medium.calls) > calls

@@ -195,10 +195,10 @@ def test_the_documentation_lists_all_services_and_topics_that_the_node_lacks(rep
     assert {"list_parameters", "get_type_description"} <= services_of_rclpy
     assert report["services_of_node"][node_name] == []
     topics_of_robot = {topic for topic, _ in report["topics_of_nodes"][node_name]}
-    missing = services_of_rclpy | (set(report["topics_of_listener"]) - topics_of_robot - {"/cmd_vel"})
+    missing_names = services_of_rclpy | (set(report["topics_of_listener"]) - topics_of_robot - {"/cmd_vel"})
     page = (ROOT / "docs" / "add-a-robot.md").read_text(encoding="utf-8")
     section = page.partition("### What its node lacks")[2].partition("\n## ")[0]
-    assert [name for name in sorted(missing) if f"`{name}`" not in section] == []
+    assert [name for name in sorted(missing_names) if f"`{name}`" not in section] == []
     assert "`/rosout`" in section
 
 
@@ -206,22 +206,22 @@ def test_the_documentation_lists_all_services_and_topics_that_the_node_lacks(rep
 def test_a_real_ros_2_receives_the_right_values_over_the_medium(
     multicast: EmulatedTestbed, report: Mapping[str, Any]
 ) -> None:
-    received = report["messages"]
+    received_messages = report["messages"]
     for topic in RECEIVED:
         stamps_s = [
             message["header"]["stamp"]["sec"] + message["header"]["stamp"]["nanosec"] / 1e9
-            for message in received[topic]
+            for message in received_messages[topic]
         ]
         assert len(stamps_s) == COUNT
         assert all(0 <= time.time() - stamp_s < LONG_S for stamp_s in stamps_s), topic
-    scan = received["/scan"][0]
+    scan = received_messages["/scan"][0]
     assert scan["header"]["frame_id"] == "base_scan"
     assert scan["ranges"] == [math.inf] * 360, "the lawn has nothing within 3.5 m of the line"
-    odom = received["/odom"][0]
+    odom = received_messages["/odom"][0]
     assert (odom["header"]["frame_id"], odom["child_frame_id"]) == ("odom", "base_footprint")
     assert odom["pose"]["covariance"][:: 6 + 1] == list(ODOMETRY_VARIANCES)
-    assert received["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
-    battery = received["/battery_state"][0]
+    assert received_messages["/imu"][0]["linear_acceleration"]["z"] == pytest.approx(GRAVITY_M_S2, abs=0.2)
+    battery = received_messages["/battery_state"][0]
     assert battery["percentage"] == pytest.approx(0.8)
     assert math.isnan(battery["current"])
     # A scan is 2.9 kB, in two fragments.

@@ -177,11 +177,11 @@ def test_the_first_of_equal_robots_publishes_and_the_relay_runs_roscore() -> Non
 
 
 def test_the_built_in_ros_has_no_shared_master(monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigurationError, match="which for emulated robots needs Debian's ROS") as caught:
+    with pytest.raises(ConfigurationError, match="which for emulated robots needs Debian's ROS") as error_info:
         requirements.check_shared_master(RosChoice.BUILTIN)
-    assert "python3-rosmaster" in caught.value.remedy
+    assert "python3-rosmaster" in error_info.value.remedy
     requirements.check_shared_master(RosChoice.DEBIAN)
     monkeypatch.setattr(requirements, "_MASTER_FILES", {"/no/roscore": "python3-roslaunch"})
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         requirements.check_shared_master(RosChoice.DEBIAN)
-    assert caught.value.remedy.startswith("apt-get install --no-install-recommends python3-roslaunch, and")
+    assert error_info.value.remedy.startswith("apt-get install --no-install-recommends python3-roslaunch, and")

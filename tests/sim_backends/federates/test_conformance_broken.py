@@ -310,9 +310,9 @@ class LosesByKey(DelayNetwork):
     def advance(self, to_ns: int, packets: Sequence[Packet], states: States) -> Outcome:
         ends_m = [states[name].position_m for name in ("ann", "bob") if name in states]
         distance_m = math.dist(*ends_m) if len(ends_m) == 2 else 0.0
-        lost = [packet for packet in packets if distance_m > 30 and self.draw(packet) < 0.5]
-        arrivals, drops = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
-        return arrivals, [*drops, *(Drop(packet.packet_id, "bad luck") for packet in lost)]
+        lost_packets = [packet for packet in packets if distance_m > 30 and self.draw(packet) < 0.5]
+        arrivals, drops = super().advance(to_ns, [packet for packet in packets if packet not in lost_packets], states)
+        return arrivals, [*drops, *(Drop(packet.packet_id, "bad luck") for packet in lost_packets)]
 
     def draw(self, packet: Packet) -> float:
         return random.Random(f"{self.seed} {packet.identity}").random()
@@ -349,9 +349,9 @@ class UnknownTransmitter(DelayNetwork):
 
 
 def random_delay(self: DelayNetwork, arrivals: list[Arrival], drops: list[Drop], to_ns: int) -> Outcome:
-    lost = [arrival for arrival in arrivals if random.random() < 0.5]
-    remaining = [arrival for arrival in arrivals if arrival not in lost]
-    return remaining, [Drop(arrival.packet_id, "bad luck") for arrival in lost]
+    lost_arrivals = [arrival for arrival in arrivals if random.random() < 0.5]
+    remaining_arrivals = [arrival for arrival in arrivals if arrival not in lost_arrivals]
+    return remaining_arrivals, [Drop(arrival.packet_id, "bad luck") for arrival in lost_arrivals]
 
 
 def turn_errors_into(kind: MessageKind) -> Alter:

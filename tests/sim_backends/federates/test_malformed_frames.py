@@ -28,9 +28,9 @@ BODIES = {name: frame[HEADER_BYTES:] for name, frame in example_frames().items()
 def test_each_cut_frame_is_refused_with_its_position(name: str) -> None:
     complete_lengths = {len(BODIES["outcomes"]) - 24} if name == "outcomes" else set()  # delay parts are optional
     for length in set(range(len(BODIES[name]))) - complete_lengths:
-        with pytest.raises(MalformedFrameError, match=r"^byte \d+: ") as raised:
+        with pytest.raises(MalformedFrameError, match=r"^byte \d+: ") as error_info:
             DECODERS[name](BODIES[name][:length])
-        assert 0 <= raised.value.position <= HEADER_BYTES + length
+        assert 0 <= error_info.value.position <= HEADER_BYTES + length
     with pytest.raises(MalformedFrameError, match=r"^byte \d+: "):
         DECODERS[name](BODIES[name] + b"\0")
 
@@ -60,9 +60,9 @@ def test_mutated_frames_raise_no_other_error_and_allocate_little_memory(name: st
     ],
 )
 def test_a_wrong_header_is_refused(fields: tuple[int, ...], message: str) -> None:
-    with pytest.raises(MalformedFrameError) as raised:
+    with pytest.raises(MalformedFrameError) as error_info:
         read_header(struct.pack("<IHHII", *fields))
-    assert str(raised.value) == message
+    assert str(error_info.value) == message
 
 
 @pytest.mark.parametrize(
@@ -86,9 +86,9 @@ def test_an_error_states_the_position_of_the_wrong_byte(
 ) -> None:
     body = bytearray(BODIES[name])
     body[position : position + len(wrong_bytes)] = wrong_bytes
-    with pytest.raises(MalformedFrameError) as raised:
+    with pytest.raises(MalformedFrameError) as error_info:
         DECODERS[name](bytes(body))
-    assert str(raised.value).startswith(message)
+    assert str(error_info.value).startswith(message)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e308])

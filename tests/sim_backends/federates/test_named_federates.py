@@ -79,9 +79,9 @@ def test_the_name_builtin_means_the_built_in_federates() -> None:
 def test_a_federate_that_cannot_be_used_is_refused_with_a_remedy(
     role: int, name: str, message: str, remedy: str
 ) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         command_line(name, role)
-    assert caught.value.remedy == remedy
+    assert error_info.value.remedy == remedy
 
 
 def test_the_conformance_suite_checks_a_federate_by_its_name(

@@ -95,9 +95,9 @@ def test_an_error_names_the_federate_the_request_and_the_byte(
     physics.advance(0, {})
     if error is UnansweredError:
         physics.session._deadline_s = 0.3
-    with pytest.raises(error) as raised:
+    with pytest.raises(error) as error_info:
         physics.advance(1_100_000, {"ann": Twist(0.5)})
-    text = str(raised.value)
+    text = str(error_info.value)
     assert message in text
     assert text.startswith("physics carts (test) ")
     with pytest.raises(FederateError, match="the connection to physics carts"):
@@ -108,9 +108,9 @@ def test_a_timeout_has_the_last_time() -> None:
     physics = remote_carts(alter_from_second_states(lambda frame: None))
     physics.advance(0, {})
     physics.session._deadline_s = 0.3
-    with pytest.raises(UnansweredError, match="; its last time is 0 s") as raised:
+    with pytest.raises(UnansweredError, match="; its last time is 0 s") as error_info:
         physics.advance(5 * MS, {})
-    assert raised.value.exit_code == 3
+    assert error_info.value.exit_code == 3
 
 
 class SlowPhysics:
@@ -159,9 +159,9 @@ def test_a_child_that_is_killed_or_suspended_is_named_and_terminated(
     physics.session._deadline_s = 2.0
     (pid,) = children(start_s)
     os.kill(pid, signal_number)
-    with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py'?\) ") as raised:
+    with pytest.raises(FederateError, match=r"^physics carts \(.*carts.py'?\) ") as error_info:
         physics.advance(3 * MS, {})
-    assert message in str(raised.value)
+    assert message in str(error_info.value)
 
 
 def test_a_federate_that_fieldkit_has_not_started_is_named_and_not_terminated() -> None:
@@ -194,25 +194,25 @@ def test_a_child_that_fails_shows_its_last_output(tmp_path: Path) -> None:
     with pytest.raises(FederateError, match=r"it has exited with code 7; its last output: no licence"):
         open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
     program.write_text("import sys\nsys.exit('\\n'.join(f'at line {n}\\x1b' for n in range(20)))\n", encoding="utf-8")
-    with pytest.raises(FederateError) as caught:
+    with pytest.raises(FederateError) as error_info:
         open_physics(shlex.join((sys.executable, str(program))), HELLO, 20.0)
     lines = "".join(f"\n    at line {number} " for number in range(10, 20))
-    assert caught.value.what.endswith(f"it has exited with code 1; its last output:{lines}")
+    assert error_info.value.what.endswith(f"it has exited with code 1; its last output:{lines}")
     with pytest.raises(ConfigurationError, match="the federate /nowhere/at-all cannot be started"):
         open_physics("/nowhere/at-all", HELLO, 20.0)
 
 
 def test_a_child_that_prints_to_its_standard_output_is_an_error_with_a_remedy() -> None:
-    with pytest.raises(FederateError, match="byte 4: there is no kind of message") as caught:
+    with pytest.raises(FederateError, match="byte 4: there is no kind of message") as error_info:
         open_physics("sh -c 'echo loading the world ...; exec cat >/dev/null'", HELLO, 20.0)
-    assert caught.value.remedy == "standard output carries only frames; print to standard error"
+    assert error_info.value.remedy == "standard output carries only frames; print to standard error"
 
 
 def test_an_unknown_scheme_shows_the_addresses() -> None:
-    with pytest.raises(ConfigurationError, match=r"'quic:127.0.0.1:7000' is not an address") as caught:
+    with pytest.raises(ConfigurationError, match=r"'quic:127.0.0.1:7000' is not an address") as error_info:
         open_physics("quic:127.0.0.1:7000", HELLO, 20.0)
-    assert caught.value.remedy.startswith("use tcp:HOST:PORT, tcp-listen:HOST:PORT, udp:HOST:PORT, ")
-    assert caught.value.remedy.endswith(", or a command, for example 'python3 carts.py'")
+    assert error_info.value.remedy.startswith("use tcp:HOST:PORT, tcp-listen:HOST:PORT, udp:HOST:PORT, ")
+    assert error_info.value.remedy.endswith(", or a command, for example 'python3 carts.py'")
 
 
 def test_output_of_the_federates_code_does_not_reach_the_protocol(tmp_path: Path) -> None:

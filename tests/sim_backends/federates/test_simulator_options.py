@@ -60,18 +60,18 @@ def sent_options(scenario: CosimScenario, role: int) -> dict[str, object]:
     ],
 )
 def test_a_wrong_option_has_its_line_and_a_remedy(value: str, message: str, tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         load_changed(tmp_path, value)
-    assert message in caught.value.what
-    assert caught.value.where == f"{tmp_path / 'pair.yaml'}:8"
+    assert message in error_info.value.what
+    assert error_info.value.where == f"{tmp_path / 'pair.yaml'}:8"
 
 
 def test_an_option_of_the_command_line_is_validated_too(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigurationError, match=r"in network.options.standard: '802.11ax' is not one of: 802.11a"
-    ) as caught:
+    ) as error_info:
         load_changed(tmp_path, network__options__standard="802.11ax")
-    assert "correct the option with this value" in caught.value.remedy
+    assert "correct the option with this value" in error_info.value.remedy
     with pytest.raises(ConfigurationError, match="gazebo is a physics, not a network"):
         load_changed(tmp_path, network__federate="gazebo")
     with pytest.raises(ConfigurationError, match="unknown key gravity; no keys are valid here"):
@@ -126,9 +126,9 @@ def test_an_unsupported_protocol_is_an_error_with_its_line(line: str, message: s
     path = tmp_path / "pair.yaml"
     path.write_text(SCENARIO.replace("PHYSICS", "gazebo").replace("VALUE", "{}") + line + "\n", encoding="utf-8")
     changes = {"physics.options": None, "network.federate": "ns3"}
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         load_scenario(path, changes)
-    assert caught.value.where.startswith(f"{path}:13")
+    assert error_info.value.where.startswith(f"{path}:13")
     load_scenario(path, changes | {"network.federate": "builtin", "network.options": None})
     load_scenario(path, changes | {"network.transports": "builtin"})
 
@@ -158,9 +158,9 @@ def test_options_of_ns3_without_an_effect_are_refused_with_their_line(
 ) -> None:
     path = tmp_path / "pair.yaml"
     path.write_text(NETWORK_ONLY.replace("KEYS", keys).replace("RADIO", radio), encoding="utf-8")
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         load_scenario(path)
-    assert caught.value.where == f"{path}:5"
+    assert error_info.value.where == f"{path}:5"
 
 
 def test_reliable_topics_over_ns3_are_refused_with_their_line(tmp_path: Path) -> None:

@@ -85,9 +85,9 @@ def drive(physics: RemotePhysics, windows: int = 50) -> list[dict[str, State]]:
 
 
 def error_of(gazebo: GazeboServer, options: Mapping[str, object], windows: int = 100) -> str:
-    with pytest.raises(FederateError) as caught, open_federate(gazebo, options) as physics:
+    with pytest.raises(FederateError) as error_info, open_federate(gazebo, options) as physics:
         drive(physics, windows)
-    return str(caught.value.what)
+    return str(error_info.value.what)
 
 
 @pytest.fixture(scope="module")
@@ -330,6 +330,6 @@ def test_a_model_that_cannot_be_created_is_reported(
         open_federate(gazebo, {"timeout_s": 3, **options}, LIFETIMES) as physics,
     ):
         physics.advance(50_000_000, {})
-        with pytest.raises(FederateError, match=message) as caught:
+        with pytest.raises(FederateError, match=message) as error_info:
             physics.advance(100_000_000, {})
-    assert "whose last time is 0.099 s" in caught.value.what
+    assert "whose last time is 0.099 s" in error_info.value.what

@@ -122,6 +122,8 @@ def test_missing_libraries_are_reported_with_the_command_that_installs_them(
 ) -> None:
     monkeypatch.setenv("PKG_CONFIG_LIBDIR", str(tmp_path))
     monkeypatch.delenv("PKG_CONFIG_PATH", raising=False)
-    with pytest.raises(ConfigurationError, match="gazebo-adapter needs the library ignition-transport11") as caught:
+    with pytest.raises(
+        ConfigurationError, match="gazebo-adapter needs the library ignition-transport11"
+    ) as error_info:
         command_line("gazebo", PHYSICS)
-    assert "apt-get install g++ pkg-config nlohmann-json3-dev libignition-transport-dev" in caught.value.remedy
+    assert "apt-get install g++ pkg-config nlohmann-json3-dev libignition-transport-dev" in error_info.value.remedy

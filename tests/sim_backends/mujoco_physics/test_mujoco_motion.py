@@ -142,13 +142,13 @@ def test_robots_stop_at_a_wall_and_do_not_pass_it() -> None:
 
 
 def test_a_robot_climbs_a_ramp_to_raised_ground_but_not_its_side() -> None:
-    raised: dict[str, object] = {
+    raised_ground: dict[str, object] = {
         "name": "raised",
         "kind": "raised",
         "centre_m": [7, 0],
         "size_m": [4, 20, 4 * math.tan(0.15)],
     }
-    obstacles = (ramp(math.degrees(0.15), 4, 3.0), raised)
+    obstacles = (ramp(math.degrees(0.15), 4, 3.0), raised_ground)
     simulation = physics(husky(), burger("blocked", east_m=10.0), obstacles=obstacles)
     state_after(simulation, 0, {"husky": Twist(1.0), "blocked": Twist(-0.2)})
     states = state_after(simulation, 7.5)

@@ -93,17 +93,17 @@ def test_an_unstable_simulation_is_an_error_that_names_time_and_agent() -> None:
     simulation.advance(20_000_000, {})
     first_dof = simulation.model.joint("a1").dofadr[0]
     simulation.data.qvel[first_dof] = 1e12
-    with pytest.raises(FederateError, match=r"mujoco became unstable until 0\.03 s, first at bob") as caught:
+    with pytest.raises(FederateError, match=r"mujoco became unstable until 0\.03 s, first at bob") as error_info:
         simulation.advance(30_000_000, {})
-    assert "shorter step" in caught.value.remedy
+    assert "shorter step" in error_info.value.remedy
 
 
 def test_a_missing_mujoco_is_an_error_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "sim_backends.mujoco_physics.physics")
     monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(ConfigurationError, match="needs the Python package mujoco") as caught:
+    with pytest.raises(ConfigurationError, match="needs the Python package mujoco") as error_info:
         MUJOCO.load()
-    assert caught.value.remedy.endswith("-m pip install 'fieldkit[mujoco]'")
+    assert error_info.value.remedy.endswith("-m pip install 'fieldkit[mujoco]'")
 
 
 def test_an_agent_without_a_known_body_has_a_body_of_its_kind_and_size() -> None:

@@ -227,7 +227,9 @@ class BroadcastTransport:
         raise AssertionError("record_loss must not be called for broadcasts")
 
 
-def broadcast(places_m: dict[str, tuple[float, float, float]], sent: Sequence[Packet]) -> list[tuple[int, str, int]]:
+def broadcast(
+    places_m: dict[str, tuple[float, float, float]], sent_packets: Sequence[Packet]
+) -> list[tuple[int, str, int]]:
     transports: list[BroadcastTransport] = []
 
     def make(wire: Wire) -> BroadcastTransport:
@@ -235,14 +237,14 @@ def broadcast(places_m: dict[str, tuple[float, float, float]], sent: Sequence[Pa
         return transports[0]
 
     net = network(wifi(list(places_m)), list(places_m), transports={"shout": make})
-    net.advance(10**9, sent, standing(places_m))
+    net.advance(10**9, sent_packets, standing(places_m))
     return transports[0].received
 
 
 def test_a_fragmented_broadcast_reaches_all_stations_in_range() -> None:
     places_m = {"a": (0.0, 0.0, 1.0), "b": (10.0, 0.0, 1.0), "c": (0.0, 20.0, 1.0), "d": (200.0, 0.0, 1.0)}
-    received = broadcast(places_m, packets([(0, "a", "b", 4000)], protocol="shout"))
-    assert [(host, number) for _, host, number in received] == [("b", 1), ("c", 1)]
+    arrivals = broadcast(places_m, packets([(0, "a", "b", 4000)], protocol="shout"))
+    assert [(host, number) for _, host, number in arrivals] == [("b", 1), ("c", 1)]
 
 
 @pytest.mark.parametrize("interval_ns", [5_000, 300_000, 1_000_000, 1_410_000, 1_430_000, 3_000_000])
@@ -251,12 +253,12 @@ def test_overlapping_frames_of_hidden_stations_collide(are_hidden: bool, interva
     """A frame of 1000 bytes at 6 Mbit/s; both senders are equally far from the receiver, so both frames are lost."""
     distance_m = 60.0 if are_hidden else 10.0
     places_m = {"a": (-distance_m, 0.0, 1.0), "b": (0.0, 0.0, 1.0), "c": (distance_m, 0.0, 1.0)}
-    sent = packets([(0, "a", "b", 1000), (interval_ns, "c", "b", 1000)], protocol="shout")
-    received = {number for _, host, number in broadcast(places_m, sent) if host == "b"}
+    sent_packets = packets([(0, "a", "b", 1000), (interval_ns, "c", "b", 1000)], protocol="shout")
+    received_numbers = {number for _, host, number in broadcast(places_m, sent_packets) if host == "b"}
     # Preamble of 20 us, extension of 6 us, symbols of 4 us with 24 bits each.
     airtime_ns = 26_000 + 4_000 * -(-(22 + 8 * 1036) // 24)
     assert airtime_ns == G_MODES[0].airtime_ns(1036)
-    assert received == (set() if are_hidden and interval_ns < airtime_ns else {1, 2})
+    assert received_numbers == (set() if are_hidden and interval_ns < airtime_ns else {1, 2})
 
 
 def test_simultaneous_events_run_in_the_documented_order() -> None:
@@ -320,10 +322,10 @@ class EchoingUdp(Udp):
 @pytest.mark.parametrize("delay_ms", [0, 2])
 def test_replies_without_delay_arrive_in_the_same_nanosecond(delay_ms: int) -> None:
     net = network(fixed(delay=f"{delay_ms}ms"), "ab", transports={"udp": EchoingUdp})
-    sent = packets([(MS, "a", "b", 10)])
-    assert outcome(sent, *net.advance(10 * MS, sent, standing(dict.fromkeys("ab", (0, 0, 0))))).arrived == {
-        ("a to b", 0): MS + 4 * delay_ms * MS
-    }
+    sent_packets = packets([(MS, "a", "b", 10)])
+    assert outcome(
+        sent_packets, *net.advance(10 * MS, sent_packets, standing(dict.fromkeys("ab", (0, 0, 0))))
+    ).arrived == {("a to b", 0): MS + 4 * delay_ms * MS}
 
 
 def test_a_timer_in_the_past_is_rejected() -> None:

@@ -42,13 +42,13 @@ def loss_power_dbm(folder: Path, network: str, mode: str, first_dbm: int) -> flo
             "traffic": stream(rate="500Hz", size_bytes=600),
         },
     )
-    sent: Counter[int] = Counter()
-    received: Counter[int] = Counter()
+    sent_counts: Counter[int] = Counter()
+    received_counts: Counter[int] = Counter()
     for fate in run.fates.values():
         step = fate.packet.sent_ns // (STEP_MS * MS) - 1
-        sent[step] += 1
-        received[step] += fate.arrived_ns is not None
-    shares = [received[step] / sent[step] for step in range(STEPS)]
+        sent_counts[step] += 1
+        received_counts[step] += fate.arrived_ns is not None
+    shares = [received_counts[step] / sent_counts[step] for step in range(STEPS)]
     for step, (share_before, share_after) in enumerate(pairwise(shares)):
         if share_before >= 0.5 > share_after:
             return first_dbm + step + (share_before - 0.5) / (share_before - share_after)
@@ -68,9 +68,9 @@ def test_a_station_does_not_send_while_it_receives_strong_noise(network: str, tm
     changes = {"duration": "400ms", "faults": [jammer], "traffic": stream(size_bytes=300)}
     run = run_pair(tmp_path, network, changes)
     assert reasons(run).total() <= 1, "the last packet may be under way"
-    deferred = [fate for fate in arrived(run) if 101 * MS < fate.packet.sent_ns < 199 * MS]
-    assert len(deferred) >= 9
-    assert all(200 * MS <= (fate.arrived_ns or 0) < 240 * MS for fate in deferred)
+    deferred_fates = [fate for fate in arrived(run) if 101 * MS < fate.packet.sent_ns < 199 * MS]
+    assert len(deferred_fates) >= 9
+    assert all(200 * MS <= (fate.arrived_ns or 0) < 240 * MS for fate in deferred_fates)
 
 
 @pytest.mark.parametrize("network", NETWORKS)

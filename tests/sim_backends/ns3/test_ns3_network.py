@@ -200,9 +200,9 @@ def test_a_missing_library_is_reported_with_the_command_that_installs_it(
         (tmp_path / name).write_text("#!/bin/sh\nexit 1\n", encoding="ascii")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigurationError, match="needs the library ns3-core, which is not installed") as caught:
+    with pytest.raises(ConfigurationError, match="needs the library ns3-core, which is not installed") as error_info:
         command_line("ns3", NETWORK)
-    assert caught.value.remedy == "apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev"
+    assert error_info.value.remedy == "apt-get install g++ pkg-config libns3-dev nlohmann-json3-dev"
     monkeypatch.setenv("PATH", "/nonexistent")
     with pytest.raises(ConfigurationError, match=r"needs g\+\+, which is not installed"):
         command_line("ns3", NETWORK)

@@ -54,13 +54,13 @@ def advance_frame(
     to_ns: int = 10_000_000,
     packets: Sequence[Packet] = (),
     *,
-    announced: Sequence[str] = AGENTS,
-    copy: int = 0,
-    extra: str = "",
+    announced_agents: Sequence[str] = AGENTS,
+    copy_number: int = 0,
+    extra_agent: str = "",
 ) -> bytes:
-    states = {**STATES, **({extra: State((0.0, 0.0, 1.0))} if extra else {})}
-    body = AdvanceNetwork(to_ns, states, packets).encode(AgentTable(announced))
-    return encode(MessageKind.ADVANCE_NETWORK, 2, copy, body)
+    states = {**STATES, **({extra_agent: State((0.0, 0.0, 1.0))} if extra_agent else {})}
+    body = AdvanceNetwork(to_ns, states, packets).encode(AgentTable(announced_agents))
+    return encode(MessageKind.ADVANCE_NETWORK, 2, copy_number, body)
 
 
 def refusal(*frames: bytes) -> str:
@@ -118,16 +118,19 @@ Frames = Callable[[Hello], Sequence[bytes]]
     [
         (lambda _: [advance_frame()], "hello is missing, or there is no such copy"),
         (lambda hello: [hello_frame(hello), hello_frame(hello)], "hello was sent twice"),
-        (lambda hello: [hello_frame(hello), advance_frame(copy=3)], "hello is missing, or there is no such copy"),
+        (
+            lambda hello: [hello_frame(hello), advance_frame(copy_number=3)],
+            "hello is missing, or there is no such copy",
+        ),
         (lambda hello: [hello_frame(hello), encode(MessageKind.FORK, 2, 0, b"\1\0\0\0")], "is not supported"),
         (
             lambda hello: [hello_frame(hello), encode(MessageKind.SAMPLE_LINKS, 2, 0, b"x")],
             "bytes follow the message",
         ),
         (lambda hello: [hello_frame(hello), advance_frame(5), advance_frame(4)], "time runs backwards to 4 ns"),
-        (lambda hello: [hello_frame(hello), advance_frame(extra="eve")], "an agent has appeared, which ns-3"),
+        (lambda hello: [hello_frame(hello), advance_frame(extra_agent="eve")], "an agent has appeared, which ns-3"),
         (
-            lambda hello: [hello_frame(hello), advance_frame(announced=[*AGENTS, "eve"], extra="eve")],
+            lambda hello: [hello_frame(hello), advance_frame(announced_agents=[*AGENTS, "eve"], extra_agent="eve")],
             "agent 2 was not announced",
         ),
         (

@@ -82,9 +82,9 @@ def test_a_single_frame_is_answered_by_an_ack_and_has_a_delimiter_only_in_vht_an
 
 
 def test_each_subframe_but_the_last_is_padded_to_four_bytes() -> None:
-    padded, last = SUBFRAME_BYTES + 2, SUBFRAME_BYTES
+    padded_bytes, last_bytes = SUBFRAME_BYTES + 2, SUBFRAME_BYTES
     assert SUBFRAME_BYTES % 4 == 2
-    assert session(VHT80_9).build_aggregate(frames(3), VHT80_9).size_bytes == 2 * padded + last
+    assert session(VHT80_9).build_aggregate(frames(3), VHT80_9).size_bytes == 2 * padded_bytes + last_bytes
 
 
 def test_a_recipient_ignores_frames_that_it_has_received() -> None:
@@ -103,33 +103,39 @@ def test_only_frames_to_the_receiver_of_the_first_are_aggregated() -> None:
 
 def test_the_window_starts_at_the_oldest_unacknowledged_frame() -> None:
     queue, agreement = frames(100), session(VHT80_9)
-    first = agreement.build_aggregate(queue, VHT80_9)
-    remove_frames(queue, set(first.frames[1:]))
-    second = agreement.build_aggregate(queue, VHT80_9)
-    assert [frame.sequence for frame in second.frames] == [0], "sequence numbers 1 to 63 fill the rest of the window"
-    remove_frames(queue, set(first.frames[:1]))
+    first_aggregate = agreement.build_aggregate(queue, VHT80_9)
+    remove_frames(queue, set(first_aggregate.frames[1:]))
+    second_aggregate = agreement.build_aggregate(queue, VHT80_9)
+    assert [frame.sequence for frame in second_aggregate.frames] == [0], (
+        "sequence numbers 1 to 63 fill the rest of the window"
+    )
+    remove_frames(queue, set(first_aggregate.frames[:1]))
     assert [frame.sequence for frame in agreement.build_aggregate(queue, VHT80_9).frames] == list(range(64, 100))
 
 
 @given(st.lists(st.sets(st.integers(0, 19)), max_size=12), st.sets(st.integers(0, 19)))
 def test_a_recipient_delivers_each_frame_once_and_in_order(
-    decoded: list[set[int]], skipped_numbers: set[int]
+    decoded_numbers: list[set[int]], skipped_numbers: set[int]
 ) -> None:
     agreement = session(VHT80_9)
-    sent = list(agreement.build_aggregate(frames(20), VHT80_9).frames)
+    sent_frames = list(agreement.build_aggregate(frames(20), VHT80_9).frames)
     delivered_frames = [
-        frame for numbers in decoded for frame in agreement.receive([sent[number] for number in numbers])
+        frame
+        for numbers in decoded_numbers
+        for frame in agreement.receive([sent_frames[number] for number in numbers])
     ]
     assert [frame.sequence for frame in delivered_frames] == list(range(len(delivered_frames))), (
         "there is no gap before a frame is skipped"
     )
     delivered_frames += agreement.skip(
-        [frame for frame in sent if frame.sequence in skipped_numbers and not frame.is_received]
+        [frame for frame in sent_frames if frame.sequence in skipped_numbers and not frame.is_received]
     )
-    remaining_frames = [frame for frame in sent if not frame.is_received and frame.sequence not in skipped_numbers]
+    remaining_frames = [
+        frame for frame in sent_frames if not frame.is_received and frame.sequence not in skipped_numbers
+    ]
     delivered_frames += agreement.receive(remaining_frames)
-    received = set().union(*decoded) | {frame.sequence for frame in remaining_frames}
-    assert [frame.sequence for frame in delivered_frames] == sorted(received)
+    received_numbers = set().union(*decoded_numbers) | {frame.sequence for frame in remaining_frames}
+    assert [frame.sequence for frame in delivered_frames] == sorted(received_numbers)
 
 
 @pytest.mark.parametrize("mode", [HT20_7, VHT80_9, HE80_11], ids=lambda mode: mode.name)

@@ -47,16 +47,16 @@ def goodputs(categories: Sequence[int], *, seconds: float, in_one_station: bool 
     names = ["s0" if in_one_station else f"s{number}" for number in range(len(categories))]
     wifi: Wifi[int] = Wifi(CategorizedPowers([*dict.fromkeys(names), "r"], HT20_7), 1)
     arrived = [0] * len(categories)
-    waiting = [number for number in range(len(categories)) for _ in range(120)]
-    wifi.log_losses(lambda _, number, *rest: waiting.append(number))
+    queued_categories = [number for number in range(len(categories)) for _ in range(120)]
+    wifi.log_losses(lambda _, number, *rest: queued_categories.append(number))
     now_ns: int | None = 0
     while now_ns is not None and now_ns < seconds * 1e9:
         for _, _, number, _, _ in wifi.deliveries(now_ns):
             arrived[number] += 1
-            waiting.append(number)
-        for number in waiting:
+            queued_categories.append(number)
+        for number in queued_categories:
             wifi.send(now_ns, names[number], number, 1028, "r", dscp=DSCP[categories[number]])
-        waiting.clear()
+        queued_categories.clear()
         now_ns = wifi.next_event_ns()
     return [count * 8e-3 / seconds for count in arrived]
 

@@ -32,9 +32,9 @@ def test_empty_options_are_valid() -> None:
     ],
 )
 def test_invalid_options_are_named_in_the_error(text: str, message: str) -> None:
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         options(text)
-    assert caught.value.where == "radio.yaml:1"
+    assert error_info.value.where == "radio.yaml:1"
 
 
 def test_configured_values_apply_to_every_link() -> None:

@@ -56,15 +56,15 @@ def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool
     missing_after_one, missing_after_all, delays_ns = [], [], []
     for number in range(DATAGRAMS):
         start_ns = number * INTERVAL_NS * MAX_TRANSMISSIONS
-        missing = set(FRAGMENTS)
+        missing_fragments = set(FRAGMENTS)
         for attempt in range(MAX_TRANSMISSIONS):
-            arrived_ns = send(model, start_ns + attempt * RETRANSMIT_NS, missing)
-            missing -= arrived_ns.keys()
+            arrived_ns = send(model, start_ns + attempt * RETRANSMIT_NS, missing_fragments)
+            missing_fragments -= arrived_ns.keys()
             if not attempt:
-                missing_after_one.append(len(missing))
-                if not missing:
+                missing_after_one.append(len(missing_fragments))
+                if not missing_fragments:
                     delays_ns.append(max(arrived_ns.values()) - start_ns)
-        missing_after_all.append(len(missing))
+        missing_after_all.append(len(missing_fragments))
     packets = DATAGRAMS * len(FRAGMENTS)
     return Outcome(
         packets=sum(missing_after_one) / packets,
@@ -93,8 +93,8 @@ def test_behind_the_wall_loss_grows_with_distance_and_is_higher_for_datagrams_th
 ) -> None:
     outcomes = [trial(Scenario.NLOS, topology, distance) for distance in distances]
     assert all(nearer.packets < farther.packets for nearer, farther in pairwise(outcomes))
-    farther = outcomes[-1]
-    assert farther.packets < farther.datagrams < 6 * farther.packets
+    farthest = outcomes[-1]
+    assert farthest.packets < farthest.datagrams < 6 * farthest.packets
 
 
 @pytest.mark.parametrize(("topology", "distance"), [(Topology.MASTER, "30ft"), (Topology.MASTERLESS, "55ft")])

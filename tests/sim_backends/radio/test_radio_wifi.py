@@ -82,15 +82,15 @@ def test_the_goodput_of_many_stations_equals_that_of_bianchis_model(stations: in
 
 def test_hidden_stations_collide_more_than_visible_ones() -> None:
     visible_goodput = saturate(FixedPowers("abr", G6), "ab", "r", seconds=4)
-    hidden = saturate(FixedPowers("abr", G6, without_link=[("a", "b")]), "ab", "r", seconds=4)
-    assert sum(hidden.values()) < 0.75 * sum(visible_goodput.values())
+    hidden_goodput = saturate(FixedPowers("abr", G6, without_link=[("a", "b")]), "ab", "r", seconds=4)
+    assert sum(hidden_goodput.values()) < 0.75 * sum(visible_goodput.values())
 
 
 def test_an_access_point_needs_twice_the_airtime() -> None:
-    direct = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
-    relayed = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
+    direct_goodput = saturate(FixedPowers("abr", G54), "a", "b", seconds=2)["a"]
+    relayed_goodput = saturate(FixedPowers("abr", G54), "a", "b", seconds=2, relay="r")["a"]
     # The access point competes with the station for each second hop, so a little is lost to collisions.
-    assert relayed == pytest.approx(direct / 2, rel=0.06)
+    assert relayed_goodput == pytest.approx(direct_goodput / 2, rel=0.06)
 
 
 def test_an_ack_follows_each_received_frame_after_sifs() -> None:
@@ -174,10 +174,10 @@ def test_the_loss_of_a_weak_link_equals_its_packet_error() -> None:
     wifi: Wifi[int] = Wifi(channel, 1, queue_packets=frames)
     for number in range(frames):
         wifi.send(0, "a", number, size_bytes, None)
-    lost = 1 - len(wifi.deliveries(60 * 10**9)) / frames
+    loss = 1 - len(wifi.deliveries(60 * 10**9)) / frames
     expected = packet_error(G6, ratio_db, size_bytes + HEADER_BYTES)
     assert 0.02 < expected < 0.5
-    assert lost == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / frames))
+    assert loss == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / frames))
 
 
 def test_below_4_db_the_preamble_is_not_detected() -> None:
@@ -261,14 +261,14 @@ def test_no_station_starts_while_it_detects_a_frame(seed: int, pairs_without_lin
     pairs = [(names[first], names[second]) for first, second in pairs_without_link if first != second]
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers(names, G54, without_link=pairs), "abcd", "e", seconds=0.1, seed=seed, log=log)
-    hidden = {*pairs, *((second, first) for first, second in pairs)}
+    hidden_pairs = {*pairs, *((second, first) for first, second in pairs)}
     data_attempts = [attempt for attempt in log if attempt.number]
     frames = sorted(data_attempts, key=lambda attempt: attempt.start_ns)
     for number, first in enumerate(frames):
         for second in frames[number + 1 :]:
             if second.start_ns >= first.end_ns:
                 break
-            if (first.transmitter, second.transmitter) not in hidden:
+            if (first.transmitter, second.transmitter) not in hidden_pairs:
                 assert second.start_ns - first.start_ns <= CCA_TIME_NS
 
 

@@ -167,9 +167,9 @@ def test_after_rts_without_data_other_stations_wait_no_longer_than_for_the_cts()
     wifi.send(0, "a", 0, 1028, "r")
     wifi.send(1000, "b", 1, 1028, "r")
     wifi.deliveries(10**9)
-    sent = [attempt for attempt in log if attempt.control == "RTS"]
-    position = [attempt.transmitter for attempt in sent].index("b")
-    first, second = sent[position - 1 : position + 1]
+    rts_attempts = [attempt for attempt in log if attempt.control == "RTS"]
+    position = [attempt.transmitter for attempt in rts_attempts].index("b")
+    first, second = rts_attempts[position - 1 : position + 1]
     assert first.transmitter == "a"
     cts_ns = G_MODES[0].airtime_ns(14)
     waits_ns = second.start_ns - first.end_ns - 2 * BAND.sifs_ns - cts_ns - 20_000 - 2 * SLOT_NS - BAND.difs_ns

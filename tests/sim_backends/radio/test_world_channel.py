@@ -164,6 +164,6 @@ def test_a_station_of_802_11n_supports_the_modes_of_802_11g() -> None:
 
 def test_an_unsupported_fixed_mode_is_rejected_at_the_start() -> None:
     antennas = {"old": Antenna("802.11g", 15.0, -85.0), "new": Antenna("802.11n", 15.0, -92.0)}
-    with pytest.raises(ConfigurationError, match=r"radio\.mode n6 is not a mode of the radio of old") as caught:
+    with pytest.raises(ConfigurationError, match=r"radio\.mode n6 is not a mode of the radio of old") as error_info:
         WorldChannel(1, antennas, RadioOptions(mode="n6"))
-    assert "g54" in caught.value.remedy
+    assert "g54" in error_info.value.remedy

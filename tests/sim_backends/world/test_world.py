@@ -197,16 +197,16 @@ def test_an_invalid_world_is_reported_with_its_line(valid_text: str, message: st
         "kind: wall": "kind: fence",
         "height: 2.4m": "height: 2.4",
     }
-    with pytest.raises(ConfigurationError, match=message) as caught:
+    with pytest.raises(ConfigurationError, match=message) as error_info:
         world(text=WORLD.replace(valid_text, invalid_texts[valid_text]))
-    assert caught.value.where.startswith("yard.yaml:")
+    assert error_info.value.where.startswith("yard.yaml:")
 
 
 def test_an_unknown_world_is_an_error_with_a_suggestion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigurationError, match="no world 'lwn'") as caught:
+    with pytest.raises(ConfigurationError, match="no world 'lwn'") as error_info:
         load_world("lwn")
-    assert caught.value.remedy == "did you mean 'lawn'?"
+    assert error_info.value.remedy == "did you mean 'lawn'?"
     (tmp_path / "worlds").mkdir()
     (tmp_path / "worlds" / "yard.yaml").write_text(WORLD.replace("X", "5"), encoding="utf-8")
     assert load_world("yard").name == "yard"

@@ -67,10 +67,10 @@ def test_jitter_equals_that_of_the_harness_in_the_order_of_arrival() -> None:
 def test_values_without_arrivals_are_nan() -> None:
     end_states = fate(0, None).true_states
     under_way = Fate(Packet(9, "a", "b", 1, ("waiting", 0), 0, 0, "tcp"), end_states, end_states)
-    lost, waiting = flow_results(run_with(fate(0, None), under_way))
-    assert (lost.loss, lost.arrived_bytes) == (1.0, 0)
-    assert math.isnan(waiting.loss)
-    for flow in (lost, waiting):
+    lost_flow, waiting_flow = flow_results(run_with(fate(0, None), under_way))
+    assert (lost_flow.loss, lost_flow.arrived_bytes) == (1.0, 0)
+    assert math.isnan(waiting_flow.loss)
+    for flow in (lost_flow, waiting_flow):
         assert all(
             math.isnan(value) for value in (flow.delay_s.mean, flow.jitter_s, flow.added_s, flow.first_to_last_s)
         )

@@ -93,14 +93,15 @@ def test_a_program_with_a_fast_clock_sends_more_often_and_stamps_the_reading() -
 
 
 def test_the_correction_of_a_clock_neither_repeats_nor_delays_a_datagram() -> None:
-    ahead = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
+    fast_clock = AgentClock(begin_ns=20 * MS, end_ns=50 * MS, offset_ns=15 * MS)
     times_ns = [
-        at_ns for at_ns, _ in sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=10 * MS), ahead), 100 * MS)
+        at_ns
+        for at_ns, _ in sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=10 * MS), fast_clock), 100 * MS)
     ]
     # The reading is 35 ms at 20 ms, and 60 ms at 45 ms. At 50 ms it falls from 65 ms to 50 ms, so the datagram after
     # the one at the reading 60 ms is sent at 70 ms.
     assert times_ns == [0, 10 * MS, 20 * MS, 25 * MS, 35 * MS, 45 * MS, 70 * MS, 80 * MS, 90 * MS, 100 * MS]
-    behind = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
-    packets = sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=MS), behind), 10_001 * MS)
+    slow_clock = AgentClock(end_ns=10_000 * MS, offset_ns=-9_000 * MS)
+    packets = sent_datagrams(ProgramWithClock(Periodic("a", "b", period_ns=MS), slow_clock), 10_001 * MS)
     assert [at_ns for at_ns, _ in packets[-3:]] == [9_999 * MS, 10_000 * MS, 10_001 * MS]
     assert [datagram.number for _, datagram in packets] == list(range(len(packets)))

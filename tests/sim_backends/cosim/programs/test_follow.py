@@ -51,12 +51,12 @@ def test_older_states_and_other_datagrams_are_ignored() -> None:
     program = FollowAtHeadway("a")
     latest = received_state((5.0, 0.0, 0.0), sent_ns=40 * MS)
     expected = FollowAtHeadway("a").wake(50 * MS, FOLLOWER_STATE, [latest])
-    ignored = [
+    ignored_datagrams = [
         received_state((9.0, 0.0, 0.0), sent_ns=30 * MS),
         received_state((9.0, 0.0, 0.0), source="b", sent_ns=50 * MS),
         ReceivedDatagram("a", "hello", 50 * MS, 50 * MS),
     ]
-    assert program.wake(50 * MS, FOLLOWER_STATE, [latest, *ignored]) == expected
+    assert program.wake(50 * MS, FOLLOWER_STATE, [latest, *ignored_datagrams]) == expected
 
 
 @pytest.mark.parametrize(
@@ -131,10 +131,12 @@ def test_a_drone_that_keeps_station_hovers_without_states() -> None:
     assert program.wake(2 * S, FOLLOWER_STATE, []).command == Velocity()
 
 
-@pytest.mark.parametrize("wrong", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}])
-def test_parameters_that_are_not_above_0_are_refused(wrong: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "invalid_parameters", [{"headway_s": 0.0}, {"standstill_m": -1.0}, {"period_ns": 0}, {"timeout_ns": 0}]
+)
+def test_parameters_that_are_not_above_0_are_refused(invalid_parameters: dict[str, float]) -> None:
     with pytest.raises(ConfigurationError, match="above 0"):
-        FollowAtHeadway("a", **wrong)  # type: ignore[arg-type]
+        FollowAtHeadway("a", **invalid_parameters)  # type: ignore[arg-type]
     with pytest.raises(ConfigurationError, match="cannot fly"):
         HoldStation(["a"], above_m=0.0)
     with pytest.raises(ConfigurationError, match="no agent to follow"):

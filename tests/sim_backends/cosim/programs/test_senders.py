@@ -138,9 +138,9 @@ def test_combined_programs_wake_at_their_own_times_and_receive_all_datagrams() -
     while (wake_ns := program.next_wake_ns()) is not None:
         commands.append((wake_ns, program.wake(wake_ns, ORIGIN, ()).command))
     assert commands == [(3, "first"), (5, "second"), (7, "second")]
-    received = [ReceivedDatagram("a", None, 0, 9)]
-    assert program.wake(9, ORIGIN, received) == Action()
-    assert first.received == second.received == received
+    received_datagrams = [ReceivedDatagram("a", None, 0, 9)]
+    assert program.wake(9, ORIGIN, received_datagrams) == Action()
+    assert first.received == second.received == received_datagrams
     # With a fast clock a program may wake later than planned.
     assert (
         CombinedProgram([CommandingProgram("first", 3), CommandingProgram("second", 5)]).wake(4, ORIGIN, ()).command

@@ -89,9 +89,9 @@ def dissect(recorded_run: RecordedRun, name: str) -> list[Packet]:
 @pytest.mark.parametrize("name", NAMES)
 def test_scapy_reads_the_packets_that_the_network_logged(recorded_run: RecordedRun, name: str) -> None:
     frames = dissect(recorded_run, name)
-    logged = [(at_ns, fragment) for at_ns, host, fragment in recorded_run.log if host == name]
-    assert len(frames) == len(logged) > 100
-    for frame, (at_ns, fragment) in zip(frames, logged, strict=True):
+    logged_fragments = [(at_ns, fragment) for at_ns, host, fragment in recorded_run.log if host == name]
+    assert len(frames) == len(logged_fragments) > 100
+    for frame, (at_ns, fragment) in zip(frames, logged_fragments, strict=True):
         packet = fragment.packet
         assert packet.destination is not None
         ip = frame[IP]
@@ -137,9 +137,9 @@ def test_checksums_equal_those_that_scapy_computes(recorded_run: RecordedRun, na
 
 def with_scapy_checksum(packet: Packet, kind: type[Packet]) -> Packet:
     """Return a packet with a checksum that scapy has computed."""
-    copy = IP(bytes(packet))
-    del copy[kind].chksum
-    return IP(bytes(copy))
+    packet_copy = IP(bytes(packet))
+    del packet_copy[kind].chksum
+    return IP(bytes(packet_copy))
 
 
 def reassemble(packets: Sequence[Packet]) -> list[Packet]:
@@ -148,13 +148,15 @@ def reassemble(packets: Sequence[Packet]) -> list[Packet]:
     for packet in packets:
         if packet.frag or "MF" in packet.flags:
             parts.setdefault((packet.src, packet.id), {})[packet.frag * 8] = packet
-    complete: list[Packet] = []
+    whole_packets: list[Packet] = []
     for by_offset in parts.values():
-        last = by_offset[max(by_offset)]
+        last_fragment = by_offset[max(by_offset)]
         data = b"".join(bytes(by_offset[offset].payload) for offset in sorted(by_offset))
-        if "MF" not in last.flags and len(data) == max(by_offset) + len(last.payload):
-            complete.append(IP(bytes(IP(src=last.src, dst=last.dst, proto=last.proto) / data)))
-    return complete
+        if "MF" not in last_fragment.flags and len(data) == max(by_offset) + len(last_fragment.payload):
+            whole_packets.append(
+                IP(bytes(IP(src=last_fragment.src, dst=last_fragment.dst, proto=last_fragment.proto) / data))
+            )
+    return whole_packets
 
 
 @pytest.mark.emulated
@@ -179,8 +181,8 @@ def test_the_robots_of_a_scenario_capture_the_packets_of_their_network(tmp_path:
         path.stem: len(list(PcapReader(str(path)))) for path in (tmp_path / "run" / "captures").iterdir()
     }
     assert packet_counts.keys() == scenario.agents.keys()
-    arrived = sum(fate.arrived_ns is not None for fate in run.fates.values())
-    assert sum(packet_counts.values()) >= len(run.fates) + arrived > 10, (
+    arrived_count = sum(fate.arrived_ns is not None for fate in run.fates.values())
+    assert sum(packet_counts.values()) >= len(run.fates) + arrived_count > 10, (
         "each packet at its sender, and at its receiver"
     )
 
@@ -189,9 +191,9 @@ class EveryThirdPacketLost(Disc):
     def advance(
         self, to_ns: int, packets: Sequence[NetworkPacket], states: Mapping[str, State]
     ) -> tuple[list[Arrival], list[Drop]]:
-        lost = [packet for packet in packets if packet.packet_id % 3 == 0]
-        arrivals, _ = super().advance(to_ns, [packet for packet in packets if packet not in lost], states)
-        return arrivals, [Drop(packet.packet_id, "third") for packet in lost]
+        lost_packets = [packet for packet in packets if packet.packet_id % 3 == 0]
+        arrivals, _ = super().advance(to_ns, [packet for packet in packets if packet not in lost_packets], states)
+        return arrivals, [Drop(packet.packet_id, "third") for packet in lost_packets]
 
 
 def test_packets_of_another_network_are_captured_as_datagrams_at_both_ends(tmp_path: Path) -> None:

@@ -90,13 +90,13 @@ def test_windows_have_the_pair_that_determined_them(tmp_path: Path, policy: Sync
 def test_the_tables_can_be_read_without_fieldkit(tmp_path: Path) -> None:
     live_run = record(tmp_path / "run")
     packets = pq.read_table(tmp_path / "run" / "packets").to_pandas()
-    arrived = packets[packets.flow == "ab"].dropna(subset=["arrived_ns"])
-    assert set(arrived.arrived_ns - arrived.enters_ns) == {1_234_567}
+    arrived_packets = packets[packets.flow == "ab"].dropna(subset=["arrived_ns"])
+    assert set(arrived_packets.arrived_ns - arrived_packets.enters_ns) == {1_234_567}
     assert (
         (packets.reason == "out of range").sum() == sum(bool(fate.reason) for fate in live_run.fates.values()) > 100
     )
-    under_way = packets[packets.arrived_ns.isna() & (packets.reason == "")]
-    assert list(under_way.sent_ns) == [1081 * 3_700_001], "sent less than its delay before the end"
+    packets_in_flight = packets[packets.arrived_ns.isna() & (packets.reason == "")]
+    assert list(packets_in_flight.sent_ns) == [1081 * 3_700_001], "sent less than its delay before the end"
     windows = pq.read_table(tmp_path / "run" / "windows")
     assert windows.column("end_ns").to_pylist() == live_run.windows_ns
     assert windows.schema.field("wait_s").metadata[b"unit"] == b"s"
@@ -118,8 +118,8 @@ def check_equals_run(run: Run) -> None:
     expected = passing_robots().advance(run.windows_ns[-1])
     assert run.windows_ns == expected.windows_ns
     assert all(fate == expected.fates[identity] for identity, fate in run.fates.items())
-    decided = {identity for identity, fate in expected.fates.items() if fate.is_decided}
-    assert decided <= run.fates.keys(), "all decided packets are recorded"
+    decided_identities = {identity for identity, fate in expected.fates.items() if fate.is_decided}
+    assert decided_identities <= run.fates.keys(), "all decided packets are recorded"
 
 
 @pytest.mark.parametrize("line_count", [1, 6, 30])
@@ -187,12 +187,12 @@ def test_a_full_disk_is_reported_and_the_packets_are_kept(tmp_path: Path, size: 
         command = [sys.executable, "-m", "fieldkit", "cosim", "run", "baylands", "--out", str(disk / "run")]
         changes = [f"traffic.{number}.rate=1000Hz" for number in (0, 1)]
         options = [option for change in changes for option in ("--set", change)]
-        completed = subprocess.run(
+        result = subprocess.run(
             [*command, *options], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300
         )
-        assert completed.returncode == 2, completed.stdout
-        assert "the recording cannot be written: No space left on device" in " ".join(completed.stderr.split())
-        assert "Traceback" not in completed.stderr
+        assert result.returncode == 2, result.stdout
+        assert "the recording cannot be written: No space left on device" in " ".join(result.stderr.split())
+        assert "Traceback" not in result.stderr
         recording = read_recording(disk / "run")
         assert recording.run.fates
         assert recording.manifest.ending is RunEnding.FAILED
@@ -206,9 +206,9 @@ def test_a_disk_without_space_is_refused_before_the_run(tmp_path: Path, monkeypa
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(os, "posix_fallocate", raise_disk_full)
-    with pytest.raises(RecordingError, match="No space left on device") as raised:
+    with pytest.raises(RecordingError, match="No space left on device") as error_info:
         record(tmp_path / "run")
-    assert raised.value.remedy == "free some space"
+    assert error_info.value.remedy == "free some space"
 
 
 def test_the_recording_states_the_error_of_a_failed_policy(tmp_path: Path) -> None:
@@ -217,14 +217,14 @@ def test_the_recording_states_the_error_of_a_failed_policy(tmp_path: Path) -> No
             return super().next_window(situation) if situation.now_ns < 100 * MS else 1 // 0
 
     with (
-        pytest.raises(FederateError, match="policy event_driven failed") as raised,
+        pytest.raises(FederateError, match="policy event_driven failed") as error_info,
         RunRecorder(tmp_path / "run", ABOUT) as recorder,
     ):
         passing_robots(recorder, FailingPolicy()).advance(MS * 200)
     recording = read_recording(tmp_path / "run")
     assert (recording.manifest.ending, recording.manifest.why) == (
         RunEnding.FAILED,
-        f"FederateError: {raised.value}",
+        f"FederateError: {error_info.value}",
     )
     expected = passing_robots(policy=EventDriven()).advance(recording.run.windows_ns[-1])
     assert recording.run.digest == expected.digest
@@ -283,24 +283,24 @@ def test_the_digest_alone_detects_a_changed_event(tmp_path: Path, recorded_folde
 @settings(max_examples=25)
 @given(
     table=st.sampled_from(packet_tables.TABLES),
-    which=st.integers(0),
-    at=st.integers(0),
+    part_number=st.integers(0),
+    offset=st.integers(0),
     change=st.sampled_from(["cut", "gone", "flip"]),
 )
 def test_a_recording_that_was_truncated_or_damaged_anywhere_is_refused(
-    recorded_folder: Path, table: str, which: int, at: int, change: str
+    recorded_folder: Path, table: str, part_number: int, offset: int, change: str
 ) -> None:
     parts = sorted((recorded_folder / table).glob("*.parquet"))
-    path = parts[which % len(parts)]
+    path = parts[part_number % len(parts)]
     content = path.read_bytes()
-    at %= len(content)
+    offset %= len(content)
     try:
         if change == "gone":
             path.unlink()
         elif change == "cut":
-            path.write_bytes(content[:at])
+            path.write_bytes(content[:offset])
         else:
-            path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+            path.write_bytes(content[:offset] + bytes([content[offset] ^ 1]) + content[offset + 1 :])
         with pytest.raises(EvidenceError, match=r"truncated|changed"):
             read_recording(recorded_folder)
     finally:
@@ -332,9 +332,9 @@ def test_a_complete_run_without_digest_or_parts_is_refused(tmp_path: Path, recor
     manifest = tmp_path / "changed" / "run.json"
     content = json.loads(manifest.read_bytes())
     manifest.write_text(json.dumps(content | {key: type(content[key])()}), encoding="utf-8")
-    with pytest.raises(EvidenceError, match="the record has no digest or no parts") as caught:
+    with pytest.raises(EvidenceError, match="the record has no digest or no parts") as error_info:
         read_recording(tmp_path / "changed")
-    assert caught.value.remedy
+    assert error_info.value.remedy
 
 
 @pytest.mark.parametrize(

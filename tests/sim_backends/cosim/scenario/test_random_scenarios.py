@@ -23,8 +23,10 @@ def optional_keys(**values: st.SearchStrategy[Any]) -> st.SearchStrategy[dict[st
     return st.fixed_dictionaries({}, optional=values)
 
 
-def entry_of_kind(name: str, required: dict[str, Any], **optional: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    return st.fixed_dictionaries({"kind": st.just(name), **required}, optional=optional)
+def entry_of_kind(
+    name: str, required_entries: dict[str, Any], **optional_entries: st.SearchStrategy[Any]
+) -> st.SearchStrategy[Any]:
+    return st.fixed_dictionaries({"kind": st.just(name), **required_entries}, optional=optional_entries)
 
 
 def quantities(unit: str, *values: float) -> st.SearchStrategy[str]:

@@ -126,15 +126,19 @@ def _a_body_without_a_profile(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def loading_error(text: str, folder: Path) -> ConfigurationError:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         load_scenario(write_scenario(text, folder))
-    return caught.value
+    return error_info.value
 
 
-@pytest.mark.parametrize(("right", "wrong", "line", "message"), WRONG, ids=lambda value: str(value).strip()[:40])
-def test_an_error_has_its_line_and_a_remedy(right: str, wrong: str, line: int, message: str, tmp_path: Path) -> None:
-    assert SCENARIO.count(right) >= 1
-    error = loading_error(SCENARIO.replace(right, wrong, 1), tmp_path)
+@pytest.mark.parametrize(
+    ("old_text", "new_text", "line", "message"), WRONG, ids=lambda value: str(value).strip()[:40]
+)
+def test_an_error_has_its_line_and_a_remedy(
+    old_text: str, new_text: str, line: int, message: str, tmp_path: Path
+) -> None:
+    assert SCENARIO.count(old_text) >= 1
+    error = loading_error(SCENARIO.replace(old_text, new_text, 1), tmp_path)
     assert re.search(message, str(error)), str(error)
     assert error.where == f"{tmp_path / 'meadow.yaml'}:{line}"
     assert error.remedy

@@ -34,8 +34,8 @@ def test_a_sign_is_certain_if_the_interval_excludes_0(low: float, high: float, i
 
 def test_the_jackknife_of_a_mean_is_students_interval() -> None:
     values = normal(12)
-    without = np.array([np.delete(values, index).mean() for index in range(12)])
-    estimate, expected = jackknife(float(values.mean()), without), mean(values)
+    means_without_one_value = np.array([np.delete(values, index).mean() for index in range(12)])
+    estimate, expected = jackknife(float(values.mean()), means_without_one_value), mean(values)
     assert (estimate.low, estimate.high) == pytest.approx((expected.low, expected.high))
 
 
@@ -46,9 +46,11 @@ def test_the_needed_repeats_detect_a_difference_in_four_out_of_five_studies(
     """The exact power is computed with the noncentral t distribution."""
 
     def power(count: int) -> float:
-        wide, centre = scipy.stats.t.ppf(0.975, count - 1), difference / deviation * math.sqrt(count)
-        below, above = scipy.stats.nct.cdf([-wide, wide], count - 1, centre)
-        return float(below + 1 - above)
+        critical_value, centre = scipy.stats.t.ppf(0.975, count - 1), difference / deviation * math.sqrt(count)
+        probability_below, probability_above = scipy.stats.nct.cdf(
+            [-critical_value, critical_value], count - 1, centre
+        )
+        return float(probability_below + 1 - probability_above)
 
     count = repeats_needed(difference, deviation)
     assert count is not None

@@ -162,16 +162,18 @@ def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> 
     """As in solvers of differential equations; the mean lag is w / 2, so the speed is too low by 2 m/s^2 w / 2."""
 
     def tracks(policy: SyncPolicy) -> Tracks:
-        sampled = SampledPhysics(CommandedMotion(), 50 * MS)
-        chase(policy, sampled).advance(1000 * MS)
-        return sampled.tracks
+        sampled_physics = SampledPhysics(CommandedMotion(), 50 * MS)
+        chase(policy, sampled_physics).advance(1000 * MS)
+        return sampled_physics.tracks
 
     exact = tracks(EventDriven())
     assert exact.names == ("lead", "chaser")
     assert exact.times_s == pytest.approx(np.arange(21) * 0.05)
-    coarse, fine = (tracks(Scheduled(window_s)).distances_m(exact)[:, 1] for window_s in (0.1, 0.05))
-    assert fine == pytest.approx(exact.times_s * 0.05, abs=0.05**2)
-    assert coarse[-1] / fine[-1] == pytest.approx(2.0, rel=0.03)
+    errors_of_long_windows_m, errors_of_short_windows_m = (
+        tracks(Scheduled(window_s)).distances_m(exact)[:, 1] for window_s in (0.1, 0.05)
+    )
+    assert errors_of_short_windows_m == pytest.approx(exact.times_s * 0.05, abs=0.05**2)
+    assert errors_of_long_windows_m[-1] / errors_of_short_windows_m[-1] == pytest.approx(2.0, rel=0.03)
 
 
 def test_windows_of_several_runs_are_pooled() -> None:
@@ -179,10 +181,10 @@ def test_windows_of_several_runs_are_pooled() -> None:
         local_errors(moving_pair, {"scheduled": Scheduled}, (0.05, 0.1), begins_ns, tail_ns=20 * MS)["scheduled"]
         for begins_ns in (WITHIN[:5], WITHIN[5:12])
     )
-    both = pool([first, second])
-    assert both.window_s.shape == (2, 12)
+    pooled_errors = pool([first, second])
+    assert pooled_errors.window_s.shape == (2, 12)
     total = first.sums["delivery_s"].sum(axis=1) + second.sums["delivery_s"].sum(axis=1)
-    assert both.sums["delivery_s"].sum(axis=1) == pytest.approx(total)
+    assert pooled_errors.sums["delivery_s"].sum(axis=1) == pytest.approx(total)
 
 
 SHARED: list[int] = []

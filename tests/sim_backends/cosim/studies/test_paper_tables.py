@@ -29,7 +29,7 @@ NAN = math.nan
 
 
 @pytest.mark.parametrize(
-    ("printed", "ours", "expected"),
+    ("printed_value", "estimate", "expected"),
     [
         # The mean rounds to the printed number, with any interval.
         (Printed("0.4"), IntervalEstimate(0.36, 0.355, 0.365), Agreement.AGREES),
@@ -52,9 +52,9 @@ NAN = math.nan
     ],
 )
 def test_agreements_equal_those_determined_by_hand(
-    printed: Printed, ours: IntervalEstimate, expected: Agreement
+    printed_value: Printed, estimate: IntervalEstimate, expected: Agreement
 ) -> None:
-    assert agreement(printed, ours) is expected
+    assert agreement(printed_value, estimate) is expected
 
 
 @given(
@@ -64,8 +64,8 @@ def test_agreements_equal_those_determined_by_hand(
 )
 def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, per_si: int) -> None:
     text = str(value.quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP))
-    ours = float(value / per_si)
-    assert agreement(Printed(text, per_si), IntervalEstimate(ours, NAN, NAN)) is Agreement.AGREES
+    estimate = float(value / per_si)
+    assert agreement(Printed(text, per_si), IntervalEstimate(estimate, NAN, NAN)) is Agreement.AGREES
 
 
 @given(
@@ -77,12 +77,12 @@ def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, 
 def test_a_number_more_than_half_a_step_away_disagrees(
     number: Decimal, step: str, deviation: float, is_above: bool
 ) -> None:
-    printed = Printed(str(number), step=step)
-    ours = printed.value + deviation * float(step) * (1 if is_above else -1)
+    printed_value = Printed(str(number), step=step)
+    estimate = printed_value.value + deviation * float(step) * (1 if is_above else -1)
     expected = Agreement.ABOVE if is_above else Agreement.BELOW
-    assert agreement(printed, IntervalEstimate(ours, NAN, NAN)) is expected
-    bounds = printed.value, ours
-    assert agreement(printed, IntervalEstimate(ours, min(bounds), max(bounds))) is Agreement.AGREES
+    assert agreement(printed_value, IntervalEstimate(estimate, NAN, NAN)) is expected
+    bounds = printed_value.value, estimate
+    assert agreement(printed_value, IntervalEstimate(estimate, min(bounds), max(bounds))) is Agreement.AGREES
 
 
 SHORT = {"duration": "1200ms"}

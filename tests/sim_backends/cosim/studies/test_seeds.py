@@ -70,9 +70,9 @@ def test_an_error_names_its_policy_and_seed_and_keeps_its_class(workers: int) ->
 
 
 def test_the_repeated_death_of_a_process_is_an_error() -> None:
-    with pytest.raises(FieldkitError, match=r"seed 1: its worker died \d times") as raised:
+    with pytest.raises(FieldkitError, match=r"seed 1: its worker died \d times") as error_info:
         run_many(kill_worker_for_seed_1, TASKS, workers=Workers(2))
-    assert "fewer workers" in raised.value.remedy
+    assert "fewer workers" in error_info.value.remedy
 
 
 ENDLESS = """
@@ -91,8 +91,8 @@ def work(task):
 @pytest.mark.parametrize("stop_signal", [signal.SIGINT, signal.SIGKILL])
 def test_workers_exit_when_their_parent_exits(stop_signal: signal.Signals, tmp_path: Path) -> None:
     (tmp_path / "endless.py").write_text(ENDLESS, encoding="utf-8")
-    started = tmp_path / "started"
-    started.mkdir()
+    started_folder = tmp_path / "started"
+    started_folder.mkdir()
     call = (
         "import endless as e; e.run_many(e.work, [e.Task('one', seed) for seed in (1, 2, 3)], workers=e.Workers(2))"
     )
@@ -102,9 +102,9 @@ def test_workers_exit_when_their_parent_exits(stop_signal: signal.Signals, tmp_p
         cwd=tmp_path,
         stderr=subprocess.PIPE,
     ) as process:
-        wait_until(lambda: len(list(started.iterdir())) == 2, Deadline.after(EXIT_S))
+        wait_until(lambda: len(list(started_folder.iterdir())) == 2, Deadline.after(EXIT_S))
         process.send_signal(stop_signal)
         _, stderr = process.communicate(timeout=EXIT_S)
     assert process.returncode == -stop_signal
     assert (b"KeyboardInterrupt" in stderr) == (stop_signal == signal.SIGINT)
-    wait_until(lambda: not any(alive(int(path.name)) for path in started.iterdir()), Deadline.after(EXIT_S))
+    wait_until(lambda: not any(alive(int(path.name)) for path in started_folder.iterdir()), Deadline.after(EXIT_S))

@@ -50,9 +50,9 @@ def test_a_sweep_on_a_full_disk_keeps_its_finished_runs_and_continues(tmp_path: 
     )
     assert "No space left on device" in output
     assert "exit code 2\n" in output
-    finished = int(output.split("count: ")[1].split()[0])
-    assert 0 < finished < RUNS
-    assert f"{finished} are done" in output
+    finished_runs = int(output.split("count: ")[1].split()[0])
+    assert 0 < finished_runs < RUNS
+    assert f"{finished_runs} are done" in output
     assert run_here(tmp_path, *SWEEP, "--jobs", "1", "-o", "reference").code == 0
     assert read_dataset(tmp_path / "copy") == read_dataset(tmp_path / "reference")
     assert read_dataset(tmp_path / "copy")

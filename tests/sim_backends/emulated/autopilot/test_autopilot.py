@@ -46,13 +46,13 @@ def item(number: int, east_m: float, north_m: float, up_m: float, command: int =
 
 def upload(gcs: GroundStation, items: list[Message]) -> int:
     """Upload items, repeating messages without an answer; return the result."""
-    pending = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
+    message = d.MAVLink_mission_count_message(SYSTEM, 1, len(items))
     for _ in range(200):
-        for answer in gcs.send_message(pending) + gcs.wait(0.3):
+        for answer in gcs.send_message(message) + gcs.wait(0.3):
             if answer.get_type() == "MISSION_ACK":
                 return int(answer.type)
             if answer.get_type() == "MISSION_REQUEST_INT":
-                pending = items[answer.seq]
+                message = items[answer.seq]
     raise AssertionError("the upload did not end")
 
 

@@ -140,8 +140,8 @@ def test_rates_belong_to_the_port_and_acknowledgements_to_the_sender(copter: Sta
     assert "LOCAL_POSITION_NED" not in {message.get_type() for message in copter.wait(5)}, (
         "the other client stopped it"
     )
-    read = d.MAVLink_param_request_read_message(SYSTEM, 1, b"RTL_ALT", -1)
-    counts = send_from_other_client(copter.autopilot, copter.now_ns, 245, read)
+    read_request = d.MAVLink_param_request_read_message(SYSTEM, 1, b"RTL_ALT", -1)
+    counts = send_from_other_client(copter.autopilot, copter.now_ns, 245, read_request)
     assert counts == {1: Counter(PARAM_VALUE=1), 2: Counter(PARAM_VALUE=1)}, (
         "a message without a target goes to all clients"
     )

@@ -38,10 +38,10 @@ JOIN_S = 60.0
 
 def run(*argv: str, may_fail: bool = False) -> str:
     """Return the output of a program; the job ends if it fails."""
-    completed = subprocess.run(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-    if completed.returncode and not may_fail:
-        sys.exit(f"{' '.join(argv)} failed with {completed.returncode}: {completed.stdout}")
-    return completed.stdout
+    result = subprocess.run(argv, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+    if result.returncode and not may_fail:
+        sys.exit(f"{' '.join(argv)} failed with {result.returncode}: {result.stdout}")
+    return result.stdout
 
 
 class Lab:

@@ -12,11 +12,11 @@ from sim_backends.emulated.linux_wifi.virtual_machine import find_kernel, requir
 
 
 def test_all_missing_programs_are_listed_with_their_packages(tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError) as caught:
+    with pytest.raises(ConfigurationError) as error_info:
         require_machine((tmp_path,))
-    assert "qemu-system-x86_64" in caught.value.what
+    assert "qemu-system-x86_64" in error_info.value.what
     for package in ("qemu-system-x86", "linux-image-amd64", "iw", "hostapd", "wpasupplicant", "busybox"):
-        assert f" {package}" in caught.value.remedy
+        assert f" {package}" in error_info.value.remedy
 
 
 def test_the_newest_kernel_with_hwsim_is_used(tmp_path: Path) -> None:

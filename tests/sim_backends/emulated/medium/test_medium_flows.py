@@ -20,18 +20,20 @@ def packet_count(flows: FlowDelays, port: int, protocol: int = UDP) -> int:
 
 
 @given(
-    sent=st.lists(st.tuples(st.integers(0, 3), st.sampled_from([1234, 1235]), st.integers(1, 9000)), max_size=30),
+    datagrams=st.lists(
+        st.tuples(st.integers(0, 3), st.sampled_from([1234, 1235]), st.integers(1, 9000)), max_size=30
+    ),
     lost_numbers=st.sets(st.integers(0, 100)),
 )
 def test_every_fragment_that_arrives_is_counted_for_its_flow(
-    sent: list[tuple[int, int, int]], lost_numbers: set[int]
+    datagrams: list[tuple[int, int, int]], lost_numbers: set[int]
 ) -> None:
     """Identifications are reused immediately, also by another flow; any fragment may be lost, also the first one."""
     flows = FlowDelays()
     assert packet_count(flows, 1234) == 0
     expected_counts: Counter[int] = Counter()
     number = 0
-    for ip_id, port, size in sent:
+    for ip_id, port, size in datagrams:
         packets = datagram(ip_id, size, port=port)
         for packet in packets:
             flows.note_first_fragment(packet)
@@ -48,8 +50,8 @@ def test_protocol_direction_and_options_of_the_header_matter() -> None:
     flows = FlowDelays()
     for protocol in (UDP, TCP):
         assert packet_count(flows, 1234, protocol) == 0
-    head = struct.pack(">HHI", 40_000, 1234, 0)
-    packet_without_option = ipv4(head, protocol=TCP)
+    tcp_ports = struct.pack(">HHI", 40_000, 1234, 0)
+    packet_without_option = ipv4(tcp_ports, protocol=TCP)
     # A header of 24 bytes, whose option looks like another port.
     packet_with_option = (
         bytes((0x46,)) + packet_without_option[1:20] + struct.pack(">HH", 7, 7) + packet_without_option[20:]
@@ -57,8 +59,8 @@ def test_protocol_direction_and_options_of_the_header_matter() -> None:
     for packet in (
         packet_without_option,
         packet_with_option,
-        ipv4(head, protocol=TCP, src=RECEIVER, dst=SENDER),
-        ipv4(head, protocol=1),
+        ipv4(tcp_ports, protocol=TCP, src=RECEIVER, dst=SENDER),
+        ipv4(tcp_ports, protocol=1),
     ):
         flows.note_first_fragment(packet)
         flows.count(packet, PACKET, packet[16:20])

@@ -133,21 +133,21 @@ def test_delay_applies_in_both_directions_and_twice_through_the_relay(bench: Ben
 def test_links_are_sampled_while_requested_without_traffic_on_the_air(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES, relay="r")
-    first = medium.links(continue_sampling=True)
-    assert {name: len(samples) for name, samples in first.items()} == {"a": 1, "b": 1, "r": 1}
+    first_samples = medium.links(continue_sampling=True)
+    assert {name: len(samples) for name, samples in first_samples.items()} == {"a": 1, "b": 1, "r": 1}
     assert len(ping(spaces["a"], ADDRESSES["b"], count=80)) == 80
-    last, stats = medium.links(continue_sampling=False), medium.stats()
-    assert len(last["a"]) >= 4, "in 0.8 s"
-    sent = {name: port.sent_packets - port.other_packets for name, port in stats.ports.items()}
-    assert sent == {"a": 80, "b": 80, "r": 0}, "a kernel solicits routers of IPv6 once, which is not counted"
+    last_samples, stats = medium.links(continue_sampling=False), medium.stats()
+    assert len(last_samples["a"]) >= 4, "in 0.8 s"
+    sent_counts = {name: port.sent_packets - port.other_packets for name, port in stats.ports.items()}
+    assert sent_counts == {"a": 80, "b": 80, "r": 0}, "a kernel solicits routers of IPv6 once, which is not counted"
     assert sum(link.sent for link in stats.links.values()) == 4 * 80, "two hops each way, and nothing else"
-    stations = {name: samples[-1].stations for name, samples in last.items()}
+    stations = {name: samples[-1].stations for name, samples in last_samples.items()}
     assert [station.station for station in stations["a"]] == ["r"], "a station lists its access point"
     assert [(station.station, station.tx_packets, station.rx_packets) for station in stations["r"]] == [
         ("a", 80, 80),
         ("b", 80, 80),
     ]
-    air_s = [sample.busy_ns / 1e9 for sample in (last["a"][-1],) if sample.busy_ns is not None]
+    air_s = [sample.busy_ns / 1e9 for sample in (last_samples["a"][-1],) if sample.busy_ns is not None]
     assert 0 < air_s[0] < 1
     assert stations["a"][0].signal_dbm == pytest.approx(stations["r"][0].signal_dbm), "both send with the same power"
 
@@ -383,9 +383,9 @@ def test_a_killed_medium_raises_an_error() -> None:
         medium.stats()
         os.kill(medium.pid, signal.SIGKILL)
         for _ in range(2):
-            with pytest.raises(LinkError, match="does not answer") as caught:
+            with pytest.raises(LinkError, match="does not answer") as error_info:
                 medium.stats()
-        assert str(medium.pid) in caught.value.where
+        assert str(medium.pid) in error_info.value.where
 
 
 MEDIUM_OWNER = """

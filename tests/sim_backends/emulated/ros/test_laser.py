@@ -84,7 +84,7 @@ def test_beams_end_at_the_points_where_radio_paths_enter_a_solid(name: str) -> N
     solids = Solids([part.shape for part in world.parts])
     targets = laser_targets(world)
     rng = np.random.default_rng(1)
-    hits = missed = 0
+    hit_count = missed_count = 0
     near_target = [part.shape.centre_m[:2] for part in world.parts for _ in range(max(1, 40 // len(world.parts)))]
     for east_m, north_m in (np.array(near_target) + rng.normal(0, 6, (len(near_target), 2))).tolist():
         start = np.tile((east_m, north_m, 0.2), (BEAMS, 1))
@@ -96,12 +96,12 @@ def test_beams_end_at_the_points_where_radio_paths_enter_a_solid(name: str) -> N
         before_ends = start + directions * (np.minimum(ranges, 20.0) - 1e-3)[:, None]
         assert solids.depths_m(start, before_ends).max() < 1e-2, "only beams that graze a corner or a trunk"
         is_hit = np.isfinite(ranges)
-        hits += int(is_hit.sum())
+        hit_count += int(is_hit.sum())
         behind_ends = start + directions * (np.where(is_hit, ranges, 0.0) + 1e-3)[:, None]
         depths_m = solids.depths_m(start, behind_ends).sum(axis=1)[is_hit]
-        missed += int((depths_m <= 1e-6).sum())
-    assert hits > 100
-    assert missed < 0.01 * hits, "only beams that touch a corner"
+        missed_count += int((depths_m <= 1e-6).sum())
+    assert hit_count > 100
+    assert missed_count < 0.01 * hit_count, "only beams that touch a corner"
 
 
 def test_targets_have_the_heights_of_their_shapes() -> None:

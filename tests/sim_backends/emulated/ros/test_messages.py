@@ -119,7 +119,7 @@ def test_quaternions_have_length_1(motion: OwnMotion) -> None:
 
 
 def test_covariances_are_symmetric_and_positive_definite() -> None:
-    checked = 0
+    matrix_count = 0
     for sensor in sensors():
         message = publish(sensor)
         parts = [message, *(getattr(message, name, None) for name in ("pose", "twist"))]
@@ -131,8 +131,8 @@ def test_covariances_are_symmetric_and_positive_definite() -> None:
                     assert (matrix == matrix.T).all()
                     assert (np.diag(matrix) > 0).all(), "0 would mean unknown, -1 not measured"
                     assert (np.linalg.eigvalsh(matrix) > 0).all()
-                    checked += 1
-    assert checked >= 10
+                    matrix_count += 1
+    assert matrix_count >= 10
 
 
 @given(MOTIONS)

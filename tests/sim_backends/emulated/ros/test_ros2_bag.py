@@ -95,7 +95,7 @@ def robots() -> Iterator[Robots]:
 def record(
     robots: Robots,
     distribution: str,
-    into: Path,
+    target_folder: Path,
     argv: Sequence[str],
     *,
     signal: int = 2,
@@ -106,8 +106,8 @@ def record(
     command = with_environment(driver, setup=ros_of(ros2_profile(distribution)).command.setup)
     archive = robots[distribution].run(command, deadline=Deadline.after(180)).stdout
     with tarfile.open(fileobj=io.BytesIO(archive)) as tar:
-        tar.extractall(into, filter="data")
-    return Recording(int((into / "code").read_text()), (into / "err").read_text())
+        tar.extractall(target_folder, filter="data")
+    return Recording(int((target_folder / "code").read_text()), (target_folder / "err").read_text())
 
 
 def scans(bag: Path, store: Stores) -> list[Any]:

@@ -120,9 +120,9 @@ def test_the_md5_sum_of_a_definition_is_that_of_ros() -> None:
     ],
 )
 def test_unsupported_types_are_rejected_with_a_remedy(topic_spec: PublishedTopic, error_text: str) -> None:
-    with pytest.raises(ConfigurationError, match=error_text) as caught:
+    with pytest.raises(ConfigurationError, match=error_text) as error_info:
         templates.template_of(topic_spec)
-    assert caught.value.remedy
+    assert error_info.value.remedy
 
 
 def test_a_template_has_serialized_head_and_tail() -> None:

@@ -67,11 +67,11 @@ class Network:
                     self.count += 1
                     if side is self._client_side:
                         self._client = peer
-                    for forwarded in self.forward(datagram, side is self._client_side):
+                    for forwarded_datagram in self.forward(datagram, side is self._client_side):
                         if side is self._client_side:
-                            self._server_side.send(forwarded)
+                            self._server_side.send(forwarded_datagram)
                         else:
-                            self._client_side.sendto(forwarded, self._client)
+                            self._client_side.sendto(forwarded_datagram, self._client)
 
     def stop(self) -> None:
         self._stopped.set()
@@ -90,15 +90,15 @@ def make_lossy(seed: int) -> Forward:
     delayed_by_direction: dict[bool, list[bytes]] = {True: [], False: []}
 
     def forward(datagram: bytes, is_to_server: bool) -> list[bytes]:
-        draw_value, delayed = rng.random(), delayed_by_direction[is_to_server]
+        draw_value, delayed_datagrams = rng.random(), delayed_by_direction[is_to_server]
         if draw_value < 0.2:
             return []
         if draw_value < 0.3:
-            delayed.append(datagram)
+            delayed_datagrams.append(datagram)
             return []
-        delayed_datagrams = tuple(delayed)
-        delayed.clear()
-        return [datagram] * (2 if draw_value < 0.4 else 1) + list(delayed_datagrams)
+        released_datagrams = tuple(delayed_datagrams)
+        delayed_datagrams.clear()
+        return [datagram] * (2 if draw_value < 0.4 else 1) + list(released_datagrams)
 
     return forward
 
@@ -111,9 +111,9 @@ def open_connection(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChann
     hello = encode(MessageKind.PING, 0, 0, b"8 bytes.")
     try:
         with UdpAddress("udp", "127.0.0.1", port, listens=True).listen() as listener:
-            accepted: list[FrameChannel] = []
+            accepted_channels: list[FrameChannel] = []
             thread = threading.Thread(
-                target=lambda: accepted.append(listener.accept(deadline_after(30))), daemon=True
+                target=lambda: accepted_channels.append(listener.accept(deadline_after(30))), daemon=True
             )
             thread.start()
             federate_end = UdpAddress("udp", "127.0.0.1", network.port).connect(deadline_after(30))
@@ -121,7 +121,7 @@ def open_connection(forward: Forward) -> Iterator[tuple[FrameChannel, FrameChann
             while thread.is_alive():
                 with suppress(DeadlineError):
                     federate_end.receive(deadline_after(0.05))
-            with closing(federate_end), closing(accepted[0]) as coordinator_end:
+            with closing(federate_end), closing(accepted_channels[0]) as coordinator_end:
                 assert coordinator_end.receive(deadline_after(30)).body == b"8 bytes."
                 yield federate_end, coordinator_end, network
     finally:
@@ -174,10 +174,10 @@ def test_an_answer_acknowledges_the_request_so_that_an_exchange_has_two_datagram
 def test_datagrams_of_other_programs_are_ignored() -> None:
     with open_connection(forward_unchanged) as (federate_end, coordinator_end, network):
         header = DatagramHeader(DatagramKind.DATA, federate_end._identity[0], 12345, federate_end._number)  # type: ignore[attr-defined]
-        forged = [pack_datagram(header, b"forged"), b"", b"garbage" * 20, pack_datagram(header)[:30]]
+        forged_datagrams = [pack_datagram(header, b"forged"), b"", b"garbage" * 20, pack_datagram(header)[:30]]
         close = DatagramHeader(DatagramKind.CLOSE, federate_end._identity[0], 0, federate_end._number)  # type: ignore[attr-defined]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
-            for datagram in (*forged, pack_datagram(close)):
+            for datagram in (*forged_datagrams, pack_datagram(close)):
                 other.sendto(datagram, ("127.0.0.1", network.port))
                 other.sendto(datagram, coordinator_end._socket.getsockname())  # type: ignore[attr-defined]
         network._client = federate_end._socket.getsockname()  # type: ignore[attr-defined]

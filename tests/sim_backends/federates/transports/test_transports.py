@@ -168,9 +168,9 @@ def test_both_federates_of_a_run_may_use_one_transport(scheme: str, federates: F
     ],
 )
 def test_no_federate_within_the_deadline_is_an_error(scheme: str, message: str, federates: Federates) -> None:
-    with pytest.raises(UnansweredError, match=message) as raised:
+    with pytest.raises(UnansweredError, match=message) as error_info:
         open_physics(new_addresses(scheme)[1], HELLO, 0.3)
-    assert raised.value.exit_code == 3
+    assert error_info.value.exit_code == 3
 
 
 def test_no_master_within_the_deadline_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,13 +72,13 @@ def test_integer_arithmetic_stays_close_to_the_real_equations(samples_ns: list[i
 
 def test_after_one_loss_every_second_ack_allows_a_segment() -> None:
     # 100 in flight, of which one is lost, and a threshold of 50: every second ACK allows one segment.
-    reduction, pipe, sent = ProportionalReduction(50, 100, 1), 96, []
+    reduction, pipe, sent_bytes = ProportionalReduction(50, 100, 1), 96, []
     for _ in range(90):
         pipe -= 1
-        sent.append(reduction.window_bytes(pipe, 1, is_safe=False) - pipe)
-        reduction.on_sent(sent[-1])
-        pipe += sent[-1]
-    assert sent[:8] == [1, 0, 1, 0, 1, 0, 1, 0]
+        sent_bytes.append(reduction.window_bytes(pipe, 1, is_safe=False) - pipe)
+        reduction.on_sent(sent_bytes[-1])
+        pipe += sent_bytes[-1]
+    assert sent_bytes[:8] == [1, 0, 1, 0, 1, 0, 1, 0]
     assert pipe == 51  # 96 - 90 + 45
 
 
@@ -97,14 +97,14 @@ def test_after_many_losses_each_ack_allows_what_it_delivers_and_a_safe_ack_one_m
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3)), max_size=80))
 def test_no_more_is_sent_than_arrives_while_losses_are_detected(acks: list[tuple[int, int]]) -> None:
-    reduction, pipe, sent, arrived = ProportionalReduction(50, 100, 1), 97, 0, 0
-    for delivered, lost in acks:
-        arrived += delivered
-        pipe = max(pipe - delivered - lost, 0)
-        allowed = reduction.window_bytes(pipe, delivered, is_safe=False) - pipe
-        reduction.on_sent(allowed)
-        pipe, sent = pipe + allowed, sent + allowed
-        assert 0 <= sent <= arrived
+    reduction, pipe, sent_bytes, arrived_bytes = ProportionalReduction(50, 100, 1), 97, 0, 0
+    for delivered_bytes, lost_bytes in acks:
+        arrived_bytes += delivered_bytes
+        pipe = max(pipe - delivered_bytes - lost_bytes, 0)
+        allowed_bytes = reduction.window_bytes(pipe, delivered_bytes, is_safe=False) - pipe
+        reduction.on_sent(allowed_bytes)
+        pipe, sent_bytes = pipe + allowed_bytes, sent_bytes + allowed_bytes
+        assert 0 <= sent_bytes <= arrived_bytes
 
 
 def test_at_the_threshold_no_segment_is_sent() -> None:

@@ -55,9 +55,9 @@ def test_packets_have_the_sizes_of_linux() -> None:
     assert sizes == [60, 60, 52, 1500, 2000 - 1448 + 52, 52]
 
 
-@pytest.mark.parametrize(("lost", "arrives_s"), [(1, 1), (2, 3), (3, 7), (6, 63)])
-def test_a_syn_is_retransmitted_after_1_3_7_seconds(lost: int, arrives_s: int) -> None:
-    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(lost)}))
+@pytest.mark.parametrize(("lost_syns", "arrives_s"), [(1, 1), (2, 3), (3, 7), (6, 63)])
+def test_a_syn_is_retransmitted_after_1_3_7_seconds(lost_syns: int, arrives_s: int) -> None:
+    wire = ScriptedWire(DELAY_NS, script=losing({"a": range(lost_syns)}))
     send_messages(wire, [message(0)])
     wire.run()
     assert wire.delivered == {0: arrives_s * SECOND + 3 * DELAY_NS}

@@ -193,10 +193,10 @@ def test_best_effort_has_the_loss_of_the_link(loss: float, size_bytes: int, fram
     count = 1000
     wire = publish_samples(BEST_EFFORT, count, script=losing_frames(loss), size_bytes=size_bytes)
     expected = 1 - (1 - loss) ** frames
-    lost = len(wire.dropped)
-    assert lost + len(wire.delivered) == count
-    assert abs(lost / count - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
-    assert Counter(wire.dropped.values()) == {"lost by script": lost}
+    lost_count = len(wire.dropped)
+    assert lost_count + len(wire.delivered) == count
+    assert abs(lost_count / count - expected) < 4 * math.sqrt(expected * (1 - expected) / count)
+    assert Counter(wire.dropped.values()) == {"lost by script": lost_count}
     assert all(type(submessage) is Data for _, _, message in messages(wire) for submessage in message)
 
 

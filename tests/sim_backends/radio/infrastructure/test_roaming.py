@@ -79,8 +79,8 @@ def test_a_robot_roams_to_the_stronger_access_point_and_packets_follow_it() -> N
     lab.run(9 * S, AT_EAST)
     lab.finish()
     assert lab.access_points == ["west", "east"]
-    last = lab.sent[-1][0][1]
-    assert {(("walker", last - 1), "base"), (("base", last), "walker")} <= lab.arrived_ns.keys()
+    last_number = lab.sent[-1][0][1]
+    assert {(("walker", last_number - 1), "base"), (("base", last_number), "walker")} <= lab.arrived_ns.keys()
     assert lab.model.counters()["west", "base"].delivered > 400
     assert lab.model.counters()["east", "walker"].delivered > 150
 
@@ -103,9 +103,9 @@ def test_each_packet_is_delivered_or_lost_once(phy: PhyCapability | None) -> Non
     lab.model.send(lab.now_ns, "walker", ("walker", -1), 84, None)
     lab.sent.append((("walker", -1), lab.now_ns))
     lab.finish()
-    lost = [packet for packet, _, _ in lab.lost]
-    delivered = [packet for packet, _ in lab.arrived_ns]
-    assert Counter(lost + delivered) == Counter(packet for packet, _ in lab.sent)
+    lost_packets = [packet for packet, _, _ in lab.lost]
+    delivered_packets = [packet for packet, _ in lab.arrived_ns]
+    assert Counter(lost_packets + delivered_packets) == Counter(packet for packet, _ in lab.sent)
     assert {receiver for _, receiver, _ in lab.lost} <= {"base", "walker"}
     assert NOT_ASSOCIATED in {reason for _, _, reason in lab.lost}
 
