@@ -198,8 +198,10 @@ class TestPlacement:
 class TestRequirements:
     def test_missing_programs_are_named_with_their_packages(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("os.geteuid", lambda: 0)
-        missing = {"sshd", "ping"}
-        monkeypatch.setattr("shutil.which", lambda name, **_: None if name in missing else f"/usr/bin/{name}")
+        missing_programs = {"sshd", "ping"}
+        monkeypatch.setattr(
+            "shutil.which", lambda name, **_: None if name in missing_programs else f"/usr/bin/{name}"
+        )
         with pytest.raises(ConfigurationError, match="sshd, ping") as error_info:
             requirements.check()
         assert error_info.value.remedy.endswith("iputils-ping openssh-server")

@@ -141,10 +141,10 @@ def test_two_robots_can_move_at_the_same_time(mobility: Mobility, medium: Record
         sender, receiver = medium.position_of(Role.SENDER), medium.position_of(Role.RECEIVER)
     assert sender is not None
     assert receiver is not None
-    (first, _), (last, _) = medium.calls[0], medium.calls[-1]
-    assert first == last
-    assert sender[0] - first[CAST[Role.SENDER].name][0] == pytest.approx(-0.4)
-    start_m = first[CAST[Role.RECEIVER].name]
+    (first_positions, _), (last_positions, _) = medium.calls[0], medium.calls[-1]
+    assert first_positions == last_positions
+    assert sender[0] - first_positions[CAST[Role.SENDER].name][0] == pytest.approx(-0.4)
+    start_m = first_positions[CAST[Role.RECEIVER].name]
     assert receiver == pytest.approx((start_m[0] - 0.2, start_m[1] + 0.3, start_m[2]))
 
 
@@ -184,13 +184,13 @@ def test_a_leg_away_increases_the_distance_to_the_other_end(
     mobility: Mobility, medium: RecordingMedium, role: Role
 ) -> None:
     other_name = CAST[Role.RELAY if role is not Role.RELAY else Role.SENDER].name
-    before = medium.calls[-1][0]
+    positions_before = medium.calls[-1][0]
     with mobility.moving(Move(role, (Leg(away_m=0.1),), 2.0)):
         wait(lambda: not motion_threads())
-        after = medium.calls[-1][0]
+        positions_after = medium.calls[-1][0]
     name = CAST[role].name
-    assert math.dist(after[name], after[other_name]) == pytest.approx(
-        math.dist(before[name], before[other_name]) + 0.1
+    assert math.dist(positions_after[name], positions_after[other_name]) == pytest.approx(
+        math.dist(positions_before[name], positions_before[other_name]) + 0.1
     )
 
 
@@ -256,9 +256,9 @@ def test_the_time_of_the_track_is_that_of_the_positions(
     monkeypatch.setattr(medium, "place", lambda *_, **__: place_times_ns.append(time.time_ns()))
     robot.record((7.0, 8.0, 9.0), (0.0, 0.0, 5.0))
     mobility.set_out_of_range(Role.SENDER)
-    last = [point for point in mobility.track(0) if point.role is Role.RELAY][-1]
-    assert last.velocity_m_s == (0.0, 0.0, 5.0)
-    assert last.utc_ns <= place_times_ns[-1], "the robot may have stopped before the medium answered"
+    last_point = [point for point in mobility.track(0) if point.role is Role.RELAY][-1]
+    assert last_point.velocity_m_s == (0.0, 0.0, 5.0)
+    assert last_point.utc_ns <= place_times_ns[-1], "the robot may have stopped before the medium answered"
 
 
 def test_a_driving_robot_stays_on_the_ground_and_a_silent_one_stops(medium: RecordingMedium) -> None:

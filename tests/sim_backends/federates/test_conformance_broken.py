@@ -487,17 +487,19 @@ NETWORK_CASES = [
         "but advanced to",
     ),
     BrokenFederate(
-        "exactly_once", physics(network_class(lambda _, arrived, drops, to_ns: ([], drops))), "neither arrived nor"
+        "exactly_once", physics(network_class(lambda _, arrivals, drops, to_ns: ([], drops))), "neither arrived nor"
     ),
     BrokenFederate(
         "exactly_once",
-        physics(network_class(lambda _, arrived, drops, to_ns: ([*arrived, *arrived[-1:]], drops))),
+        physics(network_class(lambda _, arrivals, drops, to_ns: ([*arrivals, *arrivals[-1:]], drops))),
         "reported twice",
     ),
     BrokenFederate(
         "exactly_once",
         physics(
-            network_class(lambda _, arrived, drops, to_ns: ([], [Drop(arrival.packet_id, "") for arrival in arrived]))
+            network_class(
+                lambda _, arrivals, drops, to_ns: ([], [Drop(arrival.packet_id, "") for arrival in arrivals])
+            )
         ),
         "was dropped without a reason",
     ),
@@ -505,7 +507,7 @@ NETWORK_CASES = [
         "exactly_once",
         physics(
             network_class(
-                lambda _, arrived, drops, to_ns: ([arrival._replace(receiver="cy") for arrival in arrived], [])
+                lambda _, arrivals, drops, to_ns: ([arrival._replace(receiver="cy") for arrival in arrivals], [])
             )
         ),
         "for bob arrived at cy",
@@ -514,19 +516,19 @@ NETWORK_CASES = [
         "exactly_once",
         physics(
             network_class(
-                lambda _, arrived, drops, to_ns: ([arrival._replace(at_ns=to_ns + 1) for arrival in arrived], [])
+                lambda _, arrivals, drops, to_ns: ([arrival._replace(at_ns=to_ns + 1) for arrival in arrivals], [])
             )
         ),
         "not between",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(network_class(lambda _, arrived, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
+        physics(network_class(lambda _, arrivals, drops, to_ns: ([Arrival(99, "bob", to_ns)], []))),
         "the fate of packet 99 was reported, but it was not sent to the network",
     ),
     BrokenFederate(
         "exactly_once",
-        physics(network_class(lambda _, arrived, drops, to_ns: (arrived[::-1], drops))),
+        physics(network_class(lambda _, arrivals, drops, to_ns: (arrivals[::-1], drops))),
         "order of time",
     ),
     BrokenFederate("exactly_once", physics(AnnouncesTooLate), "before the announced next event"),
@@ -536,7 +538,7 @@ NETWORK_CASES = [
         "window_length",
         physics(
             network_class(
-                lambda _, arrived, drops, to_ns: ([arrival._replace(at_ns=to_ns) for arrival in arrived], [])
+                lambda _, arrivals, drops, to_ns: ([arrival._replace(at_ns=to_ns) for arrival in arrivals], [])
             )
         ),
         "windows of another length changed an arrival",

@@ -177,7 +177,7 @@ def test_every_packet_has_one_result_independent_of_windows(
     disturbances, relay = setting
     if "loss" in options:
         disturbances = [disturbance for disturbance in disturbances if not isinstance(disturbance, Jammer)]
-    sent, states = packets(sends), standing(places_m)
+    sent_packets, states = packets(sends), standing(places_m)
 
     def create_network() -> RadioNetwork:
         wireless = wifi(NAMES, RadioOptions.model_validate(options), seed=seed)
@@ -185,12 +185,12 @@ def test_every_packet_has_one_result_independent_of_windows(
         return network(radio, NAMES, disturbances=disturbances, relay=relay)
 
     net = create_network()
-    expected = carry(net, states, sent)
-    assert len(expected.arrived) + len(expected.dropped) == len(sent)
+    expected = carry(net, states, sent_packets)
+    assert len(expected.arrived) + len(expected.dropped) == len(sent_packets)
     assert net.next_event_ns() is None, "nothing is in flight"
     # The results are the same in windows of 5 ms, and from event to event.
     for next_end in (lambda now_ns, _: now_ns + 5 * MS, lambda _, next_ns: next_ns):
-        net, remaining, now_ns = create_network(), list(sent), 0
+        net, remaining, now_ns = create_network(), list(sent_packets), 0
         arrivals: list[Arrival] = []
         drops: list[Drop] = []
         while (next_ns := net.next_event_ns()) is not None or remaining:
@@ -205,7 +205,7 @@ def test_every_packet_has_one_result_independent_of_windows(
             arrivals += window_arrivals
             drops += window_drops
             now_ns = to_ns
-        assert outcome(sent, arrivals, drops) == expected
+        assert outcome(sent_packets, arrivals, drops) == expected
 
 
 class BroadcastTransport:

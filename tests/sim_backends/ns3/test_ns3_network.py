@@ -109,11 +109,11 @@ def test_the_parts_of_each_delay_add_up_to_the_delay(
     simulation.close()
     with (tmp_path / "parts-1.csv").open(encoding="utf-8") as file:
         rows = {(row.pop("flow"), int(row.pop("number"))): row for row in csv.DictReader(file)}
-    arrived = {identity: fate for identity, fate in run.fates.items() if fate.arrived_ns is not None}
-    assert {flow for flow, _ in arrived} == {"state/bob", "log/ann"}
-    assert rows.keys() == arrived.keys()
+    arrived_fates = {identity: fate for identity, fate in run.fates.items() if fate.arrived_ns is not None}
+    assert {flow for flow, _ in arrived_fates} == {"state/bob", "log/ann"}
+    assert rows.keys() == arrived_fates.keys()
     hops = 2 if "relay" in changes else 1
-    for identity, fate in arrived.items():
+    for identity, fate in arrived_fates.items():
         delay_ns, *parts_ns = map(int, rows[identity].values())
         assert fate.arrived_ns is not None
         assert sum(parts_ns) == delay_ns == fate.arrived_ns - fate.packet.enters_ns

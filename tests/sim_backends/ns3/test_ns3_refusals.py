@@ -41,11 +41,11 @@ def hello_frame(hello: Hello, changes: Mapping[str, object] = MappingProxyType({
     """Return hello with changes of its configuration: values by their keys, `scenario/faults`."""
     configuration = json.loads(hello.configuration)
     for keys, value in changes.items():
-        *parents, last = keys.split("/")
+        *parents, last_key = keys.split("/")
         item: Any = configuration
         for key in parents:
             item = item[key]
-        item[last] = value
+        item[last_key] = value
     changed_hello = replace(hello, configuration=json.dumps(configuration).encode())
     return encode(MessageKind.HELLO, 1, 0, changed_hello.encode())
 

@@ -204,9 +204,9 @@ def test_lost_frames_are_sent_again_within_later_aggregates_and_arrive_in_order(
     wifi.log_attempts(log.append)
     for number in range(500):
         wifi.send(0, "a", number, 1000 + HEADERS_BYTES, "b")
-    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
     attempts = [attempt for attempt in log if attempt.number]
-    assert arrived == list(range(500))
+    assert arrived_numbers == list(range(500))
     retries = [attempt for attempt in attempts if attempt.number > 1]
     assert 0.02 < len(retries) / len(attempts) < 0.5
     first_starts_ns = {attempt.start_ns for attempt in attempts if attempt.number == 1}
@@ -285,11 +285,11 @@ def test_frames_of_a_station_that_is_switched_off_are_lost_once() -> None:
     wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
     for number in range(200):
         wifi.send(0, "a", number, 1028, "b")
-    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(3_000_000)]
+    arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(3_000_000)]
     wifi.switch_off(3_000_000, {"a"})
-    arrived += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
-    assert sorted(arrived + losses) == list(range(200))
-    assert arrived == sorted(arrived)
+    arrived_numbers += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    assert sorted(arrived_numbers + losses) == list(range(200))
+    assert arrived_numbers == sorted(arrived_numbers)
 
 
 def test_drivers_count_the_frames_of_aggregates() -> None:

@@ -46,19 +46,19 @@ def goodputs(categories: Sequence[int], *, seconds: float, in_one_station: bool 
     """Return goodput in Mbit/s of a saturated station per category, or of one station with all categories."""
     names = ["s0" if in_one_station else f"s{number}" for number in range(len(categories))]
     wifi: Wifi[int] = Wifi(CategorizedPowers([*dict.fromkeys(names), "r"], HT20_7), 1)
-    arrived = [0] * len(categories)
+    arrival_counts = [0] * len(categories)
     queued_categories = [number for number in range(len(categories)) for _ in range(120)]
     wifi.log_losses(lambda _, number, *rest: queued_categories.append(number))
     now_ns: int | None = 0
     while now_ns is not None and now_ns < seconds * 1e9:
         for _, _, number, _, _ in wifi.deliveries(now_ns):
-            arrived[number] += 1
+            arrival_counts[number] += 1
             queued_categories.append(number)
         for number in queued_categories:
             wifi.send(now_ns, names[number], number, 1028, "r", dscp=DSCP[categories[number]])
         queued_categories.clear()
         now_ns = wifi.next_event_ns()
-    return [count * 8e-3 / seconds for count in arrived]
+    return [count * 8e-3 / seconds for count in arrival_counts]
 
 
 def simulate_slots(categories: Sequence[int], *, seconds: float) -> list[float]:
@@ -74,7 +74,7 @@ def simulate_slots(categories: Sequence[int], *, seconds: float) -> list[float]:
     window = [TABLE[category][1] for category in categories]
     slots = [random.randint(0, size) for size in window]
     aifs_ns = [BAND.sifs_ns + TABLE[category][0] * SLOT_NS for category in categories]
-    count_start_ns, delivered, now_ns = list(aifs_ns), [0] * len(categories), 0
+    count_start_ns, delivered_counts, now_ns = list(aifs_ns), [0] * len(categories), 0
     while now_ns < seconds * 1e9:
         starts_ns = [begin + count * SLOT_NS for begin, count in zip(count_start_ns, slots, strict=True)]
         now_ns = min(starts_ns)
@@ -87,13 +87,13 @@ def simulate_slots(categories: Sequence[int], *, seconds: float) -> list[float]:
                 count_start_ns[number] = channel_end_ns + aifs_ns[number]
                 continue
             _, min_window, max_window, _ = TABLE[category]
-            delivered[number] += frames[number] * (len(senders) == 1)
+            delivered_counts[number] += frames[number] * (len(senders) == 1)
             window[number] = min_window if len(senders) == 1 else min(2 * window[number] + 1, max_window)
             slots[number] = random.randint(0, window[number])
             timeout_ns = starts_ns[number] + airtimes_ns[number] + BAND.sifs_ns + SLOT_NS + 20_000
             begin_ns = channel_end_ns + aifs_ns[number]
             count_start_ns[number] = begin_ns if len(senders) == 1 else max(begin_ns, timeout_ns)
-    return [count * 8e-3 / seconds for count in delivered]
+    return [count * 8e-3 / seconds for count in delivered_counts]
 
 
 @pytest.mark.parametrize(
@@ -176,10 +176,10 @@ def test_a_station_switched_off_loses_the_frames_of_all_categories_once() -> Non
     wifi.log_losses(lambda _, payload, *rest: losses.append(payload))
     for number in range(100):
         wifi.send(0, "a", number, 1028, "r", dscp=(0, 8, 40, 48)[number % 4])
-    arrived = [payload for _, _, payload, _, _ in wifi.deliveries(2_000_000)]
+    arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(2_000_000)]
     wifi.switch_off(2_000_000, {"a"})
-    arrived += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
-    assert sorted(arrived + losses) == list(range(100))
+    arrived_numbers += [payload for _, _, payload, _, _ in wifi.deliveries(10**10)]
+    assert sorted(arrived_numbers + losses) == list(range(100))
 
 
 def test_the_counters_of_a_link_include_all_categories() -> None:
@@ -214,16 +214,18 @@ def test_dscps_are_mapped_as_by_linux_or_by_rfc_8325(dscp: int, linux: int, rfc8
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, 3_000_000), st.booleans()), max_size=60))
 def test_each_packet_arrives_once_and_in_the_order_of_its_category(packets: list[tuple[int, int, bool]]) -> None:
     wifi: Wifi[tuple[int, int]] = Wifi(CategorizedPowers("abr", HT20_7), 1)
-    now_ns, arrived = 0, []
+    now_ns, arrived_packets = 0, []
     for number, (category, step_ns, is_first) in enumerate(packets):
         now_ns += step_ns
-        arrived += [(source, payload) for _, _, payload, source, _ in wifi.deliveries(now_ns)]
+        arrived_packets += [(source, payload) for _, _, payload, source, _ in wifi.deliveries(now_ns)]
         wifi.send(now_ns, "a" if is_first else "b", (category, number), 500, "r", dscp=DSCP[category])
-    arrived += [(source, payload) for _, _, payload, source, _ in wifi.deliveries(now_ns + 10**10)]
-    assert len(arrived) == len(packets)
+    arrived_packets += [(source, payload) for _, _, payload, source, _ in wifi.deliveries(now_ns + 10**10)]
+    assert len(arrived_packets) == len(packets)
     for source in "ab":
         for category in range(4):
             numbers = [
-                number for name, (packet_category, number) in arrived if (name, packet_category) == (source, category)
+                number
+                for name, (packet_category, number) in arrived_packets
+                if (name, packet_category) == (source, category)
             ]
             assert numbers == sorted(numbers)

@@ -75,14 +75,14 @@ def run_radio(rate_control: WifiRateControl, ratio_db: float) -> tuple[float, li
     wifi.log_losses(lambda _, payload, *rest: lost_numbers.append(payload))
     for number in range(150):
         wifi.send(0, "a", number, 1028, "b")
-    arrived = 0
+    arrival_count = 0
     while (now_ns := wifi.next_event_ns()) is not None and now_ns < 2_000_000_000:
         arrived_numbers = [payload for _, _, payload, _, _ in wifi.deliveries(now_ns)]
-        arrived += len(arrived_numbers)
+        arrival_count += len(arrived_numbers)
         for number in arrived_numbers + lost_numbers:
             wifi.send(now_ns, "a", number, 1028, "b")
         lost_numbers.clear()
-    return arrived * 8000 / 2.0, [attempt for attempt in log if attempt.number]
+    return arrival_count * 8000 / 2.0, [attempt for attempt in log if attempt.number]
 
 
 def closed_form_bit_s(mode: WifiMode, ratio_db: float) -> float:

@@ -43,10 +43,10 @@ def list_deliveries(links: FixedLinks[int], now_ns: int) -> list[tuple[int, str,
 
 def drain(links: FixedLinks[int]) -> list[tuple[int, str, int]]:
     """Advance from event to event until no packet is in flight."""
-    arrived = list_deliveries(links, 0)
+    deliveries = list_deliveries(links, 0)
     while (at_ns := links.next_event_ns()) is not None:
-        arrived += list_deliveries(links, at_ns)
-    return arrived
+        deliveries += list_deliveries(links, at_ns)
+    return deliveries
 
 
 def test_a_link_without_delay_delivers_immediately() -> None:
@@ -110,10 +110,10 @@ def test_the_configured_loss_is_in_the_wilson_interval(loss: float) -> None:
     links, n = make_links(LinkParameters(loss=loss)), 20_000
     for number in range(n):
         links.send(number, "a", number, 100, "b")
-    lost = n - len(drain(links))
-    interval = scipy.stats.binomtest(lost, n).proportion_ci(confidence_level=0.99, method="wilson")
+    lost_count = n - len(drain(links))
+    interval = scipy.stats.binomtest(lost_count, n).proportion_ci(confidence_level=0.99, method="wilson")
     assert interval.low <= loss <= interval.high
-    assert links.counters()["a", "b"].lost == lost
+    assert links.counters()["a", "b"].lost == lost_count
 
 
 def test_jitter_is_uniform_and_never_reorders() -> None:
@@ -218,11 +218,11 @@ def test_equal_seeds_give_equal_runs_in_order_of_time(
     traffic: list[tuple[int, str, str | None, int]], link: LinkParameters, relay: str | None
 ) -> None:
     first, second = (make_links(link, "abr", relay=relay) for _ in range(2))
-    arrived = run_traffic(first, traffic)
-    assert arrived == run_traffic(second, traffic)
+    deliveries = run_traffic(first, traffic)
+    assert deliveries == run_traffic(second, traffic)
     assert first.trace == second.trace
-    assert [at_ns for at_ns, _, _ in arrived] == sorted(at_ns for at_ns, _, _ in arrived)
-    assert max(Counter((name, number) for _, name, number in arrived).values(), default=1) == 1
+    assert [at_ns for at_ns, _, _ in deliveries] == sorted(at_ns for at_ns, _, _ in deliveries)
+    assert max(Counter((name, number) for _, name, number in deliveries).values(), default=1) == 1
     for counters in first.counters().values():
         assert counters.sent == counters.lost + counters.delivered
 
@@ -247,7 +247,7 @@ def test_other_traffic_does_not_change_the_losses_of_a_link() -> None:
 
 
 @given(st.sets(st.integers(0, 199)))
-def test_a_missing_packet_does_not_change_the_others(missing: set[int]) -> None:
+def test_a_missing_packet_does_not_change_the_others(missing_numbers: set[int]) -> None:
     """Draws for loss and jitter are keyed by the packet, also behind a relay."""
 
     def arrivals(numbers: Iterable[int]) -> dict[int, int]:
@@ -258,6 +258,6 @@ def test_a_missing_packet_does_not_change_the_others(missing: set[int]) -> None:
 
     all_arrivals = arrivals(range(200))
     assert 60 < len(all_arrivals) < 140
-    assert arrivals(set(range(200)) - missing) == {
-        number: at_ns for number, at_ns in all_arrivals.items() if number not in missing
+    assert arrivals(set(range(200)) - missing_numbers) == {
+        number: at_ns for number, at_ns in all_arrivals.items() if number not in missing_numbers
     }

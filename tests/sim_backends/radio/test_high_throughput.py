@@ -37,10 +37,11 @@ def test_rates_equal_those_of_the_tables(
 
 
 # Output of ns-3 (`benchmarks.high_throughput_vs_ns3`): WifiPhy::CalculateTxDuration at 5 GHz for 1538 bytes, in ns.
-# The second number is added: VHT-SIG-B (21.3.8.3.6), which ns-3 omits; HE-LTF of 7.2 us (27.3.11.10), for which ns-3
-# has 8 us; the end of the last symbol at a multiple of 4 us for short guard intervals (21.4.3).
+# The second number is the difference from ns-3: VHT-SIG-B (21.3.8.3.6), which ns-3 omits; HE-LTF of 7.2 us
+# (27.3.11.10), for which ns-3 has 8 us; the end of the last symbol at a multiple of 4 us for short guard intervals
+# (21.4.3).
 @pytest.mark.parametrize(
-    ("modes", "mcs", "ns3_ns", "added_ns"),
+    ("modes", "mcs", "ns3_ns", "difference_ns"),
     [
         (("VHT", 80, 2, 400), 9, 54_400, 4_000 + 1_600),
         (("HT", 40, 1, 800), 7, 128_000, 0),
@@ -49,11 +50,11 @@ def test_rates_equal_those_of_the_tables(
     ],
 )
 def test_airtimes_equal_those_of_ns3(
-    modes: tuple[HighThroughput, int, int, int], mcs: int, ns3_ns: int, added_ns: int
+    modes: tuple[HighThroughput, int, int, int], mcs: int, ns3_ns: int, difference_ns: int
 ) -> None:
     phy_format, width_mhz, streams, guard_ns = modes
     mode = format_modes(phy_format, "5 GHz", width_mhz, streams, guard_ns)[mcs]
-    assert mode.airtime_ns(1538) == ns3_ns + added_ns
+    assert mode.airtime_ns(1538) == ns3_ns + difference_ns
 
 
 def test_a_frame_at_2_4_ghz_has_a_signal_extension_and_shorter_sifs() -> None:

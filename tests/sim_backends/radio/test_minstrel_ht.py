@@ -45,14 +45,14 @@ def first_modes(
     random = Random(start)
     modes = []
     for number in range(start, start + aggregates):
-        attempt, acknowledged = 0, 0
-        while not acknowledged and attempt < 7:
+        attempt, acknowledged_frames = 0, 0
+        while not acknowledged_frames and attempt < 7:
             attempt += 1
             mode = rate.choose(number * step_ns, ("a", number), attempt)
             modes += [mode] * (attempt == 1)
             frames = 1 if rate.is_probing and attempt == 1 else length
-            acknowledged = sum(random.random() < share_of(mode) for _ in range(frames))
-            rate.report(mode, acknowledged=acknowledged, attempts=frames)
+            acknowledged_frames = sum(random.random() < share_of(mode) for _ in range(frames))
+            rate.report(mode, acknowledged=acknowledged_frames, attempts=frames)
     return modes
 
 
@@ -158,8 +158,8 @@ def test_any_results_leave_a_chain_of_known_modes(results: list[tuple[int, int]]
     rate = make_control(*rate_groups)
     modes = {mode for group in rate_groups for mode in group}
     now_ns = 0
-    for number, (step_ns, acknowledged) in enumerate(results):
+    for number, (step_ns, acknowledged_frames) in enumerate(results):
         now_ns += step_ns
         chain = [rate.choose(now_ns, ("a", number), attempt) for attempt in range(1, 8)]
         assert set(chain) <= modes
-        rate.report(chain[number % 7], acknowledged=acknowledged, attempts=16)
+        rate.report(chain[number % 7], acknowledged=acknowledged_frames, attempts=16)

@@ -89,8 +89,10 @@ def test_a_frame_of_the_station_releases_its_buffered_frames_in_order() -> None:
         model.send(start_ns, "ap", number, 84, "pi")
     assert model.deliveries(start_ns + 10_000_000) == []
     model.send(start_ns + 10_000_000, "pi", 99, 84, "ap")
-    arrived = [payload for _, receiver, payload, _, _ in model.deliveries(start_ns + 20_000_000) if receiver == "pi"]
-    assert arrived == [0, 1, 2]
+    arrived_numbers = [
+        payload for _, receiver, payload, _, _ in model.deliveries(start_ns + 20_000_000) if receiver == "pi"
+    ]
+    assert arrived_numbers == [0, 1, 2]
 
 
 def test_the_time_in_the_buffer_counts_as_queueing() -> None:

@@ -42,10 +42,10 @@ def make_links(link: LinkParameters, relay: str | None = None) -> FixedLinks[int
 
 
 def drain(links: FixedLinks[int]) -> list[Delivery[int]]:
-    arrived = links.deliveries(0)
+    deliveries = links.deliveries(0)
     while (at_ns := links.next_event_ns()) is not None:
-        arrived += links.deliveries(at_ns)
-    return arrived
+        deliveries += links.deliveries(at_ns)
+    return deliveries
 
 
 def delays_of_burst(link: LinkParameters, packets: int, relay: str | None = None) -> DelayParts:
@@ -91,10 +91,10 @@ def test_lost_packets_do_not_add_to_the_delay() -> None:
     links = make_links(LinkParameters(loss=0.5, delay_ns=MS), "r")
     for number in range(200):
         links.send(0, "a", number, 1500, "b")
-    arrived = drain(links)
-    parts = delay_parts(sum(delay_sum for _, _, _, _, delay_sum in arrived))
-    assert 0 < parts.packets == len(arrived) < links.counters()["a", "r"].delivered
-    assert parts.propagation_ns == len(arrived) * 2 * MS
+    deliveries = drain(links)
+    parts = delay_parts(sum(delay_sum for _, _, _, _, delay_sum in deliveries))
+    assert 0 < parts.packets == len(deliveries) < links.counters()["a", "r"].delivered
+    assert parts.propagation_ns == len(deliveries) * 2 * MS
 
 
 def test_jitter_and_reordering_wait_count_as_propagation() -> None:
@@ -133,9 +133,9 @@ def test_the_delay_includes_the_delay_before_the_radio(relay: str | None, destin
     fixed = make_links(LinkParameters(delay_ns=MS), relay)
     for model in (wifi, fixed):
         model.send(0, "a", 0, 1000, destination, before=PACKET + 7 * PROCESSING_NS)
-        arrived = model.deliveries(10**9)
-        assert arrived
-        for at_ns, _, _, _, delay_sum in arrived:
+        deliveries = model.deliveries(10**9)
+        assert deliveries
+        for at_ns, _, _, _, delay_sum in deliveries:
             parts = delay_parts(delay_sum)
             assert (parts.packets, parts.processing_ns, processing_ns(delay_sum)) == (1, 7, 7)
             assert parts.transmission_ns + parts.propagation_ns + parts.queuing_ns == at_ns

@@ -97,14 +97,14 @@ def test_an_ack_follows_each_received_frame_after_sifs() -> None:
     log: list[TransmissionAttempt] = []
     saturate(FixedPowers("abr", G54, without_link=[("a", "b")]), "ab", "r", seconds=0.2, log=log)
     acks = [attempt for attempt in log if not attempt.number]
-    arrived = {
+    received_frames = {
         (attempt.end_ns, attempt.receiver, attempt.transmitter)
         for attempt in log
         if attempt.number and attempt.received
     }
-    assert {(ack.start_ns - SIFS_NS, ack.transmitter, ack.receiver) for ack in acks} <= arrived
+    assert {(ack.start_ns - SIFS_NS, ack.transmitter, ack.receiver) for ack in acks} <= received_frames
     # A station that is sending at that time sends no ACK; the last ACK may not have been sent yet.
-    assert 0.9 * len(arrived) < len(acks) <= len(arrived)
+    assert 0.9 * len(received_frames) < len(acks) <= len(received_frames)
     assert {(ack.end_ns - ack.start_ns, ack.mode.name, ack.payload) for ack in acks} == {(ack_ns(G54), "g24", None)}
 
 
@@ -200,12 +200,14 @@ def test_equal_seeds_give_equal_results_in_order_of_time(seed: int, sent_frames:
             wifi.send(at_ns, "ab"[number % 2], number, size, "r")
         return wifi.deliveries(60 * 10**9), log
 
-    arrived, log = run()
-    assert run() == (arrived, log)
-    assert [delivery[0] for delivery in arrived] == sorted(delivery[0] for delivery in arrived)
-    assert len({delivery[2] for delivery in arrived}) == len(arrived), "a retry after a lost ACK is delivered once"
+    deliveries, log = run()
+    assert run() == (deliveries, log)
+    assert [delivery[0] for delivery in deliveries] == sorted(delivery[0] for delivery in deliveries)
+    assert len({delivery[2] for delivery in deliveries}) == len(deliveries), (
+        "a retry after a lost ACK is delivered once"
+    )
     for sender in "ab":
-        from_sender = [delivery[2] for delivery in arrived if "ab"[delivery[2] % 2] == sender]
+        from_sender = [delivery[2] for delivery in deliveries if "ab"[delivery[2] % 2] == sender]
         assert from_sender == sorted(from_sender), "frames of one station arrive in order"
     assert all(math.isfinite(attempt.end_ns) and attempt.end_ns > attempt.start_ns for attempt in log)
 
@@ -278,9 +280,9 @@ def test_the_parts_of_the_delay_add_up_to_the_elapsed_time(relay: str | None) ->
     wifi.set_relay(relay)
     for number in range(100):
         wifi.send(number * 1000, "a", number * 1000, 1000, "b")
-    arrived = wifi.deliveries(10**9)
-    assert len(arrived) == 100
-    for at_ns, _, sent_ns, source, delay_sum in arrived:
+    deliveries = wifi.deliveries(10**9)
+    assert len(deliveries) == 100
+    for at_ns, _, sent_ns, source, delay_sum in deliveries:
         parts = delay_parts(delay_sum)
         assert source == "a"
         assert parts.packets == 1
@@ -302,7 +304,7 @@ def test_frames_to_a_station_out_of_range_are_lost_immediately() -> None:
 
 @given(st.sets(st.integers(0, 59)), st.booleans())
 @settings(max_examples=30)
-def test_a_missing_packet_does_not_change_the_others(missing: set[int], is_relayed: bool) -> None:
+def test_a_missing_packet_does_not_change_the_others(missing_numbers: set[int], is_relayed: bool) -> None:
     """Every draw is keyed by the packet and the attempt, also with packets of other flows."""
 
     def attempts(numbers: Sequence[int]) -> dict[int, list[tuple[int, str, bool]]]:
@@ -326,6 +328,6 @@ def test_a_missing_packet_does_not_change_the_others(missing: set[int], is_relay
 
     all_attempts = attempts(range(60))
     assert max(map(len, all_attempts.values())) > 2, "there are retries"
-    assert attempts([number for number in range(60) if number not in missing]) == {
-        number: packet_attempts for number, packet_attempts in all_attempts.items() if number not in missing
+    assert attempts([number for number in range(60) if number not in missing_numbers]) == {
+        number: packet_attempts for number, packet_attempts in all_attempts.items() if number not in missing_numbers
     }

@@ -25,12 +25,12 @@ def attempted_modes(
     attempts_by_frame = []
     for number in range(start, start + frames):
         attempts: list[str] = []
-        acknowledged = False
-        while not acknowledged and len(attempts) < 7:
+        is_acknowledged = False
+        while not is_acknowledged and len(attempts) < 7:
             mode = rate.choose(number * STEP_NS, ("a", number), len(attempts) + 1)
             attempts.append(mode.name)
-            acknowledged = arrives(mode)
-            rate.report(mode, acknowledged=acknowledged)
+            is_acknowledged = arrives(mode)
+            rate.report(mode, acknowledged=is_acknowledged)
         attempts_by_frame.append(attempts)
     return attempts_by_frame
 

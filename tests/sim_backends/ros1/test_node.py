@@ -90,8 +90,8 @@ class _StreamWithCallback(socket.socket):
 
 def test_a_subscriber_that_has_received_the_header_receives_every_message() -> None:
     """From then on the subscriber counts as connected, and may request an answer that is published immediately."""
-    near, far = socket.socketpair()
-    stream = _StreamWithCallback(fileno=near.detach())
+    near_socket, far_socket = socket.socketpair()
+    stream = _StreamWithCallback(fileno=near_socket.detach())
     publisher = RosPublisher("/data", MESSAGE, "/a")
     counts: list[int] = []
     publishing = threading.Thread(target=lambda: counts.append(publisher.publish(b"answer", deadline_after(30))))
@@ -105,7 +105,7 @@ def test_a_subscriber_that_has_received_the_header_receives_every_message() -> N
     accepting.start()
     wait_for(lambda: publishing.ident is not None)
     publishing.join(30)
-    far.close()
+    far_socket.close()
     accepting.join(30)
     stream.close()
     assert counts == [1]

@@ -167,11 +167,11 @@ def test_a_computer_that_is_off_receives_and_sends_nothing_and_stops_its_body() 
         (40, [4], None),
         (50, [5], None),
     ]
-    while_off, when_on = ReceivedDatagram("a", 1, 0, 29), ReceivedDatagram("a", 2, 0, 31)
+    datagram_while_off, datagram_when_on = ReceivedDatagram("a", 1, 0, 29), ReceivedDatagram("a", 2, 0, 31)
     outage = Outage(driver, 12, 31)
-    assert outage.wake(29, ORIGIN, [while_off]) == Action()
-    outage.wake(31, ORIGIN, [when_on])
-    assert driver.received == [when_on]
+    assert outage.wake(29, ORIGIN, [datagram_while_off]) == Action()
+    outage.wake(31, ORIGIN, [datagram_when_on])
+    assert driver.received == [datagram_when_on]
 
 
 def test_a_computer_whose_outage_has_no_end_stays_off() -> None:

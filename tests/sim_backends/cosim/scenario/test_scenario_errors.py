@@ -247,8 +247,8 @@ def test_a_scenario_of_the_lab_has_priority_over_a_shipped_one(
 
 
 def test_values_are_changed_by_their_keys() -> None:
-    changed = load_scenario("baylands", {"agents.husky-2.along": "40m", "traffic.0.size_bytes": 64, "line": "nlos"})
-    assert (changed.agents["husky-2"].along, changed.traffic[0].size_bytes, changed.line) == (40, 64, "nlos")
+    scenario = load_scenario("baylands", {"agents.husky-2.along": "40m", "traffic.0.size_bytes": 64, "line": "nlos"})
+    assert (scenario.agents["husky-2"].along, scenario.traffic[0].size_bytes, scenario.line) == (40, 64, "nlos")
     assert load_scenario("baylands", {"physics.step": "2ms", "policy.window": "4ms"}).physics.step_ns == 2_000_000
     for key in ("traffic.9.rate", "traffic.x.rate", "name.x", "traffic.0.kind.x.y"):
         with pytest.raises(ConfigurationError, match=f"with {key}=1: the key {key} cannot be changed"):

@@ -20,7 +20,9 @@ def setups() -> dict[str, Setup]:
     return claim_setups({"duration": "1s"})
 
 
-def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -> dict[tuple[str, str, str], Claim]:
+def claims_of(
+    delays_s: dict[str, list[float]], arrival_counts: dict[str, list[int]]
+) -> dict[tuple[str, str, str], Claim]:
     """Return all claims for the mean delays and the arrivals of each system with each seed, the same in every row."""
     samples = {}
     for name, setup in setups().items():
@@ -28,15 +30,15 @@ def claims_of(delays_s: dict[str, list[float]], arrived: dict[str, list[int]]) -
         flow = only_flow(setup)
         samples[name] = [
             {flow: FlowSample(100, count, count * delay_s if count else NAN, {})}
-            for delay_s, count in zip(delays_s[system], arrived[system], strict=True)
+            for delay_s, count in zip(delays_s[system], arrival_counts[system], strict=True)
         ]
     return {(claim.compared_system, claim.lines, claim.quantity): claim for claim in claims(setups(), samples)}
 
 
 def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
-    ours_s = np.array([[1.0, 3.0], [0.02, 0.04]])
-    theirs_s = np.array([[2.0, 2.0], [0.01, 0.005]])
-    change, rows = delay_change(ours_s, theirs_s)
+    own_delays_s = np.array([[1.0, 3.0], [0.02, 0.04]])
+    compared_delays_s = np.array([[2.0, 2.0], [0.01, 0.005]])
+    change, rows = delay_change(own_delays_s, compared_delays_s)
     # From 2 to 2, and from 0.0075 to 0.03: factors of 1 and 4, whose geometric mean is 2.
     assert change.value == pytest.approx(1.0)
     assert rows == 2
@@ -47,14 +49,14 @@ def test_a_change_compares_means_and_every_row_has_the_same_weight() -> None:
 
 
 def test_only_rows_and_seeds_count_in_which_packets_arrived_in_both_systems() -> None:
-    ours_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
-    theirs_s = np.array([[2.0, NAN, 2.0], [1.0, NAN, 1.0], [1.0, 1.0, 1.0]])
-    change, rows = delay_change(ours_s, theirs_s)
+    own_delays_s = np.array([[1.0, 9.0, 3.0], [NAN, 1.0, 1.0], [NAN, NAN, NAN]])
+    compared_delays_s = np.array([[2.0, NAN, 2.0], [1.0, NAN, 1.0], [1.0, 1.0, 1.0]])
+    change, rows = delay_change(own_delays_s, compared_delays_s)
     assert rows == 1
     assert change.value == pytest.approx(0.0)
-    unknown, rows = delay_change(ours_s[2:], theirs_s[2:])
+    undefined_change, rows = delay_change(own_delays_s[2:], compared_delays_s[2:])
     assert rows == 0
-    assert math.isnan(unknown.value)
+    assert math.isnan(undefined_change.value)
 
 
 def test_claims_by_hand() -> None:

@@ -72,14 +72,14 @@ def replies_until_idle(medium: HwsimMedium, now_ns: int = START_NS) -> Iterator[
 
 def receivers_of_frame(medium: HwsimMedium) -> tuple[list[bytes], bool]:
     """Return the radios that received the frame on the air, and True if it was acknowledged."""
-    radios, acknowledged = [], False
+    radios, is_acknowledged = [], False
     for command, attributes in replies_until_idle(medium):
         if command == CMD_FRAME:
             radios.append(attributes[1])
         else:
             assert command == CMD_TX_INFO_FRAME
-            acknowledged = bool(struct.unpack("=I", attributes[4])[0] & FLAG_ACKNOWLEDGED)
-    return radios, acknowledged
+            is_acknowledged = bool(struct.unpack("=I", attributes[4])[0] & FLAG_ACKNOWLEDGED)
+    return radios, is_acknowledged
 
 
 def test_a_frame_is_passed_to_its_receiver_before_it_is_acknowledged() -> None:

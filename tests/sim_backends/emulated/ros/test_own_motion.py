@@ -119,13 +119,13 @@ def test_a_leg_away_is_ahead_and_a_leg_left_is_to_the_left(tmp_path: Path, role:
 
 
 def test_messages_use_the_frames_and_units_of_ros() -> None:
-    store, now = (
+    store, motion = (
         get_typestore(Stores.ROS1_NOETIC),
         OwnMotion(4.0, 2.0, math.pi / 2, 1.5, (300.0, 400.0, UP_M), math.pi / 2),
     )
     messages: dict[str, Any] = {}
     for kind in ("nav_msgs/Odometry", "sensor_msgs/Imu", "sensor_msgs/NavSatFix"):
-        data = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, now)
+        data = Source(Sensor("/x", kind, 10.0, "frame", None)).message(1, 2 * S, motion)
         messages[kind.partition("/")[2]] = store.deserialize_ros1(data, kind.replace("/", "/msg/"))
     odom, imu, fix = (messages[kind] for kind in ("Odometry", "Imu", "NavSatFix"))
     half_sqrt = math.sqrt(0.5)

@@ -60,14 +60,14 @@ def test_the_timeout_doubles_until_the_next_sample() -> None:
 @given(st.lists(st.integers(1, 10**10), min_size=1, max_size=50))
 def test_integer_arithmetic_stays_close_to_the_real_equations(samples_ns: list[int]) -> None:
     round_trips = RoundTrips(TcpOptions(min_timeout_ns=1, clock_granularity_ns=1))
-    smoothed, variation = float(samples_ns[0]), samples_ns[0] / 2
+    smoothed_ns, variation_ns = float(samples_ns[0]), samples_ns[0] / 2
     for count, sample_ns in enumerate(samples_ns):
         round_trips.sample(sample_ns)
         if count:
-            variation = 0.75 * variation + 0.25 * abs(smoothed - sample_ns)
-            smoothed = 0.875 * smoothed + 0.125 * sample_ns
-        assert round_trips.smoothed_ns == pytest.approx(smoothed, abs=20)
-        assert round_trips.timeout_ns == pytest.approx(smoothed + max(1, 4 * variation), abs=100)
+            variation_ns = 0.75 * variation_ns + 0.25 * abs(smoothed_ns - sample_ns)
+            smoothed_ns = 0.875 * smoothed_ns + 0.125 * sample_ns
+        assert round_trips.smoothed_ns == pytest.approx(smoothed_ns, abs=20)
+        assert round_trips.timeout_ns == pytest.approx(smoothed_ns + max(1, 4 * variation_ns), abs=100)
 
 
 def test_after_one_loss_every_second_ack_allows_a_segment() -> None:
@@ -139,16 +139,16 @@ STEPS = st.lists(st.tuples(st.integers(0, 120), st.integers(0, 9), st.booleans()
 def test_the_window_equals_the_equations_of_the_rfc(
     threshold: int, flight: int, segment: int, steps: list[tuple[int, int, bool, int]]
 ) -> None:
-    reduction, total_delivered, total_sent = ProportionalReduction(threshold, flight, segment), 0, 0
-    for pipe, delivered, is_safe, sent in steps:
-        total_delivered += delivered
+    reduction, total_delivered_bytes, total_sent_bytes = ProportionalReduction(threshold, flight, segment), 0, 0
+    for pipe, delivered_bytes, is_safe, sent_bytes in steps:
+        total_delivered_bytes += delivered_bytes
         if pipe > threshold:
-            count = math.ceil(Fraction(total_delivered * threshold, flight)) - total_sent
+            count = math.ceil(Fraction(total_delivered_bytes * threshold, flight)) - total_sent_bytes
         else:
-            limit = total_delivered - total_sent
+            limit = total_delivered_bytes - total_sent_bytes
             if is_safe:
-                limit = max(limit, delivered) + segment
+                limit = max(limit, delivered_bytes) + segment
             count = min(threshold - pipe, limit)
-        assert reduction.window_bytes(pipe, delivered, is_safe=is_safe) == max(pipe, pipe + count)
-        reduction.on_sent(sent)
-        total_sent += sent
+        assert reduction.window_bytes(pipe, delivered_bytes, is_safe=is_safe) == max(pipe, pipe + count)
+        reduction.on_sent(sent_bytes)
+        total_sent_bytes += sent_bytes

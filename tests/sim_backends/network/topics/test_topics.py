@@ -222,8 +222,8 @@ def test_reliable_keep_all_loses_nothing(loss: float) -> None:
 def test_the_number_of_arrivals_is_near_that_of_cyclonedds(
     qos: Qos, loss: float, cyclonedds: int, tolerance: int
 ) -> None:
-    arrived = len(publish_samples(qos, 1000, script=losing_frames(loss)).delivered)
-    assert abs(arrived - cyclonedds) <= tolerance
+    arrival_count = len(publish_samples(qos, 1000, script=losing_frames(loss)).delivered)
+    assert abs(arrival_count - cyclonedds) <= tolerance
 
 
 def test_a_blocked_writer_drops_samples_after_max_blocking_time() -> None:
@@ -292,23 +292,23 @@ def test_an_event_is_scheduled_while_samples_are_unacknowledged(
 ) -> None:
     """Run from event to event until the writer has received the acknowledgement of its last sample."""
     wire = publish_samples(KEEP_ALL, count, script=make_script(deliveries), until_ns=0)
-    acknowledged = 0
+    last_acknowledged = 0
     topics = wire.transports["topic"]
     receive = topics.receive
 
     def record_acknowledgement(host: str, packet: IpPacket) -> None:
-        nonlocal acknowledged
+        nonlocal last_acknowledged
         message: RtpsMessage = packet.body
-        acknowledged = max(
+        last_acknowledged = max(
             [
-                acknowledged,
+                last_acknowledged,
                 *(submessage.base - 1 for submessage in message.submessages if isinstance(submessage, AckNack)),
             ]
         )
         receive(host, packet)
 
     topics.receive = record_acknowledgement  # type: ignore[method-assign]
-    while acknowledged < count:
+    while last_acknowledged < count:
         next_ns = wire.next_event_ns()
         assert next_ns is not None
         wire.run(next_ns)
