@@ -240,7 +240,9 @@ def test_position_errors_are_half_a_window_for_any_step_of_the_physics(
 
 
 @pytest.mark.parametrize("policy", FIXED)
-def test_half_the_window_has_half_the_error(policy: type[Scheduled | SlidingWindow | TimeStepped]) -> None:
+def test_windows_of_half_the_length_have_half_the_error(
+    policy: type[Scheduled | SlidingWindow | TimeStepped],
+) -> None:
     """All fixed windows are of the first order, in time or in space."""
     reference = passing_run(EventDriven())
     errors_of_long_windows, errors_of_short_windows = (

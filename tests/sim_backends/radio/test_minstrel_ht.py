@@ -98,14 +98,14 @@ def test_the_chain_has_the_two_fastest_modes_and_a_robust_one_with_as_many_tries
     assert [(HT20.index(mode), tries) for mode, tries in single_frame_rate.stages] == [(7, 5), (6, 5), (7, 5)]
 
 
-def test_the_robust_mode_has_more_than_three_quarters_of_success() -> None:
+def test_more_than_three_quarters_of_frames_arrive_in_the_robust_mode() -> None:
     received_shares = [1.0, 1.0, 1.0, 1.0, 0.7, 0.4, 0.0, 0.0]
     rate = make_control(HT20)
     first_modes(rate, 3000, lambda mode: received_shares[HT20.index(mode)])
     assert [HT20.index(mode) for mode, _ in rate.stages] == [4, 3, 3]
 
 
-def test_with_two_streams_the_robust_mode_has_one() -> None:
+def test_the_robust_mode_has_one_stream_if_the_fastest_has_two() -> None:
     rate = make_control(*groups("ac", "5 GHz", 80, 2, 400))
     first_modes(rate, 3000, lambda _: 1.0)
     assert [mode.streams for mode, _ in rate.stages] == [2, 2, 1]

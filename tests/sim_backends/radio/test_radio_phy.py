@@ -32,7 +32,7 @@ def test_data_bits_per_symbol_follow_from_modulation_and_code(mode: WifiMode) ->
     assert mode.bits_per_symbol == subcarriers * bits * mode.code_rate
 
 
-def test_airtimes_computed_by_hand() -> None:
+def test_airtimes_equal_those_computed_by_hand() -> None:
     """1536 bytes at 54 Mbit/s: ceil((22 + 12288) / 216) = 57 symbols; an ACK of 14 bytes at 24: 2 symbols."""
     assert G_MODES[-1].airtime_ns(1536) == (20 + 57 * 4 + 6) * 1000
     assert N_MODES[-1].airtime_ns(1536) == (36 + 48 * 4 + 6) * 1000
@@ -45,7 +45,7 @@ def test_acks_use_the_fastest_mandatory_rate_up_to_that_of_the_frame() -> None:
 
 
 @MODES
-def test_uncoded_bit_error_equals_proakis(mode: WifiMode) -> None:
+def test_the_uncoded_bit_error_rate_equals_that_of_proakis(mode: WifiMode) -> None:
     """Gray-coded M-QAM by Q functions, nearest neighbours only."""
     for snr_db in (5.0, 10.0, 15.0):
         snr = 10 ** (snr_db / 10)
@@ -118,7 +118,7 @@ def test_far_two_ray_loss_is_40_db_per_decade() -> None:
     assert far_db == pytest.approx(plane_earth, abs=1.5)
 
 
-def test_free_space_and_log_distance_computed_by_hand() -> None:
+def test_free_space_and_log_distance_losses_equal_those_computed_by_hand() -> None:
     start, end = np.zeros((2, 3)), np.array([[1.0, 0, 0], [10, 0, 0]])
     assert propagation.free_space_db(start, end, WIFI_HZ) == pytest.approx([40.18, 60.18], abs=0.01)
     assert propagation.log_distance_db(start, end, WIFI_HZ, 3.0) == pytest.approx([40.18, 70.18], abs=0.01)

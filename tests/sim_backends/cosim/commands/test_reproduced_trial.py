@@ -79,7 +79,9 @@ def test_a_run_that_ends_during_a_transfer_has_a_failed_row(tmp_path: Path) -> N
         ({"traffic.2.start": "6s"}, "the traffic of one protocol starts before all traffic of the other protocol"),
     ],
 )
-def test_a_contradiction_to_the_procedure_is_refused(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+def test_a_value_that_contradicts_the_procedure_is_refused(
+    tmp_path: Path, changes: dict[str, str], message: str
+) -> None:
     options = [word for key, value in changes.items() for word in ("--set", f"{key}={value}")]
     result = run_here(tmp_path, "cosim", "run", "field_30ft", "--out", "run", "--duration", "10ms", *options)
     assert result.code == 2

@@ -50,7 +50,9 @@ def test_cells_that_agree_only_by_a_wide_interval_are_counted_separately() -> No
     assert "3 of 4 cells agree: 2 by our mean, 1 only because our interval is wide" in text
 
 
-def test_claims_are_next_to_the_papers_statements_and_tables(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_table_shows_claims_beside_the_statements_and_tables_of_the_paper(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     sheet = table.claim_sheet("title", CLAIMS)
     sheet.show("table")
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]

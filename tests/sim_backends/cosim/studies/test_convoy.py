@@ -72,7 +72,7 @@ def test_the_position_error_of_a_closed_loop_grows_with_the_window() -> None:
     assert np.abs(spacing_m[times_s > 2]).max() == pytest.approx(expected_m, rel=0.2)
 
 
-def test_measures_of_a_known_row() -> None:
+def test_the_measures_of_a_row_equal_those_computed_by_hand() -> None:
     times_s = np.linspace(0, 10, 1001)
     leader_m = np.stack([2 * times_s, 0 * times_s, 0 * times_s], axis=-1)
     follower_m = leader_m - np.array([5.0, 0.0, 0.0])

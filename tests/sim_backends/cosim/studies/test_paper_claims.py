@@ -59,7 +59,7 @@ def test_only_rows_and_seeds_count_in_which_packets_arrived_in_both_systems() ->
     assert math.isnan(undefined_change.value)
 
 
-def test_claims_by_hand() -> None:
+def test_claims_equal_those_computed_by_hand() -> None:
     by_key = claims_of(
         {"adaptive": [0.88, 0.88], "fixed window": [1.0, 1.0], "master-based": [0.44, 0.44]},
         {"adaptive": [100, 80], "fixed window": [90, 70], "master-based": [50, 70]},

@@ -231,7 +231,7 @@ def test_an_unknown_mode_is_refused_and_pilot_modes_keep_the_height(copter: Stat
         assert copter.autopilot.vehicle.body.position_m[2] == pytest.approx(3.0, abs=0.3)
 
 
-def test_acknowledgements_have_no_progress(copter: Station) -> None:
+def test_acknowledgements_contain_no_progress(copter: Station) -> None:
     copter.command(d.MAV_CMD_RUN_PREARM_CHECKS)
     ack = copter.last("COMMAND_ACK")
     assert (ack.progress, ack.result_param2) == (0, 0)

@@ -119,7 +119,7 @@ def test_a_frame_that_requests_no_acknowledgement_is_sent_once() -> None:
     assert status.attempts == 1
 
 
-def test_a_broadcast_arrives_at_all_in_range_without_acknowledgement() -> None:
+def test_a_broadcast_arrives_at_all_radios_in_range_and_is_not_acknowledged() -> None:
     air = Air(1, STEADY, dict.fromkeys("abcd", ANTENNA))
     air.place(0, {"a": (0.0, 0.0, 1.0), "b": (3.0, 0.0, 1.0), "c": (0.0, 3.0, 1.0), "d": (FAR_M, 0.0, 1.0)})
     air.transmit(START_NS, frame(RateStage(0, 1), group=True, flags=FLAG_NO_ACK), "a", None)

@@ -34,7 +34,7 @@ from sim_backends.radio.modes import SHORT_RETRY_LIMIT
         (RateStage(9, 1, RATE_VHT), 5180, None),  # 256-QAM
     ],
 )
-def test_the_mode_of_a_stage(stage: RateStage, frequency_mhz: int, name: str | None) -> None:
+def test_a_stage_has_the_mode_of_its_rate_and_band(stage: RateStage, frequency_mhz: int, name: str | None) -> None:
     mode = mode_of(stage, frequency_mhz)
     assert (mode.name if mode else None) == name
 

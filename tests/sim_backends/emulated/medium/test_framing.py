@@ -25,7 +25,7 @@ ADDRESSES = {"a": OWN_ADDRESS, **OTHER_ADDRESSES}
 RADIO = Radio(interface="wlan0", standard="802.11g", tx_power_dbm=17, sensitivity_dbm=-82)
 
 
-def test_a_mac_address_is_of_one_station_and_locally_administered() -> None:
+def test_a_mac_address_belongs_to_one_station_and_is_locally_administered() -> None:
     assert {name: mac_of(interface.ip).hex(":") for name, interface in ADDRESSES.items()} == MACS
 
 

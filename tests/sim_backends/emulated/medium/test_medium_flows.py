@@ -46,7 +46,7 @@ def test_every_fragment_that_arrives_is_counted_for_its_flow(
     assert packet_count(flows, 1235) == 0, "packets of a flow are counted only after the first request"
 
 
-def test_protocol_direction_and_options_of_the_header_matter() -> None:
+def test_packets_are_counted_by_protocol_and_direction_and_header_options_are_skipped() -> None:
     flows = FlowDelays()
     for protocol in (UDP, TCP):
         assert packet_count(flows, 1234, protocol) == 0

@@ -130,7 +130,7 @@ def test_delay_applies_in_both_directions_and_twice_through_the_relay(bench: Ben
     assert medium.stats().links["r", "b"].delivered == 20
 
 
-def test_links_are_sampled_while_requested_without_traffic_on_the_air(bench: Bench) -> None:
+def test_links_are_sampled_on_request_without_traffic_on_the_air(bench: Bench) -> None:
     medium, spaces = bench("{fading: false}")
     medium.place(PLACES, relay="r")
     first_samples = medium.links(continue_sampling=True)

@@ -36,7 +36,7 @@ def write_paths(folder: Path, *assigned_paths: AssignedPath) -> Path:
     return path
 
 
-def test_odometry_along_a_path_with_a_left_turn(tmp_path: Path) -> None:
+def test_odometry_follows_a_path_with_a_left_turn(tmp_path: Path) -> None:
     odometer = Odometer(write_paths(tmp_path, AssignedPath(10 * S, CORNER, 2.0, 0.0)), 0)
     assert odometer.at(10 * S) == OwnMotion(speed_m_s=2.0, place_m=CORNER[0])
     assert odometer.at(11 * S) == OwnMotion(2.0, 0.0, 0.0, 2.0, (5.0, 6.0, UP_M))

@@ -215,7 +215,7 @@ def test_a_filled_gap_is_acknowledged_immediately() -> None:
     assert [transmission.at_ns for transmission in transfer.wire.transmitted][-1] == transfer.wire.delivered[4]
 
 
-def test_an_ack_of_two_echoes_the_timestamp_of_the_first() -> None:
+def test_an_ack_of_two_segments_echoes_the_timestamp_of_the_first() -> None:
     # RFC 7323, 4.2 (1): the measured round trip includes the whole ACK delay, here 30 ms.
     samples: list[TcpSample] = []
     wire = ScriptedWire(DELAY_NS)

@@ -201,7 +201,7 @@ def test_best_effort_has_the_loss_of_the_link(loss: float, size_bytes: int, fram
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2, 0.6])
-def test_reliable_keep_all_loses_nothing(loss: float) -> None:
+def test_a_reliable_writer_that_keeps_all_samples_loses_none(loss: float) -> None:
     wire = publish_samples(KEEP_ALL, 100, script=losing_frames(loss), size_bytes=500)
     assert list(wire.delivered) == list(range(100))
     assert not wire.dropped
