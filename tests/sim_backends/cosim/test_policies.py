@@ -1,4 +1,4 @@
-"""Sync policies against results computed by hand: robots pass each other, links have a hard range limit."""
+"""Sync policies compared with results computed by hand: robots pass each other, links have a hard range limit."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -214,7 +214,7 @@ def test_errors_equal_those_computed_by_hand() -> None:
     # Their relative speed is 1.7 m/s; the states are those at the beginning of the window.
     assert scheduled_errors.position_error_m.largest == pytest.approx(1.7 * window_s, rel=0.03)
     assert scheduled_errors.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
-    # Only in windows in which they enter or leave the range, packets have another fate.
+    # Packets have another fate only in windows in which the robots enter or leave the range.
     differing_packets = scheduled_errors.fate_disagreement * scheduled_errors.packets
     assert 1 <= differing_packets <= 2 * window_s * 1e9 / PERIOD_NS + 2
     assert scheduled_errors.first_disagreement is not None
@@ -223,7 +223,8 @@ def test_errors_equal_those_computed_by_hand() -> None:
     assert sliding_errors.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
     assert sliding_errors.causality_violations > 0.9 * sum(not fate.reason for fate in reference.fates.values())
     stepped_errors = errors(reference, passing_run(TimeStepped(window_s)))
-    # Half a window before the network; after it, the rest of a window that the delay of the link leaves.
+    # Packets wait for half a window before the network. They enter it at the beginning of a window, arrive after the
+    # delay of the link, and wait for the rest of that window.
     assert stepped_errors.delay_added_s == pytest.approx(1.5 * window_s - DELAY_NS / 1e9, rel=0.01)
 
 

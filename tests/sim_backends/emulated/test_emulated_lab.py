@@ -154,7 +154,7 @@ def test_tcpdump_writes_captures_into_folders_of_root(emulation: EmulatedTestbed
         "until [ -e x.pcap ]; do sleep 0.01; done && ping -q -c 5 -i 0.05 10.42.0.3 && wait && stat -c %s x.pcap"
     )
     size_bytes = int(output_of(emulation.shells[Role.SENDER], "bash", "-c", script).splitlines()[-1])
-    # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
+    # The file has a header of 24 bytes, and for each packet a header of 16 bytes and a ping of 84 bytes.
     assert size_bytes == 24 + 2 * (16 + 84)
 
 
@@ -204,8 +204,9 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
     assert rate_of(stamps_s) == pytest.approx(5.0, rel=0.01)
     assert {scan.header.frame_id for scan in scans} == {"base_scan"}
     assert all(len(scan.ranges) == len(scan.intensities) == 360 for scan in scans)
-    # facts, section 1, with a frame of 9 letters: 57 + 4 + 8 * 360 bytes a message and 58 of the bag, 9,063 in all.
-    # Without ROS the message definition, which is in a bag twice, has no comments: 5,387 in all.
+    # A message with a frame of 9 letters has 57 + 4 + 8 * 360 bytes, and the bag adds 58 bytes to each. The rest of
+    # the bag has 9,063 bytes with ROS, and 5,387 without, because the message definition, which a bag contains twice,
+    # then has no comments.
     assert bag.stat().st_size - len(scans) * (57 + 4 + 8 * 360 + 58) in {9_063, 5_387}
 
 

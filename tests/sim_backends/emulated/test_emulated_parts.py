@@ -265,7 +265,9 @@ class TestMessages:
 
     def test_a_scan_has_the_real_size_and_is_within_the_range_of_the_laser(self) -> None:
         data = messages.Source(sensor(), [ROOM]).message(0, 0)
-        assert len(data) == 57 + 4 + 8 * 360  # facts, section 1: 57 + 8 per beam with a frame of 5 letters
+        assert (
+            len(data) == 57 + 4 + 8 * 360
+        )  # 57 bytes with a frame of 5 letters, 4 more letters, and 8 bytes per beam
         scan = read_back(data, "sensor_msgs/LaserScan")
         low_m, high_m = messages.LASER_RANGE_M
         assert low_m <= scan.ranges.min() <= scan.ranges.max() <= high_m + 1e-6

@@ -122,7 +122,7 @@ def test_a_busybox_robot_records_and_captures(emulation: EmulatedTestbed) -> Non
     )
     capture = "timeout 10 tcpdump -n -i wlan0 -c 2 -w x.pcap 2>/dev/null; wc -c <x.pcap"
     output = output_of(emulation, Role.SENDER, "sh", "-c", f"ping -q -c 50 -i 0.1 10.42.0.3 >/dev/null & {capture}")
-    # A file header of 24 bytes, and per packet 16 and a ping of 84 bytes.
+    # The file has a header of 24 bytes, and for each packet a header of 16 bytes and a ping of 84 bytes.
     assert int(output) == 24 + 2 * (16 + 84)
 
 

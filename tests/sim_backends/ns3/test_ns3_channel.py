@@ -59,7 +59,7 @@ def test_losses_in_ns3_equal_those_of_the_built_in_radio(options: dict[str, Any]
         for first, name in enumerate(NAMES):
             powers_mw = channel.powers_mw(first, at_ns)
             for second, other in enumerate(NAMES):
-                if first != second and powers_mw[second] > 0:  # metal may absorb everything that a float can hold
+                if first != second and powers_mw[second] > 0:  # the loss in metal may exceed the range of a float
                     links.append((at_ns, first, places[name], second, places[other]))
                     expected_mw.append(powers_mw[second])
         jammer_m = rng.uniform(0, 60), rng.uniform(0, 60), 1.0

@@ -66,7 +66,7 @@ def test_states_are_those_of_the_last_step_and_commands_take_effect_at_the_next(
     bodies = two_bodies(None)
     bodies.advance(1_500_000, {})
     assert bodies.advance(1_999_999, {"a": Twist(1.0)})["a"].velocity_m_s[0] == 0
-    # Commanded at 1.5 ms, so effective from 2 ms on; at 3 m/s^2 it has 3 mm/s a step later.
+    # The command of 1.5 ms takes effect at 2 ms; at 3 m/s^2, the speed is 3 mm/s one step later.
     assert bodies.advance(2_999_999, {})["a"].velocity_m_s[0] == 0
     assert bodies.advance(3_000_000, {})["a"].velocity_m_s[0] == pytest.approx(0.003)
     assert bodies.advance(3_000_000, {"a": Twist()})["a"].velocity_m_s[0] == pytest.approx(0.003)
@@ -78,7 +78,7 @@ def test_a_snapshot_does_not_change() -> None:
     bodies.advance(0, {"a": Twist(-1.0)})
     states_at_1_s = bodies.advance(1000 * MS, {})
     states_at_2_s = bodies.advance(2000 * MS, {"a": Twist()})
-    # To 1 m/s over 1/6 m, in steps; the same distance to stop.
+    # The robot reaches 1 m/s after 1/6 m, in steps, and stops after the same distance.
     assert states_at_1_s["a"].position_m[0] == pytest.approx(-1 - 5 / 6, abs=1e-6)
     assert states_at_2_s["a"].position_m[0] == pytest.approx(-2, abs=2e-6)
 

@@ -34,11 +34,11 @@ def test_a_robot_that_heads_straight_into_a_wall_stops() -> None:
     state = bodies.advance(5000 * MS, {"a": Twist(1.0)})["a"]
     assert state.position_m == pytest.approx((2.95 - R_M, 0.0, 0.0), abs=1e-9)
     assert state.velocity_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
-    # 1/6 m and a third of a second to 1 m/s; one contact, however long the robot pushes.
+    # The robot reaches 1 m/s after 1/6 m and a third of a second. There is one contact, however long it pushes.
     contact_s = 1 / 3 + 2.95 - R_M - 1 / 6
     assert [(collision.body, collision.obstacle) for collision in bodies.collisions] == [("a", "wall")]
     assert bodies.collisions[0].at_ns == pytest.approx(contact_s * 1e9, abs=MS)
-    # Away from the wall it accelerates as its drive allows.
+    # It accelerates away from the wall as its drive allows.
     bodies.advance(5000 * MS, {"a": Twist(-1.0)})
     assert bodies.advance(5100 * MS, {})["a"].velocity_m_s[0] == pytest.approx(-0.3)
 
@@ -49,7 +49,7 @@ def test_a_robot_slides_along_a_wall() -> None:
     earlier_state = bodies.advance(5000 * MS, {"a": Twist(1.0)})["a"]
     later_state = bodies.advance(6000 * MS, {})["a"]
     assert earlier_state.position_m[0] == later_state.position_m[0] == pytest.approx(2.95 - R_M, abs=1e-9)
-    # The speed along the wall is sin 60 degrees of the command, twice: of the heading, and of the contact.
+    # The speed is multiplied by sin 60 degrees twice: by the heading, and by the contact, which is along the wall.
     expected_m_s = math.sin(math.radians(60)) ** 2
     assert earlier_state.velocity_m_s == pytest.approx((0.0, expected_m_s, 0.0), abs=1e-9)
     assert later_state.position_m[1] - earlier_state.position_m[1] == pytest.approx(expected_m_s, rel=0.01)
@@ -75,7 +75,7 @@ def test_a_robot_neither_climbs_raised_ground_nor_drives_off_it() -> None:
     bodies.advance(0, {})
     states = bodies.advance(15_000 * MS, dict.fromkeys(("below", "above"), Twist(1.0)))
     assert states["below"].position_m == pytest.approx((2 - R_M, 0.0, 0.0), abs=1e-9)
-    # Across both areas, which form one plateau, along the edge at 1.5 m north, into the corner.
+    # It drives across both areas, which form one plateau, and along the edge at 1.5 m north into the corner.
     assert states["above"].position_m == pytest.approx((10.0, 1.5, 0.5), abs=1e-9)
     assert states["above"].velocity_m_s == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
 

@@ -34,7 +34,7 @@ def state_after(bodies: Bodies, *legs: tuple[float, Twist]) -> State:
 def test_acceleration_and_braking_distances_are_v_squared_over_2a() -> None:
     heading = math.radians(30)
     state = state_after(drive(heading_rad=heading), (2.0, Twist(1.5)), (3.0, Twist()))
-    # To 1.5 m/s in 1.5 s over 1.125 m, 0.5 s at that speed, and the same distance to brake.
+    # The robot reaches 1.5 m/s after 1.5 s and 1.125 m, has this speed for 0.5 s, and brakes over the same distance.
     path_m = 1.5**2 / 2 + 0.5 * 1.5 + 1.5**2 / 2
     assert state.position_m == pytest.approx((path_m * math.cos(heading), path_m * math.sin(heading), 0.5), abs=1e-12)
     assert state.velocity_m_s == (0.0, 0.0, 0.0)
@@ -86,7 +86,7 @@ def test_speeds_do_not_exceed_the_limits() -> None:
     assert math.hypot(*state.velocity_m_s) == pytest.approx(0.22)
     bodies = drive(HUSKY_A200)
     state = state_after(bodies, (10.0, Twist(0.0, 9.0)))
-    # To 2 rad/s in a third of a second.
+    # The robot reaches 2 rad/s after a third of a second.
     assert state.heading_rad == pytest.approx(2.0 * 10 - 2.0**2 / 6 / 2, abs=1e-6)
     assert state.position_m == (0.0, 0.0, 0.5)
 

@@ -32,7 +32,7 @@ def state_after(bodies: Bodies, ms: int, twist: Twist) -> State:
 
 def test_a_robot_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
     bodies = rover(0.0)
-    # 5 m to the ramp, sqrt(104) m up the ramp, and the rest on the plateau, minus the distance lost by accelerating.
+    # It drives 5 m to the ramp, sqrt(104) m up the ramp, and the rest on the plateau; acceleration costs `lost_m`.
     lost_m = 1 / (2 * 0.5 * GRAVITY_M_S2)
     plateau_m = 18.0 - lost_m - 5 - math.hypot(10, 2)
     halfway = state_after(bodies, 9000, Twist(1.0))

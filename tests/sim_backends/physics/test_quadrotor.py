@@ -70,7 +70,7 @@ def test_the_velocity_error_decays_with_the_gain() -> None:
 
 
 def test_a_quadrotor_turns_to_its_target_yaw_in_the_shorter_direction() -> None:
-    # From 3 rad by 0.78 rad across pi; 0.1 s at 90 degrees per second.
+    # The shorter turn from 3 rad is by 0.78 rad, across pi. In 0.1 s it turns by 9 degrees, at 90 degrees per second.
     bodies = Bodies({"a": Quadrotor(DUCKIEDRONE, (0.0, 0.0, 1.0), 3.0)})
     bodies.advance(0, {"a": Velocity(yaw_rad=-2.5)})
     assert bodies.advance(S // 10, {"a": Velocity(yaw_rad=-2.5)})["a"].heading_rad == pytest.approx(

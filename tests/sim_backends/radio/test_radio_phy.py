@@ -46,7 +46,7 @@ def test_acks_use_the_fastest_mandatory_rate_up_to_that_of_the_frame() -> None:
 
 @MODES
 def test_the_uncoded_bit_error_rate_equals_that_of_proakis(mode: WifiMode) -> None:
-    """Gray-coded M-QAM by Q functions, nearest neighbours only."""
+    """The expected rates are those of Gray-coded M-QAM by Q functions, with errors to nearest neighbours only."""
     for snr_db in (5.0, 10.0, 15.0):
         snr = 10 ** (snr_db / 10)
         q = scipy.stats.norm.sf
@@ -109,7 +109,7 @@ def test_two_ray_loss_is_near_the_direct_path_and_symmetric(heights_and_distance
 
 
 def test_far_two_ray_loss_is_40_db_per_decade() -> None:
-    """Beyond 4 pi h1 h2 / wavelength (Rappaport, eq. 4.52)."""
+    """Far means beyond 4 pi h1 h2 / wavelength (Rappaport, eq. 4.52)."""
     start = np.array([[0, 0, 0.5]] * 2)
     end = np.array([[100, 0, 0.5], [1000, 0, 0.5]])
     near_db, far_db = propagation.two_ray_db(start, end, WIFI_HZ)

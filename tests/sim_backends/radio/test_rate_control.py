@@ -43,13 +43,15 @@ def test_the_initial_mode_follows_from_the_snr(snr_db: float, expected: str) -> 
 @pytest.mark.parametrize(
     ("snr_db", "expected"),
     [
-        # All reliable: twice the best, the second, the most robust (the fastest reliable one), then the slowest.
+        # All modes are reliable: two attempts each in the best, the second and the most robust mode, which is the
+        # fastest reliable one; then one in the slowest.
         (35.0, ["g54", "g54", "g48", "g48", "g54", "g54", "g6"]),
-        # At 48 Mbit/s 37 % of frames of 1200 bytes fail, so it ranks below 36 Mbit/s. An exchange takes 0.30 ms
-        # there, and the mean backoffs before the 2nd to 6th attempt are 67, 139, 283, 571 and 1147 us: six take 4.0
-        # ms, seven 6.6.
+        # At 48 Mbit/s, 37 % of frames of 1200 bytes fail, so this mode ranks below 36 Mbit/s. Its exchange takes
+        # 0.30 ms, and the mean backoffs before the 2nd to 6th attempt are 67, 139, 283, 571 and 1147 us: six attempts
+        # take 4.0 ms, and seven take 6.6 ms.
         (20.81, ["g36", "g36", "g48", "g48", "g48", "g48", "g48"]),
-        # Almost no success, so half as many as fit: three for the slowest, at 1.7 ms, and also for the next four.
+        # Almost all attempts fail, so each mode has half as many attempts as fit: one of three in the slowest mode,
+        # at 1.7 ms each, and two of four in the next one.
         (0.0, ["g6", "g9", "g9", "g6", "g6", "g6", "g6"]),
     ],
 )
@@ -68,7 +70,9 @@ def test_faster_modes_are_sampled_in_a_tenth_of_the_frames_and_each_at_most_four
     frames = attempted_modes(minstrel(35.0), 20_000, lambda mode: mode.bits_per_symbol <= 96)[5_000:]
     samples = [attempts for attempts in frames if attempts[0] in {"g36", "g48", "g54"}]
     assert 0.06 < len(samples) / len(frames) < 0.1
-    assert {tuple(attempts[2:]) for attempts in samples} == {("g24",)}, "the sample twice, and then the best"
+    assert {tuple(attempts[2:]) for attempts in samples} == {("g24",)}, (
+        "two attempts in the sampled mode, and then the best mode"
+    )
     for start in range(0, len(frames), PER_UPDATE):
         counts = Counter(attempts[0] for attempts in frames[start : start + PER_UPDATE])
         assert max(counts[name] for name in ("g36", "g48", "g54")) <= 4

@@ -1,4 +1,4 @@
-"""ROS 1 nodes: messages through a real master, among Debian's own tools, nodes that have exited, and wrong types."""
+"""ROS 1 nodes: messages with a real master and Debian's tools, nodes that have exited, and wrong types."""
 
 import socket
 import subprocess

@@ -64,7 +64,7 @@ def ignore(_: Event) -> None:
 
 
 def test_ctrl_c_ends_all_seeds_on_a_single_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On a single processor, the runs are in the process that receives the signal."""
+    """On a single processor, the runs take place in the process that receives the signal."""
     started_seeds: list[int | None] = []
 
     def build_interrupted(*arguments: object, seed: int, **options: object) -> object:

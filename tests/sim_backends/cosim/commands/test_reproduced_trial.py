@@ -1,4 +1,4 @@
-"""A scenario that reproduces a trial of robots: its rows against scapy's counts of its captures, and its errors."""
+"""A scenario that reproduces a trial of robots: its rows compared with scapy's counts of captures, and its errors."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The bound of `error_bounded`: in complete runs of bodies that accelerate and collide, and in decibels."""
+"""The bound of `error_bounded` on positions, in complete runs with acceleration and collisions, and on path loss."""
 
 import math
 from collections.abc import Sequence
@@ -103,7 +103,7 @@ def test_no_error_exceeds_the_bound_if_agents_steer_often_and_send_rarely() -> N
 
 
 def test_a_collision_with_a_wall_does_not_exceed_the_bound() -> None:
-    """Side by side their relative position is constant, until one of them stops suddenly."""
+    """While they drive side by side, their relative position is constant, until one of them stops suddenly."""
     start = {"a": (0.0, -1.0), "b": (0.0, 6.0)}
     bodies = Bodies({name: DifferentialDrive(HUSKY_A200, place_m) for name, place_m in start.items()}, YARD)
     agents = Agents(bodies, {name: Driver(peer, [Twist(1.0)]) for name, peer in ("ab", "ba")})

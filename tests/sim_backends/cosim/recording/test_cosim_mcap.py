@@ -63,7 +63,7 @@ def test_packets_and_their_fates_are_those_of_the_run(recording: Recording, mess
         assert content.get("reason", "") == fate.reason
         if fate.counted_ns is not None and fate.arrived_ns is not None:
             assert content["delay_s"] == (fate.counted_ns - fate.packet.sent_ns) / 1e9
-            # The policy adds all of the delay except that of the link, by steps of 5 ms.
+            # The policy adds all of the delay except that of the link, in steps of 5 ms.
             assert content["delay_s"] - content["added_s"] == pytest.approx(0.001234567)
     assert {"arrived" in content for content in contents.values()} == {True, False}
     assert {content["size_bytes"] for content in contents.values()} == {100, 333}

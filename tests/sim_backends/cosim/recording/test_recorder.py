@@ -64,7 +64,8 @@ def test_a_recording_reproduces_every_number(tmp_path: Path, policy: SyncPolicy)
     assert list(recording.run.fates) == list(live_run.fates), "in the same order, which affects the rounding of means"
     assert recording.manifest.ending is RunEnding.COMPLETE
     assert recording.manifest.about == ABOUT
-    # States are at 10 Hz, at the first end of a window from then on; a drives at 1 m/s, in steps of 1 ms.
+    # States are recorded at 10 Hz, each at the first end of a window after its due time. Robot a drives at 1 m/s, in
+    # steps of 1 ms.
     states_of_a = [(at_ns, state) for at_ns, agent, state in recording.states if agent == "a"]
     assert [at_ns // (100 * MS) for at_ns, _ in states_of_a] == list(range(len(states_of_a)))
     assert len(states_of_a) >= END_NS // (100 * MS)
@@ -166,7 +167,7 @@ def test_a_run_that_is_interrupted_is_recorded_completely(tmp_path: Path) -> Non
 
 
 def test_a_full_disk_ends_the_run_and_keeps_the_parts_written_before(tmp_path: Path) -> None:
-    """A limit on the size of files stands in for a full disk."""
+    """A limit of the file size simulates a full disk."""
     with recording_process(tmp_path / "run", 20_000) as process:
         _, stderr = process.communicate(timeout=EXIT_S)
     assert "RecordingError" in stderr

@@ -1,4 +1,4 @@
-"""Each fault of a federate, over each transport and in both roles: the run names it and its recording is readable."""
+"""Faults of federates, over each transport and in both roles: the run names the federate and can be replayed."""
 
 import json
 import os

@@ -33,7 +33,8 @@ def test_events_are_commensurate_if_few_phases_are_counted(period_ms: int, windo
     if phases <= MAX_PHASES:
         assert [event.phases for event in commensurate] == [phases]
     for event in commensurate:
-        # If there are more phases, they are close to the reported ones: after that many events, the phase is similar.
+        # If there are more phases than reported, every further phase is close to a reported one: after `event.phases`
+        # events, the phase is nearly the same again.
         phases_ms = [number * period_ms % window_ms for number in range(0, event_count, event.phases)]
         assert all(min(ms, window_ms - ms) < window_ms / event.phases for ms in phases_ms)
 

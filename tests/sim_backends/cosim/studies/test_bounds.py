@@ -1,4 +1,4 @@
-"""The cost of a bound, against results computed by hand."""
+"""The cost of a bound, compared with results computed by hand."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Convoys against transfer functions derived by hand, on a network with a constant delay."""
+"""Convoys compared with transfer functions derived by hand, on a network with a constant delay."""
 
 import math
 

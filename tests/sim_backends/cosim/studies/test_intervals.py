@@ -1,4 +1,4 @@
-"""Intervals against scipy, and their coverage."""
+"""Confidence intervals compared with those of scipy, and the number of repeats that a study needs."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Local errors against results computed by hand: a moving pair, a hard range limit, a constant delay."""
+"""Local errors compared with results computed by hand: a moving pair, a hard range limit, a constant delay."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -33,8 +33,8 @@ from tests.helpers.moving_pair import DELAY_NS, LEAVES_NS, PERIOD_NS, SPEED_M_S,
 MS = 1_000_000
 DELAY_S = DELAY_NS / 1e9
 WINDOWS_S = (0.02, 0.06, 0.2)
-WITHIN = low_discrepancy_times_ns(4_000 * MS, 7_500 * MS, 30, STEP_NS)
-"""Beginnings of windows that are within range until their end."""
+STARTS_IN_RANGE_NS = low_discrepancy_times_ns(4_000 * MS, 7_500 * MS, 30, STEP_NS)
+"""Starts of windows during which the pair is always within range."""
 
 
 def mean_wait_s(window_s: float) -> float:
@@ -74,7 +74,7 @@ LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
 
 def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
     by_policy = local_errors(
-        moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, WITHIN, tail_ns=20 * MS
+        moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, STARTS_IN_RANGE_NS, tail_ns=20 * MS
     )
     for name, (_, laws) in LAWS.items():
         errors = by_policy[name]
@@ -179,7 +179,7 @@ def test_the_position_error_of_a_whole_run_grows_and_is_of_the_first_order() -> 
 def test_windows_of_several_runs_are_pooled() -> None:
     first, second = (
         local_errors(moving_pair, {"scheduled": Scheduled}, (0.05, 0.1), begins_ns, tail_ns=20 * MS)["scheduled"]
-        for begins_ns in (WITHIN[:5], WITHIN[5:12])
+        for begins_ns in (STARTS_IN_RANGE_NS[:5], STARTS_IN_RANGE_NS[5:12])
     )
     pooled_errors = pool([first, second])
     assert pooled_errors.window_s.shape == (2, 12)

@@ -96,7 +96,7 @@ def test_a_drone_without_motors_falls_with_drag_and_comes_to_rest() -> None:
 
 
 def test_the_drone_tilts_towards_its_acceleration() -> None:
-    """With the nose to the north, acceleration to the east is a roll to the right, and to the north a pitch down."""
+    """With its nose to the north, it accelerates to the east by rolling right, and to the north by pitching down."""
     body = hovering_drone(heading_rad=math.pi / 2)
     for _ in range(20):
         body.step((0.2, 0.0, 0.0), DUCKIEDRONE)
@@ -107,7 +107,7 @@ def test_the_drone_tilts_towards_its_acceleration() -> None:
 
 
 def house() -> Sequence[Footprint]:
-    """Return a house of 3 m, from 4 m to 8 m east."""
+    """Return a house with a height of 3 m, from 4 m to 8 m east."""
     box = {"name": "house", "kind": "box", "material": "concrete", "centre_m": [6, 0], "size_m": [4, 4, 3]}
     world = World.model_validate({"name": "w", "summary": "", "area_m": [40, 40], "obstacles": [box]})
     return Ground(world, None).obstacles

@@ -59,7 +59,7 @@ def test_gazebo_places_robots_and_stops_them_at_the_wall_until_it_is_killed(
         wait_until(lambda: bench.driven.drive(0.2, 2.0).place_m[0] > 3.75, Deadline.after(60))
         wait_until(lambda: not bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
         motion_at_wall = bench.driven.drive(0.2, 0.5)
-        assert motion_at_wall.place_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis has 69 mm in front"
+        assert motion_at_wall.place_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis extends 69 mm ahead"
         bench.driven.assign(PLACES["a"])
         bench.medium.place(PLACES)
         wait_until(lambda: bench.driven.drive(0.2, 0.5).place_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))

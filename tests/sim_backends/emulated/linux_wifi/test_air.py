@@ -69,7 +69,7 @@ def test_a_frame_takes_its_airtime_and_that_of_its_acknowledgement(stage: RateSt
 
 
 def test_tries_are_lost_as_often_as_the_packet_error_rate_of_their_mode() -> None:
-    """Each frame has one try in 54 Mbit/s and then one in 6 Mbit/s, at a signal with which 54 Mbit/s often fails."""
+    """Each frame has one try at 54 Mbit/s and then one at 6 Mbit/s, at a signal with which 54 Mbit/s often fails."""
     ack = control_mode(G54)
     distance_m = next(
         distance / 10

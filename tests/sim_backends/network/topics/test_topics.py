@@ -77,9 +77,10 @@ def messages(wire: ScriptedWire) -> list[tuple[int, str, tuple[Submessage, ...]]
 @pytest.mark.parametrize(
     ("submessages", "size_bytes"),
     [
-        # Clause 9.4.5: 4 bytes of header each; DATA 20 more, after INFO_TS with 12; HEARTBEAT 28 more.
+        # Clause 9.4.5: every submessage has a header of 4 bytes. DATA has 20 more and follows an INFO_TS of 12 bytes;
+        # HEARTBEAT has 28 more.
         ((Data(Sample(100, 0), 0, 1, 1, 1344), Heartbeat(1, 1, 1, final=True, directed=False)), 12 + 24 + 100 + 32),
-        # All of a LaserScan in one DATA_FRAG, whose header has 32 bytes more.
+        # One DATA_FRAG, whose header has 32 bytes more, contains a complete LaserScan.
         ((Data(Sample(SCAN_BYTES, 0), 0, 3, 3, 1344),), 12 + 36 + SCAN_BYTES),
         ((Data(Sample(SCAN_BYTES, 0), 2, 1, 3, 1344),), 36 + SCAN_BYTES - 2 * 1344),
         # Messages for one end contain its participant in an INFO_DST of 16 bytes.
