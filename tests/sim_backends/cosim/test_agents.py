@@ -78,8 +78,10 @@ def test_programs_wake_at_their_last_planned_time_and_when_they_receive(
                 if programs[name].next_wake_ns() == at_ns:
                     programs[name].wake(at_ns, state, ())
         assert wakes == expected
-        planned_ns = [wake_ns for program in programs.values() if (wake_ns := program.next_wake_ns()) is not None]
-        assert agents.next_wake_ns() == min(planned_ns, default=None)
+        planned_wakes_ns = [
+            wake_ns for program in programs.values() if (wake_ns := program.next_wake_ns()) is not None
+        ]
+        assert agents.next_wake_ns() == min(planned_wakes_ns, default=None)
 
 
 class PhysicsWithLateAgent(StationaryPhysics):
@@ -134,7 +136,7 @@ def test_an_agent_that_the_physics_removes_is_absent_with_every_policy(policy: s
     assert len(fates["to b"]) >= 55
     assert 30 < len(fates["to a"]) <= 60 - 15, "its program sends nothing while the agent is absent"
     assert {fate.reason for name in fates for fate in fates[name]} == {"", ABSENT}
-    lost_sent_ns = [fate.packet.sent_ns for fate in fates["to b"] if fate.reason]
-    assert {*range(15, 30)} <= {at_ns // MS for at_ns in lost_sent_ns}
-    assert all(4 * MS <= at_ns < 37 * MS for at_ns in lost_sent_ns)
+    send_times_of_lost_ns = [fate.packet.sent_ns for fate in fates["to b"] if fate.reason]
+    assert {*range(15, 30)} <= {at_ns // MS for at_ns in send_times_of_lost_ns}
+    assert all(4 * MS <= at_ns < 37 * MS for at_ns in send_times_of_lost_ns)
     assert any(fate.arrived_ns is not None and fate.arrived_ns > 40 * MS for fate in fates["to a"])

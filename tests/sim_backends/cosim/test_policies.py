@@ -137,8 +137,8 @@ def test_exact_policies_agree_in_each_packet_and_only_sliding_windows_are_late()
             other.reason,
             other.assumed_states,
         )
-        held_m = 1.7 * (fate.packet.sent_ns % MS) / 1e9
-        assert position_error_m(fate) == pytest.approx(held_m, abs=1e-9), "states are held for a step"
+        hold_error_m = 1.7 * (fate.packet.sent_ns % MS) / 1e9
+        assert position_error_m(fate) == pytest.approx(hold_error_m, abs=1e-9), "states are held for a step"
         assert not fate.late_ns
     assert any(fate.late_ns for fate in passing_run(SlidingWindow(0.05)).fates.values()), (
         "some receivers had already passed the time of arrival"
@@ -235,9 +235,9 @@ def test_position_errors_are_half_a_window_for_any_step_of_the_physics(
 ) -> None:
     """All fixed windows have the same error; the exact policy has an error of half a step."""
     error_m = errors(passing_run(EventDriven()), passing_run(policy(0.01), step_ns=step_ns)).position_error_m
-    held_s = step_ns / 1e9 if window_s is None else window_s
-    assert error_m.mean == pytest.approx(1.7 * held_s / 2, rel=0.02)
-    assert error_m.largest == pytest.approx(1.7 * held_s, rel=0.02)
+    hold_time_s = step_ns / 1e9 if window_s is None else window_s
+    assert error_m.mean == pytest.approx(1.7 * hold_time_s / 2, rel=0.02)
+    assert error_m.largest == pytest.approx(1.7 * hold_time_s, rel=0.02)
 
 
 @pytest.mark.parametrize("policy", FIXED)

@@ -17,15 +17,15 @@ SHORT = {"duration": "400ms", "policy.name": "sliding_window", "policy.window": 
 @given(st.lists(st.integers(-(10**10), 10**10), min_size=1))
 def test_the_histogram_counts_every_window_below_its_limit(lateness_values_ns: list[int]) -> None:
     lateness = WindowLateness()
-    for value_ns in lateness_values_ns:
-        lateness.add(value_ns)
+    for lateness_ns in lateness_values_ns:
+        lateness.add(lateness_ns)
     assert lateness.windows.total() == len(lateness_values_ns)
     assert lateness.largest_ns == max(0, *lateness_values_ns)
-    assert lateness.windows[0] == sum(value_ns <= 0 for value_ns in lateness_values_ns)
+    assert lateness.windows[0] == sum(lateness_ns <= 0 for lateness_ns in lateness_values_ns)
     for limit_ns in lateness.windows:
         assert str(limit_ns).rstrip("0") in {"", "1", "2", "5"}
         window_count = sum(count for bound_ns, count in lateness.windows.items() if bound_ns <= limit_ns)
-        assert window_count == sum(value_ns <= limit_ns for value_ns in lateness_values_ns)
+        assert window_count == sum(lateness_ns <= limit_ns for lateness_ns in lateness_values_ns)
 
 
 def test_a_run_takes_as_long_as_its_factor_states_and_has_the_events_of_a_fast_run() -> None:

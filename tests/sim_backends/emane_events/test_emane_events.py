@@ -332,12 +332,12 @@ def test_agents_follow_events(network: None, tmp_path: Path) -> None:
     assert run.wall_s["wait"] > 0.3  # it runs in real time
 
 
-def loss_event(messages: dict[str, Any], to_nem: int, **losses_db: tuple[float, float]) -> SerializedEvent:
+def loss_event(messages: dict[str, Any], receiver_nem: int, **losses_db: tuple[float, float]) -> SerializedEvent:
     """Return an event for a NEM with the bytes of protobuf: forward and reverse losses by the other NEM."""
     event = messages["PathlossEvent"]()
     for nem, (forward_db, reverse_db) in losses_db.items():
         event.pathlosses.add(nemId=int(nem[1:]), forwardPathlossdB=forward_db, reversePathlossdB=reverse_db)
-    return SerializedEvent(to_nem, PATHLOSS, event.SerializeToString())
+    return SerializedEvent(receiver_nem, PATHLOSS, event.SerializeToString())
 
 
 @pytest.mark.emulated

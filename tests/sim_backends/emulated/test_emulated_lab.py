@@ -86,7 +86,7 @@ def output_of(shell: Shell, *argv: str, seconds: float = 30.0) -> str:
     return shell.run(argv, deadline=Deadline.after(seconds)).stdout.decode()
 
 
-def in_ros(shell: Shell, *argv: str) -> str:
+def run_in_ros(shell: Shell, *argv: str) -> str:
     return output_of(shell, *with_environment(argv, setup=[SETUP]), seconds=60)
 
 
@@ -193,7 +193,7 @@ def rate_of(times_s: list[float]) -> float:
 
 @pytest.mark.quiet
 def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, tmp_path: Path) -> None:
-    in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
+    run_in_ros(sender, "rosbag", "record", "--duration=5", "-O", "scan", "/scan")
     bag = tmp_path / "scan.bag"
     sender.fetch(("cat", "scan.bag"), bag, deadline=Deadline.after(30), limit_bytes=1 << 20)
     scans = messages_in(bag, "/scan")
@@ -213,7 +213,7 @@ def test_a_recorded_scan_has_the_sensor_s_rate_and_the_real_size(sender: Shell, 
 @pytest.mark.quiet
 def test_all_topics_keep_their_rates(sender: Shell, tmp_path: Path) -> None:
     rates_hz = {topic.name: topic.rate for topic in ros_of(master_cast()[Role.SENDER].profile).topics}
-    in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
+    run_in_ros(sender, "rosbag", "record", "--duration=3", "-O", "all", *rates_hz)
     bag = tmp_path / "all.bag"
     sender.fetch(("cat", "all.bag"), bag, deadline=Deadline.after(30), limit_bytes=8 << 20)
     for topic, rate_hz in rates_hz.items():
@@ -283,7 +283,7 @@ def test_a_clone_works_in_any_folder(parent: str) -> None:
         shutil.rmtree(folder)
 
 
-def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
+def robot_without_lab(stack: ExitStack, **changes: str) -> EmulatedRobot:
     cast = master_cast()
     spec = robot_spec(cast, Role.SENDER, ros=RosChoice.BUILTIN, login=KeyPair.make(), host_key=KeyPair.make())
     return stack.enter_context(EmulatedRobot(replace(spec, **changes)))  # type: ignore[arg-type]
@@ -291,7 +291,7 @@ def lone_robot(stack: ExitStack, **changes: str) -> EmulatedRobot:
 
 def test_a_server_that_does_not_start_is_named_with_its_output() -> None:
     with ExitStack() as stack:
-        robot = lone_robot(stack, host_key="no key")
+        robot = robot_without_lab(stack, host_key="no key")
         robot.build()
         robot.open_radio()
         with pytest.raises(RobotError, match=r"turtlebot-1: sshd exited with status 1: .*no hostkeys available"):
@@ -301,7 +301,7 @@ def test_a_server_that_does_not_start_is_named_with_its_output() -> None:
 def test_a_robot_uses_less_than_15_mb_of_unshared_memory() -> None:
     """Two robots run, so that pages of programs are shared even if no other program on this machine uses them."""
     with ExitStack() as stack:
-        robots = [lone_robot(stack) for _ in range(2)]
+        robots = [robot_without_lab(stack) for _ in range(2)]
         for robot in robots:
             robot.build()
             robot.open_radio()
@@ -311,7 +311,7 @@ def test_a_robot_uses_less_than_15_mb_of_unshared_memory() -> None:
 
 def test_a_rejected_address_is_reported() -> None:
     with ExitStack() as stack:
-        robot = lone_robot(stack, address="10.42.0.1/99")
+        robot = robot_without_lab(stack, address="10.42.0.1/99")
         robot.build()
         with pytest.raises(RobotError, match="turtlebot-1: ip rejected a setting"):
             robot.open_radio()
@@ -319,7 +319,7 @@ def test_a_rejected_address_is_reported() -> None:
 
 def test_a_killed_robot_is_reported() -> None:
     with ExitStack() as stack:
-        robot = lone_robot(stack)
+        robot = robot_without_lab(stack)
         robot.build()
         os.kill(robot.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match=r"turtlebot-1, pid .* does not answer: it was killed by SIGKILL"):

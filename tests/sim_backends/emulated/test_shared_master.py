@@ -57,7 +57,7 @@ def output_of(shell: Shell, *argv: str) -> str:
     return shell.run(argv, deadline=Deadline.after(LONG_S)).stdout.decode()
 
 
-def in_ros(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
+def run_in_ros(emulation: EmulatedTestbed, role: Role, *argv: str) -> str:
     return output_of(emulation.shells[role], *with_environment(argv, setup=emulation.robots[role].spec.setup))
 
 
@@ -83,9 +83,9 @@ def test_the_relay_runs_roscore_and_the_others_no_master(emulation: EmulatedTest
 @pytest.mark.emulated
 def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: EmulatedTestbed) -> None:
     for role in emulation.shells:
-        topics = set(in_ros(emulation, role, "rostopic", "list").split())
+        topics = set(run_in_ros(emulation, role, "rostopic", "list").split())
         assert topics >= {"/scan", "/odom", "/imu", "/battery_state", "/pidrone/imu", "/rosout"}
-    info = in_ros(emulation, Role.RECEIVER, "rostopic", "info", "/scan")
+    info = run_in_ros(emulation, Role.RECEIVER, "rostopic", "info", "/scan")
     publishers = info.partition("Publishers:")[2].partition("Subscribers:")[0].split()
     assert publishers[:2] == ["*", "/sensors_turtlebot_1"], "the other TurtleBot's laser has the same name"
     assert len([publisher for publisher in publishers if publisher == "*"]) == 1
@@ -96,7 +96,7 @@ def test_every_robot_lists_all_topics_with_one_publisher_each(emulation: Emulate
 def test_subscriptions_to_another_robot_cross_the_medium(emulation: EmulatedTestbed, tmp_path: Path) -> None:
     receiver = emulation.shells[Role.RECEIVER]
     before = emulation.medium.stats().ports["turtlebot-1"].sent_packets
-    in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
+    run_in_ros(emulation, Role.RECEIVER, "rosbag", "record", "--duration=3", "-O", "heard", "/scan")
     bag = tmp_path / "heard.bag"
     receiver.fetch(("cat", "heard.bag"), bag, deadline=Deadline.after(LONG_S), limit_bytes=1 << 20)
     with Reader(bag) as reader:

@@ -45,10 +45,12 @@ def error(program: Path, request: bytes) -> str:
 def test_a_malformed_frame_is_refused_with_its_position(program: Path) -> None:
     for name in REQUESTS:
         body = FRAMES[name][HEADER_BYTES:]
-        for wrong_body in (body[:9], body[:-1], body + b"\0"):
-            message = error(program, struct.pack("<I", len(wrong_body)) + FRAMES[name][4:HEADER_BYTES] + wrong_body)
+        for malformed_body in (body[:9], body[:-1], body + b"\0"):
+            message = error(
+                program, struct.pack("<I", len(malformed_body)) + FRAMES[name][4:HEADER_BYTES] + malformed_body
+            )
             position = int(message.removeprefix("byte ").partition(":")[0])
-            assert position <= HEADER_BYTES + len(wrong_body)
+            assert position <= HEADER_BYTES + len(malformed_body)
         assert message.endswith("1 bytes follow the message")
     hello, physics = FRAMES["hello"], FRAMES["advance physics"]
     assert error(program, struct.pack("<I", MAX_HELLO_BYTES + 1) + hello[4:]).startswith("byte 0: a size of 4194305")

@@ -254,11 +254,11 @@ def test_robots_appear_and_disappear_at_their_times(reset: str, tmp_path: Path) 
         for _ in range(2):
             with open_federate(gazebo, changes=changes) as physics:
                 times_ms = record_presence(physics)
-                moved_m = physics.advance(1_000_000_000, {})["leader"].position_m[0] - 20
+                driven_distance_m = physics.advance(1_000_000_000, {})["leader"].position_m[0] - 20
             assert times_ms["follower"] == list(range(0, 401, 10))
             assert times_ms["leader"] == list(range(100, 401, 10))
             assert times_ms["drone"] == list(range(0, 301, 10))
-            assert moved_m == pytest.approx(0.55, abs=0.1), "speed and acceleration are those of its model"
+            assert driven_distance_m == pytest.approx(0.55, abs=0.1), "speed and acceleration are those of its model"
         with open_federate(gazebo) as physics:
             assert physics.advance(0, {}).keys() == {"leader", "follower", "drone"}
 

@@ -141,9 +141,9 @@ def test_losses_have_reasons(build_simulation: BuildSimulation) -> None:
     run = build_simulation(
         faults=faults, traffic=small_traffic, radio__mode="g54", network__options__standard="802.11a"
     ).run()
-    lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
-    assert len(lost_ns) == pytest.approx(10, abs=2)
-    assert all(90e6 < at_ns < 200e6 or 290e6 < at_ns < 400e6 for at_ns in lost_ns)
+    send_times_of_lost_ns = [fate.packet.sent_ns for fate in run.fates.values() if fate.reason]
+    assert len(send_times_of_lost_ns) == pytest.approx(10, abs=2)
+    assert all(90e6 < at_ns < 200e6 or 290e6 < at_ns < 400e6 for at_ns in send_times_of_lost_ns)
     relay_changes = {key.replace(".", "__"): value for key, value in RELAYED.items()}
     unassociated_run = build_simulation(
         **relay_changes | {"agents__bob__at_m": [500, 0]}, traffic=sparse_traffic

@@ -43,11 +43,11 @@ COMMANDS = st.lists(
 def run_commands(commands: list[tuple[int, str, Twist]], divisions_ns: list[int]) -> tuple[dict[str, State], Bodies]:
     """Return the states after 4.5 s; time is divided at the times of the commands and at `divisions_ns`."""
     bodies = two_bodies()
-    by_time = {at_ns: (name, twist) for at_ns, name, twist in commands}
+    commands_by_time = {at_ns: (name, twist) for at_ns, name, twist in commands}
     twists: dict[str, Twist] = {}
-    for at_ns in sorted({*by_time, *divisions_ns, 4000 * MS}):
+    for at_ns in sorted({*commands_by_time, *divisions_ns, 4000 * MS}):
         bodies.advance(at_ns, twists)
-        twists = dict([by_time[at_ns]] if at_ns in by_time else [])
+        twists = dict([commands_by_time[at_ns]] if at_ns in commands_by_time else [])
     return dict(bodies.advance(4500 * MS, twists)), bodies
 
 

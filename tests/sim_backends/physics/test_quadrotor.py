@@ -126,9 +126,9 @@ def test_extrapolation_errors_are_within_the_limit(
             at_ns += round(part * seconds * S)
             state = bodies.advance(at_ns, {"a": velocity})["a"]
             samples.append((at_ns // bodies.step_ns * bodies.step_ns / S, state, bodies.limits_m_s2["a"]))
-    top_m_s = limits.top_speed_m_s()
+    top_speed_m_s = limits.top_speed_m_s()
     for number, (start_s, start, limit) in enumerate(samples):
-        assert math.hypot(*start.velocity_m_s) <= top_m_s
+        assert math.hypot(*start.velocity_m_s) <= top_speed_m_s
         for end_s, end, _ in samples[number:]:
             t = end_s - start_s
             assert math.dist(end.velocity_m_s, start.velocity_m_s) <= limit * t + 1e-9

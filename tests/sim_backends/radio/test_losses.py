@@ -100,13 +100,13 @@ def record_losses(wifi: Wifi[int]) -> list[tuple[int, str, str]]:
 
 
 def test_exhausted_retries_are_reported_at_the_sender_and_the_relay() -> None:
-    for missing_link, lost_at in ((("a", "r"), "a"), (("r", "b"), "r")):
+    for missing_link, losing_station in ((("a", "r"), "a"), (("r", "b"), "r")):
         wifi: Wifi[int] = Wifi(FixedPowers("abr", G54, without_link=[missing_link]), 1)
         wifi.set_relay("r")
         losses = record_losses(wifi)
         wifi.send(0, "a", 1, 100, "b")
         assert wifi.deliveries(10**9) == []
-        assert losses == [(1, "b", RETRIES_EXHAUSTED)], lost_at
+        assert losses == [(1, "b", RETRIES_EXHAUSTED)], losing_station
 
 
 def test_a_frame_whose_acks_are_lost_is_delivered_and_not_lost() -> None:

@@ -53,7 +53,7 @@ def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool
     antennas = {robot.name: antenna_of(robot.profile.radio) for robot in CAST.values()}
     model: WifiInWorld[int] = WifiInWorld(1, RadioOptions(fading=fading), antennas, world)
     model.place(0, placement.positions_m(CAST, robot_placement, world), placement.relay(CAST, robot_placement))
-    missing_after_one, missing_after_all, delays_ns = [], [], []
+    missing_counts_after_one, missing_counts_after_all, delays_ns = [], [], []
     for number in range(DATAGRAMS):
         start_ns = number * INTERVAL_NS * MAX_TRANSMISSIONS
         missing_fragments = set(FRAGMENTS)
@@ -61,15 +61,15 @@ def trial(scenario: Scenario, topology: Topology, distance: str, *, fading: bool
             arrived_ns = send(model, start_ns + attempt * RETRANSMIT_NS, missing_fragments)
             missing_fragments -= arrived_ns.keys()
             if not attempt:
-                missing_after_one.append(len(missing_fragments))
+                missing_counts_after_one.append(len(missing_fragments))
                 if not missing_fragments:
                     delays_ns.append(max(arrived_ns.values()) - start_ns)
-        missing_after_all.append(len(missing_fragments))
+        missing_counts_after_all.append(len(missing_fragments))
     packets = DATAGRAMS * len(FRAGMENTS)
     return Outcome(
-        packets=sum(missing_after_one) / packets,
-        datagrams=sum(map(bool, missing_after_one)) / DATAGRAMS,
-        repaired=sum(missing_after_all) / packets,
+        packets=sum(missing_counts_after_one) / packets,
+        datagrams=sum(map(bool, missing_counts_after_one)) / DATAGRAMS,
+        repaired=sum(missing_counts_after_all) / packets,
         delay_s=float(np.median(delays_ns)) / 1e9,
     )
 

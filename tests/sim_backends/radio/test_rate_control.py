@@ -86,11 +86,11 @@ def test_modes_with_occasional_success_are_sampled_without_limit() -> None:
         20_000,
         lambda mode: mode.bits_per_symbol <= 144 or (mode.name == "g48" and next(attempts_of_g48) % 3 == 0),
     )[5_000:]
-    per_update = [
+    samples_per_update = [
         Counter(attempts[0] for attempts in frames[start : start + PER_UPDATE])["g48"]
         for start in range(0, len(frames), PER_UPDATE)
     ]
-    assert max(per_update) > 4
+    assert max(samples_per_update) > 4
 
 
 def test_a_mode_that_works_again_is_used_again() -> None:

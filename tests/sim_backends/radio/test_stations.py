@@ -29,7 +29,7 @@ class TrafficRun:
         for name in "ab":
             for _ in range(20):
                 self.wifi.send(0, name, name, 1000, "r")
-        due_ns = [*samples_ns]
+        due_times_ns = [*samples_ns]
         while (now_ns := self.wifi.next_event_ns()) is not None and now_ns < END_NS:
             for at_ns, receiver, source, _, _ in self.wifi.deliveries(now_ns):
                 self.delivered[source, receiver] += 1
@@ -37,8 +37,8 @@ class TrafficRun:
                     self.wifi.send(at_ns, source, source, 1000, "r")
                     if self.delivered[source, receiver] % 4 == 0:
                         self.wifi.send(at_ns, "r", "r", 200, source)
-            while due_ns and due_ns[0] <= now_ns:
-                due_ns.pop(0)
+            while due_times_ns and due_times_ns[0] <= now_ns:
+                due_times_ns.pop(0)
                 self.wifi.sample(now_ns, now_ns)
 
     def station_sample(self, name: str, peer: str) -> StationSample:

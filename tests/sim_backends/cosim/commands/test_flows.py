@@ -15,18 +15,18 @@ from sim_backends.world.motion import State
 MS = 1_000_000
 
 
-def fate(number: int, delay_ms: float | None, *, decided: bool = True, held_ms: float = 2.0) -> Fate:
+def fate(number: int, delay_ms: float | None, *, is_decided: bool = True, policy_delay_ms: float = 2.0) -> Fate:
     """Return the fate of one packet of a flow with a packet every 10 ms.
 
-    The sender starts 4 m away and drives east at 3 m/s. The policy delays the packet by `held_ms` before it enters
-    the network, and by 5 ms after its arrival.
+    The sender starts 4 m away and drives east at 3 m/s. The policy delays the packet by `policy_delay_ms` before it
+    enters the network, and by 5 ms after its arrival.
     """
     sent_ns = number * 10 * MS
-    enters_ns = sent_ns + round(held_ms * MS)
+    enters_ns = sent_ns + round(policy_delay_ms * MS)
     packet = Packet(number, "a", "b", 100, ("flow", number), sent_ns, enters_ns, "udp")
     end_states = State((4.0 + 0.03 * number, 0.0, 0.0), (3.0, 0.0, 0.0)), State((0.0, 0.0, 0.0), (0.0, 4.0, 0.0))
     if delay_ms is None:
-        return Fate(packet, end_states, end_states, reason="lost" if decided else "")
+        return Fate(packet, end_states, end_states, reason="lost" if is_decided else "")
     arrived_ns = enters_ns + round(delay_ms * MS)
     return Fate(packet, end_states, end_states, arrived_ns, arrived_ns + 5 * MS)
 
@@ -37,7 +37,7 @@ def run_with(*fates: Fate) -> Run:
 
 def test_the_result_of_a_flow_follows_from_its_packets() -> None:
     (flow,) = flow_results(
-        run_with(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, decided=False))
+        run_with(fate(0, 1.0), fate(1, 3.0), fate(2, None), fate(3, 2.0), fate(4, None, is_decided=False))
     )
     assert (flow.sent_packets, flow.arrived_packets, flow.packets_under_way, flow.sent_bytes, flow.arrived_bytes) == (
         4,
@@ -85,7 +85,7 @@ def test_a_round_trip_excludes_the_delays_of_the_policy_and_counts_only_decided_
         return replace(request, packet=packet._replace(source="b", destination="a", identity=identity))
 
     requests = [fate(0, 1.0), fate(1, 2.0), fate(2, None), fate(3, 1.0), fate(4, 1.0)]
-    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, decided=False)]
+    replies = [fate(0, 3.0), fate(1, 5.0), fate(3, None), fate(4, None, is_decided=False)]
     flow, reply_flow = flow_results(run_with(*requests, *map(as_reply, replies)))
     trips = flow.round_trips
     assert trips is not None

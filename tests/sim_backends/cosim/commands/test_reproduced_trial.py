@@ -18,8 +18,8 @@ from tests.helpers.runs import Run, rows, run_here
 def run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Run]:
     """Return the folder of a run of the shipped scenario, and its output."""
     folder = tmp_path_factory.mktemp("field")
-    on_ns3 = ("--network", "ns3", "--policy", "sliding_window", "--window", "5ms")
-    options = on_ns3 if request.param == "ns3" else ()
+    ns3_options = ("--network", "ns3", "--policy", "sliding_window", "--window", "5ms")
+    options = ns3_options if request.param == "ns3" else ()
     result = run_here(folder, "cosim", "run", "field_30ft", *options, "--out", "simulated")
     assert result.code == 0, result.err
     return folder / "simulated", result

@@ -79,9 +79,9 @@ def test_no_position_error_exceeds_the_bound(
     pauses_ns: list[int],
 ) -> None:
     """The oracle is each motion itself, extrapolated between the steps of the physics."""
-    by_name = {name: WayPoints(name, *motion) for name, motion in zip(NAMES, motions, strict=True)}
+    motions_by_name = {name: WayPoints(name, *motion) for name, motion in zip(NAMES, motions, strict=True)}
     network = StateRecorder(extrapolates, sorted(transmitters), [MAST_M] if has_mast else [])
-    agents = Agents(Paths([*by_name.values()]), {"a": Periodic("a", "b", period_ns=period_ns)})
+    agents = Agents(Paths([*motions_by_name.values()]), {"a": Periodic("a", "b", period_ns=period_ns)})
     coordinator = Coordinator(agents, network, ErrorBounded(bound_m, 0.2), [("a", "b")])
     try:
         for to_ns in sorted({*pauses_ns, END_NS}):
@@ -95,13 +95,15 @@ def test_no_position_error_exceeds_the_bound(
     assert network.assumptions or not extrapolates
     for at_ns, assumed_states in network.assumptions:
         step_ns = at_ns // STEP_NS * STEP_NS
-        true_m = {name: _extrapolated_m(by_name[name].at(step_ns)[name], at_ns - step_ns) for name in names}
+        true_m = {name: _extrapolated_m(motions_by_name[name].at(step_ns)[name], at_ns - step_ns) for name in names}
         errors_m = [
             tuple(assumed - true for assumed, true in zip(assumed_states[name].position_m, true_m[name], strict=True))
             for name in names
         ]
-        worst_m = max(math.dist(first, second) for first, second in combinations([*errors_m, (0.0, 0.0, 0.0)], 2))
-        assert worst_m <= bound_m * (1 + 1e-6) + 1e-9, f"at {at_ns} ns"
+        largest_error_m = max(
+            math.dist(first, second) for first, second in combinations([*errors_m, (0.0, 0.0, 0.0)], 2)
+        )
+        assert largest_error_m <= bound_m * (1 + 1e-6) + 1e-9, f"at {at_ns} ns"
     for fate in coordinator.run.fates.values():
         assert position_error_m(fate) <= bound_m * (1 + 1e-6) + 1e-9
 
@@ -152,11 +154,11 @@ def test_agents_that_forward_or_interfere_count_in_the_bound_and_in_the_errors(r
 def test_a_jammer_at_a_fixed_position_counts_if_two_robots_move_side_by_side() -> None:
     """Their distance does not change, but their distances from the jammer do."""
     motions = [WayPoints(name, [(0.0, y, 0.0), (9.0, y, 0.0)], 2.0) for name, y in (("a", 0.0), ("b", 1.0))]
-    for fixed_m, worst_m in ((), 0.0), ([MAST_M], 0.2):
-        network = StateRecorder(False, (), fixed_m)
+    for emitters_m, expected_m in ((), 0.0), ([MAST_M], 0.2):
+        network = StateRecorder(False, (), emitters_m)
         agents = Agents(Paths(motions), {"a": Periodic("a", "b", period_ns=3 * STEP_NS)})
         run = Coordinator(agents, network, Scheduled(0.1), [("a", "b")]).advance(2000 * STEP_NS)
-        assert max(map(position_error_m, run.fates.values())) == pytest.approx(worst_m, abs=0.005)
+        assert max(map(position_error_m, run.fates.values())) == pytest.approx(expected_m, abs=0.005)
 
 
 def test_a_bound_that_one_step_of_the_physics_exceeds_is_refused_with_a_remedy() -> None:

@@ -183,18 +183,18 @@ def window_ns(
 def test_the_path_loss_error_of_a_pair_does_not_exceed_the_bound(
     separation_m: float, speed_m_s: float, bound_db: float, course_rad: float, assumed_m_s: float
 ) -> None:
-    e_m_s, n_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
+    east_m_s, north_m_s = speed_m_s * math.cos(course_rad), speed_m_s * math.sin(course_rad)
     try:
-        end_ns = window_ns(separation_m, (e_m_s, n_m_s, 0.0), bound_db, (assumed_m_s, 0.0, 0.0))
+        end_ns = window_ns(separation_m, (east_m_s, north_m_s, 0.0), bound_db, (assumed_m_s, 0.0, 0.0))
     except PolicyError:
         bound_m = max(separation_m, 1.0) * (1 - 10 ** (-bound_db / (10 * EXPONENT)))
-        assert math.hypot(e_m_s - assumed_m_s, n_m_s) * 0.001 > bound_m, "one step exceeds the bound"
+        assert math.hypot(east_m_s - assumed_m_s, north_m_s) * 0.001 > bound_m, "one step exceeds the bound"
         return
     if end_ns == STEP_NS:
         return  # states are constant within a window of one step
-    true_m = math.hypot(separation_m + e_m_s * end_ns / 1e9, n_m_s * end_ns / 1e9)
-    assumed_m = abs(separation_m + assumed_m_s * end_ns / 1e9)
-    assert abs(path_loss_db(true_m) - path_loss_db(assumed_m)) <= bound_db * (1 + 1e-9)
+    true_distance_m = math.hypot(separation_m + east_m_s * end_ns / 1e9, north_m_s * end_ns / 1e9)
+    assumed_distance_m = abs(separation_m + assumed_m_s * end_ns / 1e9)
+    assert abs(path_loss_db(true_distance_m) - path_loss_db(assumed_distance_m)) <= bound_db * (1 + 1e-9)
 
 
 def test_a_window_during_a_direct_approach_ends_when_the_error_equals_the_bound() -> None:

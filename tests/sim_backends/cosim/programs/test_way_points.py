@@ -28,10 +28,10 @@ def test_a_robot_drives_through_all_points_and_stops_at_the_last() -> None:
         state = states["a"]
         assert math.hypot(*state.velocity_m_s) <= 0.8 + 1e-9
         least_distances_m = {
-            point: min(least_m, math.dist(point, state.position_m[:2]))
-            for point, least_m in least_distances_m.items()
+            point: min(earlier_m, math.dist(point, state.position_m[:2]))
+            for point, earlier_m in least_distances_m.items()
         }
-    assert all(near_m <= 0.1 for near_m in least_distances_m.values())
+    assert all(least_m <= 0.1 for least_m in least_distances_m.values())
     assert state.velocity_m_s == (0.0, 0.0, 0.0)
     assert math.dist(state.position_m[:2], points[-1]) <= 0.1
     assert agents.next_wake_ns() is None

@@ -149,10 +149,10 @@ def reassemble(packets: Sequence[Packet]) -> list[Packet]:
         if packet.frag or "MF" in packet.flags:
             parts.setdefault((packet.src, packet.id), {})[packet.frag * 8] = packet
     whole_packets: list[Packet] = []
-    for by_offset in parts.values():
-        last_fragment = by_offset[max(by_offset)]
-        data = b"".join(bytes(by_offset[offset].payload) for offset in sorted(by_offset))
-        if "MF" not in last_fragment.flags and len(data) == max(by_offset) + len(last_fragment.payload):
+    for fragments_by_offset in parts.values():
+        last_fragment = fragments_by_offset[max(fragments_by_offset)]
+        data = b"".join(bytes(fragments_by_offset[offset].payload) for offset in sorted(fragments_by_offset))
+        if "MF" not in last_fragment.flags and len(data) == max(fragments_by_offset) + len(last_fragment.payload):
             whole_packets.append(
                 IP(bytes(IP(src=last_fragment.src, dst=last_fragment.dst, proto=last_fragment.proto) / data))
             )

@@ -52,11 +52,11 @@ def run_of(tmp_path: Path) -> RunOf:
     return run
 
 
-def sent_ms(run: Run, flow: str) -> list[float]:
+def send_times_ms(run: Run, flow: str) -> list[float]:
     return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow]
 
 
-def lost_ms(run: Run, flow: str) -> list[float]:
+def send_times_of_lost_ms(run: Run, flow: str) -> list[float]:
     """Return the times of sending, in ms, of the packets of a flow that never arrived."""
     return [fate.packet.sent_ns / MS for (name, _), fate in run.fates.items() if name == flow and fate.reason]
 
@@ -67,18 +67,18 @@ def are_within(times_ms: list[float], begin_ms: float, end_ms: float) -> bool:
 
 def test_an_agent_that_is_off_sends_and_receives_nothing_and_recovers(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}")
-    assert not [at_ms for at_ms in sent_ms(run, "cb/b") if 1000 <= at_ms < 2000]
-    assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
-    assert not lost_ms(run, "ab/b")
-    lost_times_ms = lost_ms(run, "ping/c")
+    assert not [at_ms for at_ms in send_times_ms(run, "cb/b") if 1000 <= at_ms < 2000]
+    assert len(send_times_ms(run, "cb/b")) == pytest.approx(200, abs=1)
+    assert not send_times_of_lost_ms(run, "ab/b")
+    lost_times_ms = send_times_of_lost_ms(run, "ping/c")
     assert len(lost_times_ms) == 10
     assert are_within(lost_times_ms, 1000, 2000)
-    by_flow = {recovery.flow: recovery for recovery in recoveries(scenario, run)}
-    assert by_flow.keys() == ALL_FLOWS - {"ab/b"}
-    lost_packets = {flow: recovery.lost_packets for flow, recovery in by_flow.items()}
+    recoveries_by_flow = {recovery.flow: recovery for recovery in recoveries(scenario, run)}
+    assert recoveries_by_flow.keys() == ALL_FLOWS - {"ab/b"}
+    lost_packets = {flow: recovery.lost_packets for flow, recovery in recoveries_by_flow.items()}
     assert lost_packets == {"cb/b": 0, "ping/c": 10, "ping/c/reply": 0}
     for flow, period_s in (("cb/b", 0.01), ("ping/c", 0.1), ("ping/c/reply", 0.1)):
-        recovered_s = by_flow[flow].recovered_s
+        recovered_s = recoveries_by_flow[flow].recovered_s
         assert recovered_s is not None
         assert 0 < recovered_s < period_s + 0.01
 
@@ -119,8 +119,8 @@ def test_a_subscriber_that_was_off_for_less_than_a_lease_receives_the_history_of
 
 def test_a_topic_whose_publisher_was_off_loses_no_published_sample(run_of: RunOf) -> None:
     _, run = run_of("{kind: node-loss, agent: c, from: 1s, to: 2s}", TOPIC)
-    assert len(sent_ms(run, "cb/b")) == pytest.approx(200, abs=1)
-    assert are_within(lost_ms(run, "cb/b"), 0, DISCOVERED_MS)
+    assert len(send_times_ms(run, "cb/b")) == pytest.approx(200, abs=1)
+    assert are_within(send_times_of_lost_ms(run, "cb/b"), 0, DISCOVERED_MS)
 
 
 @pytest.mark.parametrize("reliability", ["reliable", "best_effort"])
@@ -135,7 +135,7 @@ def test_a_topic_removes_a_subscriber_whose_lease_has_expired_and_discovers_it_a
     # Announcements are sent every 8 s; one that was due during the fault is sent when the agent is on again.
     assert recovery.recovered_s is not None
     assert 0 < recovery.recovered_s < 8.2
-    lost_times_ms = [at_ms for at_ms in lost_ms(run, "cb/b") if at_ms > DISCOVERED_MS]
+    lost_times_ms = [at_ms for at_ms in send_times_of_lost_ms(run, "cb/b") if at_ms > DISCOVERED_MS]
     assert are_within(lost_times_ms, 5000, 20_000 + 1000 * recovery.recovered_s)
     reasons = {fate.reason for (flow, _), fate in run.fates.items() if flow == "cb/b"}
     assert ("the lease of the subscriber expired" in reasons) == (reliability == "reliable")
@@ -144,10 +144,10 @@ def test_a_topic_removes_a_subscriber_whose_lease_has_expired_and_discovers_it_a
 
 def test_a_cut_link_affects_both_ends_and_no_other_agent(run_of: RunOf) -> None:
     scenario, run = run_of("{kind: link-cut, between: [c, a], from: 500ms, to: 1500ms}")
-    assert not lost_ms(run, "ab/b")
-    assert not lost_ms(run, "cb/b")
-    assert len(lost_ms(run, "ping/c")) == 10
-    assert are_within(lost_ms(run, "ping/c"), 500, 1500)
+    assert not send_times_of_lost_ms(run, "ab/b")
+    assert not send_times_of_lost_ms(run, "cb/b")
+    assert len(send_times_of_lost_ms(run, "ping/c")) == 10
+    assert are_within(send_times_of_lost_ms(run, "ping/c"), 500, 1500)
     assert {recovery.flow for recovery in recoveries(scenario, run)} == {"ping/c", "ping/c/reply"}
     trips_s = round_trips_s(run, "ping/c")
     assert (trips_s.shape, np.isnan(trips_s).sum()) == ((28,), 10)
@@ -157,10 +157,10 @@ def test_a_cut_link_affects_both_ends_and_no_other_agent(run_of: RunOf) -> None:
 def test_a_fault_of_the_relay_affects_all_flows_that_pass_it(run_of: RunOf) -> None:
     master = {"topology": "master", "relay": "b"}
     scenario, run = run_of("{kind: link-cut, between: [a, b], from: 500ms, to: 1500ms}", master)
-    assert len(lost_ms(run, "ping/c")) == 10
+    assert len(send_times_of_lost_ms(run, "ping/c")) == 10
     assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL_FLOWS - {"cb/b"}
     scenario, run = run_of("{kind: node-loss, agent: b, from: 500ms, to: 1500ms}", master)
-    assert len(lost_ms(run, "ping/c")) == 10
+    assert len(send_times_of_lost_ms(run, "ping/c")) == 10
     assert {recovery.flow for recovery in recoveries(scenario, run)} == ALL_FLOWS
 
 
@@ -181,12 +181,14 @@ def test_a_fast_clock_sends_more(run_of: RunOf) -> None:
     _, reference = run_of("{kind: node-loss, agent: c, from: 2.9s}")
     _, run_with_fast_clock = run_of("{kind: clock-skew, agent: a, rate_ppm: 100000, from: 1s, to: 2s}")
     # For one second the sender runs at 110 Hz.
-    assert len(sent_ms(run_with_fast_clock, "ab/b")) - len(sent_ms(reference, "ab/b")) == pytest.approx(0, abs=1)
-    times_during_fault_ms = [at_ms for at_ms in sent_ms(run_with_fast_clock, "ab/b") if 1000 <= at_ms < 2000]
+    assert len(send_times_ms(run_with_fast_clock, "ab/b")) - len(send_times_ms(reference, "ab/b")) == pytest.approx(
+        0, abs=1
+    )
+    times_during_fault_ms = [at_ms for at_ms in send_times_ms(run_with_fast_clock, "ab/b") if 1000 <= at_ms < 2000]
     assert len(times_during_fault_ms) == pytest.approx(110, abs=1)
     # After it was set back by 100 ms, the program waits until the clock reaches the same reading again.
-    assert not [at_ms for at_ms in sent_ms(run_with_fast_clock, "ab/b") if 2000 <= at_ms < 2099]
-    assert len([at_ms for at_ms in sent_ms(run_with_fast_clock, "cb/b") if 1000 <= at_ms < 2000]) == 100
+    assert not [at_ms for at_ms in send_times_ms(run_with_fast_clock, "ab/b") if 2000 <= at_ms < 2099]
+    assert len([at_ms for at_ms in send_times_ms(run_with_fast_clock, "cb/b") if 1000 <= at_ms < 2000]) == 100
 
 
 @pytest.mark.parametrize("federate", ["physics", "network"])

@@ -39,11 +39,11 @@ def test_the_limit_of_string_stability_is_where_the_gain_exceeds_one() -> None:
 def test_a_row_amplifies_as_its_transfer_function_predicts(delay_s: float, is_stable: bool) -> None:
     """The limit is 83 ms; one delay is below it and one above it."""
     assert (delay_s < formation.longest_delay_s(HEADWAY_S, GAIN_PER_S)) == is_stable
-    settled_s = 3 * PERIOD_S
+    settling_time_s = 3 * PERIOD_S
     times_s, places = positions_m(
-        EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settled_s + PERIOD_S
+        EventDriven(), delay_s=delay_s, headway_s=HEADWAY_S, followers=2, seconds=settling_time_s + PERIOD_S
     )
-    speeds = formation.speeds_m_s(times_s, places)[times_s >= settled_s]
+    speeds = formation.speeds_m_s(times_s, places)[times_s >= settling_time_s]
     ratios = formation.amplifications(speeds)
     # A state is sent every 10 ms, and a command is held for 10 ms: half of each adds to the delay.
     expected = formation.gain(

@@ -73,11 +73,11 @@ LAWS: dict[str, tuple[Callable[[float], SyncPolicy], dict[str, Law]]] = {
 
 
 def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
-    by_policy = local_errors(
+    errors_by_policy = local_errors(
         moving_pair, {name: kind for name, (kind, _) in LAWS.items()}, WINDOWS_S, STARTS_IN_RANGE_NS, tail_ns=20 * MS
     )
     for name, (_, laws) in LAWS.items():
-        errors = by_policy[name]
+        errors = errors_by_policy[name]
         lengths_s = errors.window_s.mean(axis=1)
         for measure in MEASURES:
             if measure not in laws:
@@ -89,7 +89,7 @@ def test_each_method_has_the_errors_and_the_order_computed_by_hand() -> None:
             order = errors.order(measure)
             assert order.value == pytest.approx(1.0, abs=0.05), f"{name} {measure}"
             assert order.low < order.value < order.high < order.low + 0.1, "a narrow interval"
-    assert by_policy["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
+    assert errors_by_policy["velocity_aware_raw"].window_s[0] == pytest.approx(0.02 + SPEED_M_S / 1000)
 
 
 def test_the_share_of_packets_with_another_fate_at_the_range_limit_is_proportional_to_the_window() -> None:

@@ -60,33 +60,33 @@ def test_only_rows_and_seeds_count_in_which_packets_arrived_in_both_systems() ->
 
 
 def test_claims_equal_those_computed_by_hand() -> None:
-    by_key = claims_of(
+    claims_by_key = claims_of(
         {"adaptive": [0.88, 0.88], "fixed window": [1.0, 1.0], "master-based": [0.44, 0.44]},
         {"adaptive": [100, 80], "fixed window": [90, 70], "master-based": [50, 70]},
     )
-    assert len(by_key) == 12
-    fixed, loss = by_key["fixed window", "all", "delay"], by_key["fixed window", "all", "loss"]
+    assert len(claims_by_key) == 12
+    fixed, loss = claims_by_key["fixed window", "all", "delay"], claims_by_key["fixed window", "all", "loss"]
     assert fixed.ours.value == pytest.approx(-0.12)
     assert fixed.agreement is Agreement.AGREES
     assert loss.ours.value == pytest.approx(-0.10)
     assert loss.agreement is Agreement.AGREES
     assert (fixed.rows, loss.rows) == (10, 10)
     assert math.isnan(fixed.tabled_change), "no table of the paper has this change"
-    master = by_key["master-based", "nlos", "delay"]
+    master = claims_by_key["master-based", "nlos", "delay"]
     assert master.ours.value == pytest.approx(1.0)
     assert master.agreement is Agreement.ABOVE
     # The arrivals differ by 50 and by 10 points with the two seeds.
-    assert by_key["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
-    assert by_key["fixed window", "los", "delay"].agreement is None, "the paper states no change"
+    assert claims_by_key["master-based", "nlos", "loss"].ours.value == pytest.approx(-0.3)
+    assert claims_by_key["fixed window", "los", "delay"].agreement is None, "the paper states no change"
 
 
 def test_the_papers_own_tables_contradict_its_statements() -> None:
     systems = "adaptive", "fixed window", "master-based"
-    by_key = claims_of({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
-    los, nlos = (by_key["master-based", line, "loss"] for line in Sight)
+    claims_by_key = claims_of({system: [1.0, 1.0] for system in systems}, {system: [1, 1] for system in systems})
+    los, nlos = (claims_by_key["master-based", line, "loss"] for line in Sight)
     assert los.tabled_change == pytest.approx((20 - 40) / 5 / 100), "losses of 0 0 0 10 10 instead of 0 0 10 10 20"
     assert nlos.tabled_change == pytest.approx((70 - 140) / 5 / 100)
-    delay = by_key["master-based", "los", "delay"]
+    delay = claims_by_key["master-based", "los", "delay"]
     expected = (0.01 * 0.1 * 0.4 * 0.4 * 0.6) / (0.01 * 0.1 * 0.48 * 0.6 * 0.8)
     assert delay.tabled_change == pytest.approx(expected ** (1 / 5) - 1)
 

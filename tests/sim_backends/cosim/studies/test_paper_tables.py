@@ -130,8 +130,8 @@ def test_samples_count_the_packets_of_a_run() -> None:
 
 def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
     setups = {"far": master_based(Sight.NLOS, 100, "ros1", SHORT)}
-    (by_flow,) = flow_samples(setups, [1], workers=Workers(1))["far"]
-    (sample,) = by_flow.values()
+    (samples_by_flow,) = flow_samples(setups, [1], workers=Workers(1))["far"]
+    (sample,) = samples_by_flow.values()
     assert sample.arrived_packets == 0
     assert sample.loss == 1
     assert math.isnan(sample.delay_sum_s)
@@ -141,8 +141,8 @@ def test_out_of_range_no_packet_arrives_and_there_is_no_delay() -> None:
 
 def test_the_delays_of_pings_are_round_trips() -> None:
     setups = {"mesh": mesh({"radio": {"rate": "1Mbit/s"}}, {"duration": "2s"})}
-    (by_flow,) = flow_samples(setups, [1], workers=Workers(1))["mesh"]
-    sample = by_flow["before/node-10"]
+    (samples_by_flow,) = flow_samples(setups, [1], workers=Workers(1))["mesh"]
+    sample = samples_by_flow["before/node-10"]
     assert sample.arrived_packets == sample.sent_packets == 15, "ten per second from 0.5 s on"
     # Payload, headers of UDP and IP at 1 Mbit/s, and 0.2 ms in addition, in both directions.
     assert sample.delay_mean_s == pytest.approx(2 * (8 * (56 + 8 + 20) / 1e6 + 0.0002))

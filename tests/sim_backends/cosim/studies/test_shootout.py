@@ -35,8 +35,8 @@ def test_the_reference_is_first_and_a_policy_that_cannot_run_has_a_reason(all_ou
         "variable_stepped",
         "time_stepped",
     ]
-    by_name = {row.policy: row for row in table}
-    raw = by_name["velocity_aware_raw"]
+    rows_by_policy = {row.policy: row for row in table}
+    raw = rows_by_policy["velocity_aware_raw"]
     assert raw.errors is None
     assert "b publishes at 0 m/s to a at 1.7 m/s" in raw.failure
     assert "time runs backwards" in raw.failure
@@ -45,9 +45,9 @@ def test_the_reference_is_first_and_a_policy_that_cannot_run_has_a_reason(all_ou
             assert not row.failure
             assert len(row.by_seed) == len(SEEDS)
     for exact in ("event_driven", "variable_stepped"):
-        assert all(run_errors.delivery_error_s == Spread(0, 0, 0) for run_errors in by_name[exact].by_seed)
-        assert all(run_errors.path_error_m == Spread(0, 0, 0) for run_errors in by_name[exact].by_seed)
-    scheduled = by_name["scheduled"].errors
+        assert all(run_errors.delivery_error_s == Spread(0, 0, 0) for run_errors in rows_by_policy[exact].by_seed)
+        assert all(run_errors.path_error_m == Spread(0, 0, 0) for run_errors in rows_by_policy[exact].by_seed)
+    scheduled = rows_by_policy["scheduled"].errors
     assert scheduled is not None
     assert scheduled.delivery_error_s.mean == pytest.approx(WINDOW_S / 2, rel=0.02)
     assert scheduled.position_error_m.largest == pytest.approx(SPEED_M_S * WINDOW_S, rel=0.002)
@@ -94,20 +94,20 @@ def test_the_first_disagreement_has_its_time_and_is_nan_without_one() -> None:
 
 
 def test_a_bias_is_relative_to_the_reference_and_has_the_needed_seeds(all_outcomes: Outcomes) -> None:
-    by_policy = biases(all_outcomes)
-    assert set(by_policy) == {"event_driven", "scheduled", "variable_stepped", "time_stepped"}
+    biases_by_policy = biases(all_outcomes)
+    assert set(biases_by_policy) == {"event_driven", "scheduled", "variable_stepped", "time_stepped"}
     for measure in ("loss", "delay_s", "apart_m"):
-        exact = by_policy["variable_stepped"][measure]
+        exact = biases_by_policy["variable_stepped"][measure]
         assert (exact.bias.value, exact.deviation, exact.seeds_needed) == (0, 0, None)
-    delay_s = by_policy["event_driven"]["delay_s"]
-    assert delay_s.mean.value == pytest.approx(DELAY_NS / 1e9)
-    added_s = by_policy["scheduled"]["delay_s"].bias
-    assert added_s.is_certain
-    assert added_s.low < WINDOW_S / 2 < added_s.high
-    stepped_s = by_policy["time_stepped"]["delay_s"].bias
-    assert stepped_s.value == pytest.approx(1.5 * WINDOW_S - DELAY_NS / 1e9, rel=0.01)
-    assert by_policy["time_stepped"]["delay_s"].seeds_needed == 2
+    reference_delay = biases_by_policy["event_driven"]["delay_s"]
+    assert reference_delay.mean.value == pytest.approx(DELAY_NS / 1e9)
+    scheduled_bias = biases_by_policy["scheduled"]["delay_s"].bias
+    assert scheduled_bias.is_certain
+    assert scheduled_bias.low < WINDOW_S / 2 < scheduled_bias.high
+    stepped_bias = biases_by_policy["time_stepped"]["delay_s"].bias
+    assert stepped_bias.value == pytest.approx(1.5 * WINDOW_S - DELAY_NS / 1e9, rel=0.01)
+    assert biases_by_policy["time_stepped"]["delay_s"].seeds_needed == 2
     # The distance is 10 m at first and decreases at 1.7 m/s.
     times_s = np.arange(0, PAIR_END_NS / 1e9 + 0.05, 0.1)
     distances_m = np.abs(10 - 1.7 * times_s)
-    assert by_policy["event_driven"]["apart_m"].values == pytest.approx([distances_m.mean()] * len(SEEDS))
+    assert biases_by_policy["event_driven"]["apart_m"].values == pytest.approx([distances_m.mean()] * len(SEEDS))

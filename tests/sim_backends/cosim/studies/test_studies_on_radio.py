@@ -59,12 +59,12 @@ def test_the_papers_rule_reports_the_pair_for_which_time_runs_backwards() -> Non
 
 
 def test_local_errors_can_be_measured_from_any_state_of_the_radio() -> None:
-    by_policy = local_errors(
+    errors_by_policy = local_errors(
         three_robots,
         {"scheduled": Scheduled, "exact": lambda _: VariableStepped()},
         (0.02, 0.04),
         [50 * MS, 100 * MS],
         tail_ns=60 * MS,
     )
-    assert not any(by_policy["exact"].sums[measure].any() for measure in by_policy["exact"].sums)
-    assert by_policy["scheduled"].mean("delivery_s") == pytest.approx([0.01, 0.02], rel=0.4)
+    assert not any(errors_by_policy["exact"].sums[measure].any() for measure in errors_by_policy["exact"].sums)
+    assert errors_by_policy["scheduled"].mean("delivery_s") == pytest.approx([0.01, 0.02], rel=0.4)

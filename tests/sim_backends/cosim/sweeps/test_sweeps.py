@@ -221,9 +221,9 @@ def test_two_settings_of_a_sweep_are_compared(lab: Path) -> None:
         if row["quantity"] == "added_delay_mean_s" and row["window_s"] == "0.013"
     )
     assert difference == pytest.approx(cells["scheduled"] - cells["sliding_window"], rel=1e-6)
-    one_window = run_here(lab, "compare", "sweep", *between, "--where", "window_s == 0.013", "--format", "csv")
-    assert one_window.code == 0, one_window.err
-    assert {row["window_s"] for row in csv.DictReader(one_window.out.splitlines())} == {"0.013"}
+    filtered_result = run_here(lab, "compare", "sweep", *between, "--where", "window_s == 0.013", "--format", "csv")
+    assert filtered_result.code == 0, filtered_result.err
+    assert {row["window_s"] for row in csv.DictReader(filtered_result.out.splitlines())} == {"0.013"}
 
 
 @pytest.mark.parametrize("between", ["window=7ms,13ms", "window_s=0.007,0.013"])

@@ -149,11 +149,11 @@ class TestFlight:
 
     def test_the_drone_follows_set_points_until_they_stop(self, gcs: GroundStation) -> None:
         take_off(gcs)
-        only_velocity = 0b111111000111
+        velocity_mask = 0b111111000111
         for number in range(30):
             gcs.send_message(
                 d.MAVLink_set_position_target_local_ned_message(
-                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, only_velocity, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
+                    0, SYSTEM, 1, d.MAV_FRAME_LOCAL_NED, velocity_mask, 0, 0, 0, 1.0, 0, 0, 0, 0, 0, 0, 0
                 )
             )
             if number == 0:
@@ -238,7 +238,7 @@ class TestLimits:
         for name, value in ((b"GF_MAX_HOR_DIST", 99.0), (b"GF_MAX_VER_DIST", 99.0), (b"MPC_XY_VEL_MAX", 9.0)):
             gcs.send_message(d.MAVLink_param_set_message(SYSTEM, 1, name, value, d.MAV_PARAM_TYPE_REAL32))
         take_off(gcs)
-        for by_velocity, velocity, place in commands:
+        for uses_velocity, velocity, place in commands:
             east_m, north_m, up_m = place
             x, y = degrees_e7(HOME_M[0] + east_m, HOME_M[1] + north_m)
             gcs.send_message(
@@ -246,7 +246,7 @@ class TestLimits:
                     SYSTEM, 1, RELATIVE, d.MAV_CMD_DO_REPOSITION, 0, 0, -1, 1, 0, 0, x, y, up_m
                 )
             )
-            mask = 0b111111000111 if by_velocity else 0b110111111000
+            mask = 0b111111000111 if uses_velocity else 0b110111111000
             for number in range(40):
                 gcs.send_message(
                     d.MAVLink_set_position_target_local_ned_message(

@@ -173,9 +173,9 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
         os.kill(pid, signal.SIGSTOP)
         last_motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
         assert last_motion.is_moving
-        at_rest = last_motion.at(time.monotonic_ns() + SILENT_NS)
-        assert not at_rest.is_moving
-        assert distance_m(at_rest, last_motion.place_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
+        motion_at_rest = last_motion.at(time.monotonic_ns() + SILENT_NS)
+        assert not motion_at_rest.is_moving
+        assert distance_m(motion_at_rest, last_motion.place_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
         os.kill(pid, signal.SIGCONT)
         wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.is_moving, Deadline.after(60))
         wait_until(lambda: bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))

@@ -56,13 +56,13 @@ def test_the_robot_drives_while_velocities_arrive_and_then_stops() -> None:
     assert controller.pose.speed_m_s == pytest.approx(0.4), "before the timeout"
     controller.advance(last_ns + TIMEOUT_NS + S // 2)
     assert controller.is_idle
-    stopped_m = controller.pose.place_m
+    stop_place_m = controller.pose.place_m
     controller.advance(100 * S)
-    assert controller.pose.place_m == stopped_m
+    assert controller.pose.place_m == stop_place_m
     # Deceleration takes as long as acceleration.
     distance_m = 0.4 * (1.9 + TIMEOUT_NS / S)
-    assert math.dist(stopped_m, START.place_m) == pytest.approx(distance_m, abs=0.02)
-    course_rad = math.atan2(stopped_m[1] - START.place_m[1], stopped_m[0] - START.place_m[0])
+    assert math.dist(stop_place_m, START.place_m) == pytest.approx(distance_m, abs=0.02)
+    course_rad = math.atan2(stop_place_m[1] - START.place_m[1], stop_place_m[0] - START.place_m[0])
     assert course_rad == pytest.approx(START.heading_rad)
     x_m, y_m, _ = controller.odometry
     assert math.atan2(y_m - START.y_m, x_m - START.x_m) == pytest.approx(START.yaw_rad)

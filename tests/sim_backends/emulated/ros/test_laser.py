@@ -93,12 +93,12 @@ def test_beams_end_at_the_points_where_radio_paths_enter_a_solid(name: str) -> N
         ranges = np.array(ranges_m(targets, (east_m, north_m, 0.2), 0.3, BEAMS, 20.0))
         angles = 0.3 + np.arange(BEAMS) * math.radians(1)
         directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(BEAMS)], axis=1)
-        before_ends = start + directions * (np.minimum(ranges, 20.0) - 1e-3)[:, None]
-        assert solids.depths_m(start, before_ends).max() < 1e-2, "only beams that graze a corner or a trunk"
+        points_before_ends = start + directions * (np.minimum(ranges, 20.0) - 1e-3)[:, None]
+        assert solids.depths_m(start, points_before_ends).max() < 1e-2, "only beams that graze a corner or a trunk"
         is_hit = np.isfinite(ranges)
         hit_count += int(is_hit.sum())
-        behind_ends = start + directions * (np.where(is_hit, ranges, 0.0) + 1e-3)[:, None]
-        depths_m = solids.depths_m(start, behind_ends).sum(axis=1)[is_hit]
+        points_behind_ends = start + directions * (np.where(is_hit, ranges, 0.0) + 1e-3)[:, None]
+        depths_m = solids.depths_m(start, points_behind_ends).sum(axis=1)[is_hit]
         missed_count += int((depths_m <= 1e-6).sum())
     assert hit_count > 100
     assert missed_count < 0.01 * hit_count, "only beams that touch a corner"

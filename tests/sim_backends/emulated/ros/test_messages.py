@@ -139,13 +139,13 @@ def test_covariances_are_symmetric_and_positive_definite() -> None:
 def test_a_transform_is_the_pose_of_its_robot_s_odometry(motion: OwnMotion) -> None:
     """REP 105: odom is the parent, and the robot's base the child; both have the same pose."""
     for name in PROFILES:
-        by_type = {sensor.type: sensor for sensor in sensors_of_profile(name).values()}
-        if "nav_msgs/Odometry" not in by_type:
-            assert "tf2_msgs/TFMessage" not in by_type
+        sensors_by_type = {sensor.type: sensor for sensor in sensors_of_profile(name).values()}
+        if "nav_msgs/Odometry" not in sensors_by_type:
+            assert "tf2_msgs/TFMessage" not in sensors_by_type
             continue
         odom, (transform,) = (
-            publish(by_type["nav_msgs/Odometry"], motion),
-            publish(by_type["tf2_msgs/TFMessage"], motion).transforms,
+            publish(sensors_by_type["nav_msgs/Odometry"], motion),
+            publish(sensors_by_type["tf2_msgs/TFMessage"], motion).transforms,
         )
         assert odom.header.frame_id == transform.header.frame_id == "odom"
         assert odom.child_frame_id == transform.child_frame_id
@@ -194,14 +194,14 @@ def test_ranges_to_walls_follow_position_and_heading() -> None:
     room = LaserTarget(((8.0, 4.0), (12.0, 4.0), (12.0, 7.0), (8.0, 7.0)), 0.0, 0.0, 2.0)
     source = Source(sensor, [room])
     ahead, left = 0, (sensor.points or 0) // 4
-    after_drive = publish(sensor, OwnMotion(x_m=70.0, yaw_rad=1.0, place_m=(10.5, 5.5, 0.2)), source=source)
-    assert after_drive.ranges[ahead] == pytest.approx(1.5, abs=0.1)
-    assert after_drive.ranges[left] == pytest.approx(1.5, abs=0.1)
-    assert after_drive.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
-    after_turn = publish(sensor, OwnMotion(place_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
-    assert after_turn.ranges[ahead] == pytest.approx(2.0, abs=0.1)
-    assert after_turn.ranges[left] == pytest.approx(2.5, abs=0.1)
-    assert (after_drive.intensities > 0).all()
+    scan_after_drive = publish(sensor, OwnMotion(x_m=70.0, yaw_rad=1.0, place_m=(10.5, 5.5, 0.2)), source=source)
+    assert scan_after_drive.ranges[ahead] == pytest.approx(1.5, abs=0.1)
+    assert scan_after_drive.ranges[left] == pytest.approx(1.5, abs=0.1)
+    assert scan_after_drive.ranges[2 * left] == pytest.approx(2.5, abs=0.1)
+    scan_after_turn = publish(sensor, OwnMotion(place_m=(10.5, 5.0, 0.2), heading_rad=math.pi / 2), source=source)
+    assert scan_after_turn.ranges[ahead] == pytest.approx(2.0, abs=0.1)
+    assert scan_after_turn.ranges[left] == pytest.approx(2.5, abs=0.1)
+    assert (scan_after_drive.intensities > 0).all()
 
 
 def test_a_beam_without_echo_has_infinite_range_and_no_intensity() -> None:

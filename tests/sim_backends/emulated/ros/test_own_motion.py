@@ -79,10 +79,10 @@ def test_odometry_starts_at_zero_when_it_is_created(
     points_m: list[tuple[float, float, float]],
     facing_rad: float,
     speed_m_s: float,
-    on_ns: int,
+    start_ns: int,
 ) -> None:
     path = write_paths(tmp_path_factory.getbasetemp(), AssignedPath(0, points_m, speed_m_s, facing_rad))
-    motion = Odometer(path, on_ns).at(on_ns)
+    motion = Odometer(path, start_ns).at(start_ns)
     assert (motion.x_m, motion.y_m, motion.yaw_rad) == pytest.approx((0, 0, 0), abs=1e-6)
 
 

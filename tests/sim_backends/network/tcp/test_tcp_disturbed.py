@@ -68,7 +68,7 @@ def test_a_sender_reaches_its_receiver_again_with_exponential_backoff() -> None:
 
 def test_a_stream_pauses_while_a_jammer_passes_and_then_continues() -> None:
     """An agent with a jammer passes the sender, which detects a busy channel within 10 m and does not send."""
-    blocked_m = 10.0
+    jamming_range_m = 10.0
     power_dbm = ENERGY_DETECTION_DBM + 40.18 + 30.0
     net = RadioNetwork(wifi("ab"), "ab", transports={"tcp": Tcp}, disturbances=[Jammer(power_dbm, 0, agent="j")])
     messages = [Packet(number, "a", "b", 1000, ("f", number), 0, 0, "tcp") for number in range(6000)]
@@ -82,7 +82,7 @@ def test_a_stream_pauses_while_a_jammer_passes_and_then_continues() -> None:
         now_ns = (step + 1) * 100 * MS
         arrivals, drops = net.advance(now_ns, messages if step == 0 else [], states)
         assert not drops
-        if abs(east_m) < blocked_m:
+        if abs(east_m) < jamming_range_m:
             arrivals_while_jammed.append(len(arrivals))
         numbers += [arrival.packet_id for arrival in arrivals]
         arrived_ns += [arrival.at_ns for arrival in arrivals]

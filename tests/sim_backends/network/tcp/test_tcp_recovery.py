@@ -48,11 +48,11 @@ def test_the_timeout_has_bounds(round_trip_ms: int, timeout_ms: int) -> None:
 def test_the_timeout_doubles_until_the_next_sample() -> None:
     round_trips = RoundTrips(TcpOptions())
     round_trips.sample(100 * MS)
-    backed_off_ms = []
+    timeouts_ms = []
     for _ in range(10):
         round_trips.back_off()
-        backed_off_ms.append(round_trips.timeout_ns // MS)
-    assert backed_off_ms == [600, 1200, 2400, 4800, 9600, 19_200, 38_400, 76_800, 120_000, 120_000]
+        timeouts_ms.append(round_trips.timeout_ns // MS)
+    assert timeouts_ms == [600, 1200, 2400, 4800, 9600, 19_200, 38_400, 76_800, 120_000, 120_000]
     round_trips.sample(100 * MS)
     assert round_trips.timeout_ns == (100 + 4 * 37.5) * MS
 

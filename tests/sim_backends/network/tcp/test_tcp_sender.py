@@ -73,23 +73,23 @@ def losing_data(numbers: Collection[int], *, times: int = 1) -> Script:
     return script
 
 
-@pytest.mark.parametrize("per_ack", [1, 2])
+@pytest.mark.parametrize("segments_per_ack", [1, 2])
 @pytest.mark.parametrize("congestion", ["newreno", "cubic"])
-def test_slow_start_doubles_the_window_per_round_trip(per_ack: int, congestion: str) -> None:
-    options = TcpOptions(segments_per_ack=per_ack, congestion=congestion)  # type: ignore[arg-type]
+def test_slow_start_doubles_the_window_per_round_trip(segments_per_ack: int, congestion: str) -> None:
+    options = TcpOptions(segments_per_ack=segments_per_ack, congestion=congestion)  # type: ignore[arg-type]
     transfer = Transfer(2000, options)
-    per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
     # SYN and SYN-ACK take the first round trip; then 10, 20, 40, ... (RFC 6928, and RFC 5681 with all bytes counted).
     doubled_windows = {(1 + number) * ROUND_TRIP_NS: 10 << number for number in range(7)}
-    assert per_round == doubled_windows | {8 * ROUND_TRIP_NS: 2000 - sum(doubled_windows.values())}
+    assert segments_per_round == doubled_windows | {8 * ROUND_TRIP_NS: 2000 - sum(doubled_windows.values())}
 
 
 def test_reno_counts_acks_if_configured() -> None:
     # RFC 5681 increases the window by a segment per ACK: with an ACK for every second segment, by half.
     options = TcpOptions(initial_window_segments=16, bytes_counted_segments=1)
     transfer = Transfer(1000, options, until_ns=5 * ROUND_TRIP_NS)
-    per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
-    assert list(per_round.values())[:4] == [16, 24, 36, 54]
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
+    assert list(segments_per_round.values())[:4] == [16, 24, 36, 54]
 
 
 def test_a_transfer_uses_the_full_rate_of_a_link() -> None:
@@ -172,8 +172,8 @@ def test_after_a_timeout_slow_start_retransmits_only_missing_segments() -> None:
         {n: 1 + (n in lost_numbers) for n in range(70)}
     )
     start_ns = transfer.events("timeout")[0].at_ns
-    per_round = Counter((at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.transmissions(times=1))
-    assert per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
+    segments_per_round = Counter((at_ns - start_ns) // ROUND_TRIP_NS for at_ns, _ in transfer.transmissions(times=1))
+    assert segments_per_round == {0: 1, 1: 2, 2: 4, 3: 8, 4: 16, 5: 7}
 
 
 def test_a_repeatedly_lost_segment_waits_for_another_timeout() -> None:
@@ -261,9 +261,9 @@ def test_nagle_delays_small_segments_while_others_are_in_flight() -> None:
 
 def test_the_receive_window_limits_the_bytes_in_flight() -> None:
     transfer = Transfer(500, TcpOptions(receive_window_bytes=25 * MSS))
-    per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
     # 25, minus one segment that waits for a second one before it is acknowledged.
-    assert list(per_round.values())[:5] == [10, 20, 25, 24, 24]
+    assert list(segments_per_round.values())[:5] == [10, 20, 25, 24, 24]
 
 
 @pytest.mark.parametrize(("restart", "burst"), [(True, 10), (False, 40)])
@@ -274,8 +274,8 @@ def test_the_window_is_reset_after_an_idle_period(*, restart: bool, burst: int) 
     for number in range(70, 270):
         wire.transports["tcp"].send(Packet(number, "a", "b", MSS, ("f", number), 0, 0, "tcp"))
     wire.run()
-    per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
-    assert per_round[5 * SECOND] == burst
+    segments_per_round = Counter(at_ns for at_ns, _ in transfer.transmissions())
+    assert segments_per_round[5 * SECOND] == burst
 
 
 def test_the_window_does_not_grow_if_the_program_does_not_use_it() -> None:

@@ -49,7 +49,7 @@ def run_until_matched(wire: ScriptedWire) -> None:
         assert wire.now_ns < 1000 * SECOND
 
 
-def lose_in(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[ScriptedWire]]:
+def lose_during(*spans_ns: tuple[int, int], sources: str = "ab") -> tuple[Script, list[ScriptedWire]]:
     """Return a script that loses packets of these hosts in these spans of time, and a list for its wire."""
     wires: list[ScriptedWire] = []
 
@@ -116,7 +116,7 @@ def test_without_discovery_only_samples_are_sent() -> None:
 
 
 def test_a_participant_is_removed_after_its_lease_and_discovered_again() -> None:
-    script, wires = lose_in((20 * SECOND, 60 * SECOND))
+    script, wires = lose_during((20 * SECOND, 60 * SECOND))
     wire = two_participants(script)
     wires.append(wire)
     publish(wire, [at_ns * SECOND for at_ns in (10, 25, 50, 75)])
@@ -134,7 +134,7 @@ def test_a_participant_is_removed_after_its_lease_and_discovered_again() -> None
 @pytest.mark.parametrize("sources", ["a", "b"])
 def test_a_participant_removed_on_one_side_only_is_discovered_again(sources: str) -> None:
     """The other side still receives everything and has no new endpoints, so the data must be requested."""
-    script, wires = lose_in((20 * SECOND, 60 * SECOND), sources=sources)
+    script, wires = lose_during((20 * SECOND, 60 * SECOND), sources=sources)
     wire = two_participants(script)
     wires.append(wire)
     publish(wire, [*(number * SECOND for number in range(1, 100))])
@@ -246,8 +246,10 @@ def test_participants_match_again_after_any_outages(spans: Sequence[tuple[int, i
 
     def script(packet: IpPacket, receiver: str, number: int) -> Sequence[int]:
         now_s = wires[0].now_ns / SECOND
-        is_out = any(begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans)
-        return () if is_out else (0,)
+        is_outage = any(
+            begin <= now_s < begin + length and packet.source in sources for begin, length, sources in spans
+        )
+        return () if is_outage else (0,)
 
     wire = two_participants(script)
     wires.append(wire)

@@ -118,7 +118,7 @@ def test_the_gap_of_a_handover_is_the_sum_of_its_frames_and_processing_times(han
     lab.run(S, AT_WEST)
     lab.interval_ns = MS
     lab.run(2 * S + 300 * MS, AT_EAST)
-    (lost_ns, joined_ns) = next(
+    (disconnect_ns, connect_ns) = next(
         (start_ns, end_ns)
         for (start_ns, start), (end_ns, end) in pairwise(lab.cells)
         if start is None and end == "east"
@@ -130,7 +130,7 @@ def test_the_gap_of_a_handover_is_the_sum_of_its_frames_and_processing_times(han
     # Each frame is sent at a rate of at least 6 Mbit/s; at the highest rate its airtime is about 0.1 ms.
     airtimes_ns = sum(mode.airtime_ns(size) for size in sizes)
     waits_ns = len(sizes) * (CW_MIN * SLOT_NS + MS)
-    assert shortest_ns - airtimes_ns - MS <= joined_ns - lost_ns <= shortest_ns + waits_ns + MS
+    assert shortest_ns - airtimes_ns - MS <= connect_ns - disconnect_ns <= shortest_ns + waits_ns + MS
 
 
 def test_a_scan_delays_packets_and_loses_none() -> None:
@@ -151,9 +151,9 @@ def test_a_robot_out_of_range_loses_its_association_and_associates_again_when_it
     lab = Lab(interval_ns=100 * MS)
     lab.run(2 * S, AT_WEST)
     lab.run(8 * S, FAR)
-    lost_ns = lab.cells[-1][0]
+    disconnect_ns = lab.cells[-1][0]
     assert lab.cells[-1][1] is None
-    assert 2 * S + LINK_LOSS_NS - 200 * MS <= lost_ns <= 2 * S + LINK_LOSS_NS + 300 * MS
+    assert 2 * S + LINK_LOSS_NS - 200 * MS <= disconnect_ns <= 2 * S + LINK_LOSS_NS + 300 * MS
     lab.run(16 * S, AT_EAST)
     assert lab.access_points == ["west", "east"]
 
