@@ -58,7 +58,7 @@ def test_a_robot_drives_up_a_ramp_onto_the_plateau_and_down_again() -> None:
 def test_the_grip_of_tires_limits_the_acceleration_on_a_slope(
     heading_deg: float, forward: float, along: float, across: float
 ) -> None:
-    """Friction is mu m g cos(slope); gravity adds m g sin(slope) along the heading, and uses grip across it."""
+    """Friction is mu m g cos(slope); gravity adds m g sin(slope) along the heading or, across it, uses grip."""
     g_cos = GRAVITY_M_S2 / math.hypot(1, RISE)
     expected_m_s2 = g_cos * (math.sqrt(0.5**2 - across**2) + along)
     state = state_after(rover(10.0, heading_deg=heading_deg), 100, Twist(forward))
