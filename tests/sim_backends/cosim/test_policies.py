@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sim_backends.cosim.agents import Agents
-from sim_backends.cosim.comparison import Spread, errors
+from sim_backends.cosim.comparison import Spread, compare_runs
 from sim_backends.cosim.coordinator import Coordinator
 from sim_backends.cosim.federates import Action, FederateError
 from sim_backends.cosim.packet_ledger import position_error_m
@@ -196,7 +196,7 @@ def test_a_million_windows_end_at_a_million_times_their_length() -> None:
 def test_errors_equal_those_computed_by_hand() -> None:
     """Packets are sent at all phases of a window, so waiting for its end takes half a window on average."""
     reference, window_s = passing_run(EventDriven()), 0.05
-    exact_errors = errors(reference, passing_run(VariableStepped()))
+    exact_errors = compare_runs(reference, passing_run(VariableStepped()))
     assert exact_errors.delivery_error_s == Spread(0, 0, 0)
     assert exact_errors.position_error_m.mean == pytest.approx(1.7 * 0.001 / 2, rel=0.12), "states are held for 1 ms"
     assert exact_errors.position_error_m.largest <= 1.7 * 0.001
@@ -205,7 +205,7 @@ def test_errors_equal_those_computed_by_hand() -> None:
         None,
         0,
     )
-    scheduled_errors = errors(reference, passing_run(Scheduled(window_s)))
+    scheduled_errors = compare_runs(reference, passing_run(Scheduled(window_s)))
     assert scheduled_errors.delivery_error_s.mean == pytest.approx(window_s / 2, rel=0.01)
     assert scheduled_errors.delivery_error_s.largest == pytest.approx(window_s, rel=0.01)
     assert scheduled_errors.delay_added_s == pytest.approx(window_s / 2, rel=0.01)
@@ -218,11 +218,11 @@ def test_errors_equal_those_computed_by_hand() -> None:
     differing_packets = scheduled_errors.fate_disagreement * scheduled_errors.packets
     assert 1 <= differing_packets <= 2 * window_s * 1e9 / PERIOD_NS + 2
     assert scheduled_errors.first_disagreement is not None
-    sliding_errors = errors(reference, passing_run(SlidingWindow(window_s)))
+    sliding_errors = compare_runs(reference, passing_run(SlidingWindow(window_s)))
     assert sliding_errors.delivery_error_s == Spread(0, 0, 0), "arrivals keep their time"
     assert sliding_errors.position_error_m.mean == pytest.approx(1.7 * window_s / 2, rel=0.02)
     assert sliding_errors.causality_violations > 0.9 * sum(not fate.reason for fate in reference.fates.values())
-    stepped_errors = errors(reference, passing_run(TimeStepped(window_s)))
+    stepped_errors = compare_runs(reference, passing_run(TimeStepped(window_s)))
     # Packets wait for half a window before the network. They enter it at the beginning of a window, arrive after the
     # delay of the link, and wait for the rest of that window.
     assert stepped_errors.delay_added_s == pytest.approx(1.5 * window_s - DELAY_NS / 1e9, rel=0.01)
@@ -234,7 +234,7 @@ def test_position_errors_are_half_a_window_for_any_step_of_the_physics(
     policy: Callable[[float], SyncPolicy], window_s: float | None, step_ns: int
 ) -> None:
     """All fixed windows have the same error; the exact policy has an error of half a step."""
-    error_m = errors(passing_run(EventDriven()), passing_run(policy(0.01), step_ns=step_ns)).position_error_m
+    error_m = compare_runs(passing_run(EventDriven()), passing_run(policy(0.01), step_ns=step_ns)).position_error_m
     hold_time_s = step_ns / 1e9 if window_s is None else window_s
     assert error_m.mean == pytest.approx(1.7 * hold_time_s / 2, rel=0.02)
     assert error_m.largest == pytest.approx(1.7 * hold_time_s, rel=0.02)
@@ -247,7 +247,7 @@ def test_windows_of_half_the_length_have_half_the_error(
     """All fixed windows are of the first order, in time or in space."""
     reference = passing_run(EventDriven())
     errors_of_long_windows, errors_of_short_windows = (
-        errors(reference, passing_run(policy(window_s))) for window_s in (0.08, 0.04)
+        compare_runs(reference, passing_run(policy(window_s))) for window_s in (0.08, 0.04)
     )
     orders = [
         math.log2(coarse_error / fine_error)
@@ -277,7 +277,7 @@ def test_a_window_that_is_not_a_positive_time_is_refused(window_s: float) -> Non
 
 
 def test_a_window_below_the_physics_step_is_refused() -> None:
-    with pytest.raises(PolicyError, match="step of the physics, 1000000 ns"):
+    with pytest.raises(PolicyError, match="physics step, 1000000 ns"):
         passing_run(SlidingWindow(0.0005))
 
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from fieldkit.cli import main
 from fieldkit.core.errors import ConfigurationError
 from sim_backends.cosim import build, load_scenario
-from sim_backends.cosim.scenario.agent_setup import bodies
+from sim_backends.cosim.scenario.agent_setup import make_bodies
 from sim_backends.cosim.scenario.external import make_hello
 from sim_backends.emane_events.channel import EventListener, EventPublisher
 from sim_backends.emane_events.events import (
@@ -390,7 +390,7 @@ def test_path_losses_of_events_have_a_direction() -> None:
 def test_the_physics_emane_passes_the_conformance_checks(network: None) -> None:
     scenario = load_scenario("convoy", {"physics.options": {"device": "lo", "reference": list(TURIN)}})
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
     start_positions_m = [agent.start.position_m for agent in hello.agents]
     with publishing(*start_positions_m):
         results = list(run_checks(Target(Pair(_load()), hello, windows=100)))
@@ -403,7 +403,7 @@ def test_the_physics_emane_passes_the_conformance_checks(network: None) -> None:
 def test_commands_and_invalid_options_of_the_physics_emane_are_refused(network: None) -> None:
     scenario = load_scenario("convoy", {"physics.options": {"device": "lo"}})
     world = load_world(scenario.world)
-    hello = make_hello(scenario, world, bodies(scenario, world), 1, PHYSICS)
+    hello = make_hello(scenario, world, make_bodies(scenario, world), 1, PHYSICS)
     physics = EmaneLocations(hello)
     with pytest.raises(FederateError, match="does not move robots, and leader has a command"):
         physics.advance(0, {"leader": Twist()})

@@ -47,7 +47,7 @@ def test_tables_show_only_labels_that_differ_between_rows_and_the_printed_digits
 
 def test_cells_that_agree_only_by_a_wide_interval_are_counted_separately() -> None:
     text = table.summary(ROWS)
-    assert "3 of 4 cells agree: 2 by our mean, 1 only because our interval is wide" in text
+    assert "3 of 4 cells agree: 2 by the simulated mean, 1 only because the simulated interval is wide" in text
 
 
 def test_a_table_shows_claims_beside_the_statements_and_tables_of_the_paper(

@@ -23,7 +23,7 @@ from sim_backends.cosim.studies.paper_setups import (
     mesh,
     only_flow,
 )
-from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, agreement, paper_table
+from sim_backends.cosim.studies.paper_tables import DISTANCES_M, TABLES, Agreement, Printed, compare, paper_table
 
 NAN = math.nan
 
@@ -54,7 +54,7 @@ NAN = math.nan
 def test_agreements_equal_those_determined_by_hand(
     printed_value: Printed, estimate: IntervalEstimate, expected: Agreement
 ) -> None:
-    assert agreement(printed_value, estimate) is expected
+    assert compare(printed_value, estimate) is expected
 
 
 @given(
@@ -65,7 +65,7 @@ def test_agreements_equal_those_determined_by_hand(
 def test_a_rounded_number_agrees_with_its_original(value: Decimal, places: int, per_si: int) -> None:
     text = str(value.quantize(Decimal(1).scaleb(-places), ROUND_HALF_UP))
     estimate = float(value / per_si)
-    assert agreement(Printed(text, per_si), IntervalEstimate(estimate, NAN, NAN)) is Agreement.AGREES
+    assert compare(Printed(text, per_si), IntervalEstimate(estimate, NAN, NAN)) is Agreement.AGREES
 
 
 @given(
@@ -80,9 +80,9 @@ def test_a_number_more_than_half_a_step_away_disagrees(
     printed_value = Printed(str(number), step=step)
     estimate = printed_value.value + deviation * float(step) * (1 if is_above else -1)
     expected = Agreement.ABOVE if is_above else Agreement.BELOW
-    assert agreement(printed_value, IntervalEstimate(estimate, NAN, NAN)) is expected
+    assert compare(printed_value, IntervalEstimate(estimate, NAN, NAN)) is expected
     bounds = printed_value.value, estimate
-    assert agreement(printed_value, IntervalEstimate(estimate, min(bounds), max(bounds))) is Agreement.AGREES
+    assert compare(printed_value, IntervalEstimate(estimate, min(bounds), max(bounds))) is Agreement.AGREES
 
 
 SHORT = {"duration": "1200ms"}
@@ -158,15 +158,15 @@ def test_a_row_has_the_mean_over_seeds_and_the_printed_number() -> None:
     row = study.rows(samples)[1]
     assert row.labels == {"line": "los", "distance_m": 40, "protocol": "topic"}
     assert row.delay.seeds == 2
-    assert row.delay.ours.value == pytest.approx(0.2), "of the seeds with arrivals"
+    assert row.delay.measured.value == pytest.approx(0.2), "of the seeds with arrivals"
     # Student's t with one degree of freedom is 12.706, and the standard error is 0.1 s; a delay is at least 0.
-    assert row.delay.ours.low == 0
-    assert row.delay.ours.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
+    assert row.delay.measured.low == 0
+    assert row.delay.measured.high == pytest.approx(0.2 + 12.706 * 0.1, rel=1e-4)
     assert row.delay.agreement is Agreement.AGREES
     assert not row.delay.agrees_by_mean
     assert row.delay.difference == pytest.approx(0.1)
-    assert row.loss.ours.value == pytest.approx((0.02 + 0.02 + 1) / 3)
-    assert row.loss.ours.high == 1, "Student's interval would end at 1.75"
+    assert row.loss.measured.value == pytest.approx((0.02 + 0.02 + 1) / 3)
+    assert row.loss.measured.high == 1, "Student's interval would end at 1.75"
     assert row.reason == "not matched yet"
     assert flow == study.sources[1].flow
 

@@ -56,16 +56,18 @@ def test_gazebo_places_robots_and_stops_them_at_the_wall_until_it_is_killed(
         world=LAWN,
         places_m={**PLACES, "a": NEAR_WALL_M},
     ) as bench:
-        wait_until(lambda: bench.driven.drive(0.2, 2.0).place_m[0] > 3.75, Deadline.after(60))
+        wait_until(lambda: bench.driven.drive(0.2, 2.0).position_m[0] > 3.75, Deadline.after(60))
         wait_until(lambda: not bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
         motion_at_wall = bench.driven.drive(0.2, 0.5)
-        assert motion_at_wall.place_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), "the chassis extends 69 mm ahead"
+        assert motion_at_wall.position_m[:2] == pytest.approx((3.831, 18.0), abs=0.02), (
+            "the chassis extends 69 mm ahead"
+        )
         bench.driven.assign(PLACES["a"])
         bench.medium.place(PLACES)
-        wait_until(lambda: bench.driven.drive(0.2, 0.5).place_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))
+        wait_until(lambda: bench.driven.drive(0.2, 0.5).position_m[0] > PLACES["a"][0] + 0.1, Deadline.after(60))
         later_motion = bench.driven.drive(0.2, 0.1)
-        assert later_motion.place_m[0] < motion_at_wall.place_m[0]
-        assert later_motion.place_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
+        assert later_motion.position_m[0] < motion_at_wall.position_m[0]
+        assert later_motion.position_m[1] == pytest.approx(PLACES["a"][1], abs=0.02)
         assert bench.ping(count=3)
         os.kill(server.process.pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="Gazebo"):
