@@ -1,6 +1,6 @@
 """Process of the base of an emulated ground robot: receives velocities at a socket and drives the robot.
 
-The velocities are datagrams of six doubles, as in ROS's `Twist`. Relays that run under Debian's Python import this
+The velocities are datagrams of six doubles, those of ROS's `Twist`. Relays that run under Debian's Python import this
 module, so it imports only the standard library and modules that do the same.
 """
 
@@ -11,7 +11,7 @@ import socket
 import struct
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sim_backends.emulated.robot.spec import STATE, Base
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND, VelocityCommand, VelocityCommandRecord
@@ -95,9 +95,25 @@ _TWIST: Final = struct.Struct("<6d")
 BYTES: Final = _TWIST.size
 
 
-def pack(*values: float) -> bytes:
-    """Return the datagram for metres per second along x, y, z, and radians per second about them."""
-    return _TWIST.pack(*values)
+STAMPED: Final = "geometry_msgs/TwistStamped"
+"""Type of velocities with a header."""
+
+_MAX_AGE_NS: Final = 500_000_000
+"""ROS's default `cmd_vel_timeout`."""
+
+
+def is_outdated(stamp_ns: int, now_ns: int) -> bool:
+    """Return True if a stamped velocity is too old for a base, by the rule of ROS 2's `diff_drive_controller`.
+
+    A stamp of 0 means the time of arrival (`DiffDriveController::on_configure`).
+    """
+    return stamp_ns != 0 and now_ns - stamp_ns >= _MAX_AGE_NS
+
+
+def pack(twist: Any) -> bytes:  # noqa: ANN401 (a `geometry_msgs/Twist` of rospy or of rosbags)
+    """Return the datagram of a velocity: metres per second along x, y, z, and radians per second about them."""
+    linear, angular = twist.linear, twist.angular
+    return _TWIST.pack(linear.x, linear.y, linear.z, angular.x, angular.y, angular.z)
 
 
 def unpack(datagram: bytes) -> tuple[float, float] | None:

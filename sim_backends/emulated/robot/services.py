@@ -157,7 +157,7 @@ def services(spec: RobotSpec, neighbourhood: Neighbourhood | None = None) -> lis
         types = {sensor.topic: sensor.type for sensor in spec.sensors}
         if frames:
             types[static_frames.TOPIC] = static_frames.TYPE
-        words = (spec.ip, ros_node(spec), _velocity_topic(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
+        words = (spec.ip, ros_node(spec), *_velocity_topic(spec), json.dumps(asdict(spec.ros2)), json.dumps(types))
         result.append(_ros2_program(ROS2_RELAY, "relay", *words))
     return result
 
@@ -186,13 +186,13 @@ def _debian_ros(spec: RobotSpec, topics: Sequence[str]) -> Iterator[Service]:
     variables = spec.ros1_environment | {"PYTHONPATH": str(worker.PROJECT)}
     if spec.runs_master:
         yield _master(spec, variables)
-    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), _velocity_topic(spec), *topics)
+    relay = ("/usr/bin/python3", "-s", str(_RELAY), ros_node(spec), *_velocity_topic(spec), *topics)
     yield _program("ros_relay", relay, variables, ready_file("ros_relay").exists)
 
 
-def _velocity_topic(spec: RobotSpec) -> str:
-    """Return the topic of velocities that the robot's base subscribes to; empty if it has no base."""
-    return spec.base.topic if spec.base else ""
+def _velocity_topic(spec: RobotSpec) -> tuple[str, str]:
+    """Return the topic of velocities that the robot's base subscribes to, and its type; empty if it has no base."""
+    return (spec.base.topic, spec.base.type) if spec.base else ("", "")
 
 
 def _drone(spec: RobotSpec, port: int) -> autopilot.Drone:

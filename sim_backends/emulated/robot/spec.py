@@ -47,6 +47,7 @@ class Base:
 
     Attributes:
         topic: ROS topic of velocities that it subscribes to.
+        type: Type of this topic, `geometry_msgs/Twist` or `geometry_msgs/TwistStamped`.
         speed_m_s: Maximum speed.
         acceleration_m_s2: Maximum acceleration.
         turn_rad_s: Maximum turn rate.
@@ -55,6 +56,7 @@ class Base:
     """
 
     topic: str
+    type: str
     speed_m_s: float
     acceleration_m_s2: float
     turn_rad_s: float

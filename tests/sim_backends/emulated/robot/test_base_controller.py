@@ -5,6 +5,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
 
 from sim_backends.emulated.robot import base_process
 from sim_backends.emulated.robot.base_controller import STEP_NS, TIMEOUT_NS, BaseController
@@ -12,7 +13,7 @@ from sim_backends.emulated.robot.spec import Base
 from sim_backends.emulated.ros.robot_motion import RobotMotionState
 
 S = 10**9
-BASE = Base("/cmd_vel", 0.5, 1.0, 2.0)
+BASE = Base("/cmd_vel", "geometry_msgs/Twist", 0.5, 1.0, 2.0)
 ANY = st.floats(allow_nan=True, allow_infinity=True)
 START = RobotMotionState(x_m=1.0, y_m=2.0, yaw_rad=0.5, position_m=(30.0, 40.0, 0.2), heading_rad=-1.0)
 
@@ -79,6 +80,17 @@ def test_a_reset_robot_is_at_rest_at_the_new_place() -> None:
 
 
 def test_velocities_are_packed_exactly_and_other_datagrams_are_ignored() -> None:
-    assert base_process.unpack(base_process.pack(0.25, 1.0, 2.0, 3.0, 4.0, -0.5)) == (0.25, -0.5)
+    kinds = get_typestore(Stores.ROS1_NOETIC).types
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    twist = kinds["geometry_msgs/msg/Twist"](vector(0.25, 1.0, 2.0), vector(3.0, 4.0, -0.5))
+    assert base_process.unpack(base_process.pack(twist)) == (0.25, -0.5)
     assert base_process.unpack(b"") is None
     assert base_process.unpack(bytes(base_process.BYTES + 1)) is None
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "is_outdated"),
+    [(0, False), (9 * S, True), (int(9.5 * S), True), (int(9.5 * S) + 1, False), (11 * S, False)],
+)
+def test_a_stamped_velocity_is_outdated_half_a_second_after_its_stamp(stamp_ns: int, is_outdated: bool) -> None:
+    assert base_process.is_outdated(stamp_ns, 10 * S) is is_outdated
