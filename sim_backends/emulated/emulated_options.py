@@ -134,7 +134,7 @@ class SyncOptions(Strict):
 
     @property
     def step_ns(self) -> int:
-        """Time step of the physics in nanoseconds."""
+        """Time step of the physics simulator in nanoseconds."""
         return round(self.step * 1e9)
 
 
@@ -168,9 +168,9 @@ class EmulatedOptions(Strict):
         sync: The sync policy between physics and network: its name, or name and parameters. The default is
             `event_driven`, which adds no delay; with `ns3` it is `{name: sliding_window, window: 2ms}`, because an
             exchange at every event of ns-3 takes too long for real time.
-        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [the Wi-Fi of Linux](linux-wifi.md), over the same
-            radio, in a virtual machine if this kernel has no mac80211_hwsim.
-        linux_wifi: Settings of the Wi-Fi of Linux.
+        wifi: `model`: the Wi-Fi of fieldkit's radio. `linux`: [Linux Wi-Fi](linux-wifi.md), over the same radio,
+            in a virtual machine if this kernel has no mac80211_hwsim.
+        linux_wifi: Settings of Linux Wi-Fi.
     """
 
     ros: RosChoice = RosChoice.AUTO
@@ -191,7 +191,7 @@ class EmulatedOptions(Strict):
 
     @property
     def has_linux_wifi(self) -> bool:
-        """True if the robots have the Wi-Fi of Linux."""
+        """True if the robots have Linux Wi-Fi."""
         return self.wifi == "linux"
 
     @property

@@ -78,17 +78,17 @@ from sim_backends.world.motion import State
 _TIME: Final = struct.Struct("<q")
 _TWO_TIMES: Final = struct.Struct("<qq")
 _NO_COMMANDS: Final = struct.Struct("<qqI")
-"""A request to a physics in which the count of commands is 0."""
+"""A request to a physics federate in which the count of commands is 0."""
 _NO_OUTCOMES: Final = struct.Struct("<qqQ")
 """An answer of a network in which both counts are 0."""
 _THREE_TIMES: Final = struct.Struct("<qqq")
 _U32: Final = struct.Struct("<I")
 _STATES_HEAD: Final = struct.Struct("<qII")
-"""An answer of a physics without new agents: time, 0, number of states."""
+"""An answer of a physics federate without new agents: time, 0, number of states."""
 
 
 def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any], agents: AgentTable) -> bytes:
-    """Return the body of a request to a physics; errors as for `commands_bytes`.
+    """Return the body of a request to a physics federate. Raises the errors of `commands_bytes`.
 
     Args:
         to_ns: Time to advance to.
@@ -102,7 +102,7 @@ def encode_advance_physics(to_ns: int, from_ns: int, commands: Mapping[str, Any]
 
 
 def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, dict[str, Twist | Velocity]]:
-    """Return the two times and the commands of a request to a physics.
+    """Return the two times and the commands of a request to a physics federate.
 
     Raises:
         MalformedFrameError: It is malformed.
@@ -121,12 +121,12 @@ def decode_advance_physics(body: bytes, agents: AgentTable) -> tuple[int, int, d
 def encode_states(
     at_ns: int, states: Mapping[str, State], agents: AgentTable, limits_m_s2: Mapping[str, float]
 ) -> bytes:
-    """Return the body of a physics' answer."""
+    """Return the body of a physics federate's answer."""
     return _TIME.pack(at_ns) + announcements_bytes(states, agents) + states_bytes(states, agents, limits_m_s2)
 
 
 def decode_states(body: bytes, agents: AgentTable) -> tuple[int, ReceivedStates]:
-    """Return time and states of a physics' answer; the states include the limits.
+    """Return time and states of a physics federate's answer; the states include the acceleration limits.
 
     Raises:
         MalformedFrameError: It is malformed.

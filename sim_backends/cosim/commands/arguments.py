@@ -149,8 +149,8 @@ def _add_table(commands: Commands) -> None:
     parser: Parser = commands.add_parser(
         "table",
         help="regenerate a table of the paper",
-        description="Run the simulations of a table of the paper. Print each number of the paper next to ours, with "
-        "the interval of our number and the result of the comparison.",
+        description="Run the simulations of a table of the paper. Print each number of the paper next to the "
+        "simulated number, with its interval and the result of the comparison.",
         epilog="example: fieldkit cosim table 1 --format markdown",
     )
     parser.add_choice(

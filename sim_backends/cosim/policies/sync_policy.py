@@ -1,4 +1,4 @@
-"""Protocol of a sync policy, and its input."""
+"""The interface of a sync policy, and the data on which it decides."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from fieldkit.core.model import Vector
 from sim_backends.world.motion import State
 
 Pair = tuple[str, str]
-"""Publisher and subscriber."""
+"""Names of a publisher and a subscriber."""
 
 
 @dataclass(slots=True)
@@ -103,7 +103,8 @@ class LookingAhead(SyncPolicy, Protocol):
         """Return the step of the network's dead reckoning in the window that begins now.
 
         Args:
-            situation: The present situation; `assumed_states` has the velocities that the network will extrapolate.
+            situation: The current situation; `assumed_states` has the velocities with which the network will
+                extrapolate.
         """
         ...
 
@@ -111,7 +112,7 @@ class LookingAhead(SyncPolicy, Protocol):
         """Return the time to which the current window can be extended; the agents have reached `situation.now_ns`.
 
         Args:
-            situation: The present situation, except for the network, which is still at the beginning of the window:
+            situation: The current situation, except for the network, which is still at the beginning of the window:
                 its next event is the next one after that time. If a program has sent in the window, the network may
                 need positions immediately.
 

@@ -1,4 +1,4 @@
-"""The tables of a recording: each is a folder of Parquet files, and each file is readable without the others.
+"""Writes and reads the tables of a recording. Each is a folder of Parquet files that are readable independently.
 
 The only module of `sim_backends` that imports pyarrow. `RecordingState` is the state of a recording between parts.
 """
@@ -60,7 +60,7 @@ SCHEMAS: Final[Mapping[str, pa.Schema]] = {
                 "arrived_ns",
                 pa.int64(),
                 "ns",
-                "time of arrival by the network's clock; empty if the packet never arrived",
+                "time of arrival in the network; empty if the packet never arrived",
             ),
             _field(
                 "counted_ns",
@@ -145,7 +145,7 @@ def write_part(folder: Path, table: str, number: int, rows: Sequence[Row]) -> st
     return hashlib.blake2b(content, digest_size=16).hexdigest()
 
 
-def checksum(path: Path) -> str:
+def file_checksum(path: Path) -> str:
     """Return the BLAKE2b of a file, computed as by `write_part`.
 
     Raises:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 from sim_backends.emulated.robot.spec import STATE, Base
 from sim_backends.emulated.robot.velocity_command import VELOCITY_COMMAND, VelocityCommand, VelocityCommandRecord
-from sim_backends.emulated.ros.own_motion import MotionReporter
+from sim_backends.emulated.ros.robot_motion import MotionReporter
 
 if TYPE_CHECKING:
     from sim_backends.emulated.robot.base_controller import BaseController
@@ -28,8 +28,8 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
 
     Args:
         base: Settings of the robot's base.
-        assigned_paths: The file of the paths that the lab assigns (`own_motion.append_path`).
-        motion_record: The file in which the robot records its motion (`own_motion.MotionReporter`).
+        assigned_paths: The file of the paths that the lab assigns (`robot_motion.append_path`).
+        motion_record: The file in which the robot records its motion (`robot_motion.MotionReporter`).
         ready: File that is created when the base accepts velocities.
 
     Raises:
@@ -60,7 +60,7 @@ def serve(base: Base, *, assigned_paths: Path, motion_record: Path, ready: Path)
 
 
 def _record_velocities(channel: socket.socket) -> NoReturn:
-    """Record each velocity for the physics, which limits it and stops the robot after the last one."""
+    """Record each velocity for the physics simulator, which limits it and stops the robot after the last one."""
     record = VelocityCommandRecord.open(VELOCITY_COMMAND)
     while True:
         velocity = unpack(channel.recv(BYTES + 1))

@@ -30,7 +30,7 @@ from sim_backends.emulated.ros import offered_qos, static_frames
 from sim_backends.emulated.ros.tcpros import Listener
 
 _POLL_S: Final = 0.1
-"""Polling interval for subscribers; ROS 2's own recorder polls for new publishers as often."""
+"""Polling interval for subscribers; the recorder of ROS 2 polls for new publishers as often."""
 
 
 _LOG: Final = "rcl_interfaces/msg/Log"

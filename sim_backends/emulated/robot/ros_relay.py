@@ -41,7 +41,7 @@ class Relay(rospy.SubscribeListener):  # type: ignore[misc]  # rospy has no type
         super().__init__()
         self._topic = topic
         self._stream: socket.socket | None = None
-        # rospy calls `peer_subscribe` in its own threads, possibly before the publisher has been assigned.
+        # rospy calls `peer_subscribe` in other threads, possibly before the publisher has been assigned.
         self._lock = threading.Lock()
         stream, packets = _subscribe(topic)
         with stream:
@@ -153,7 +153,7 @@ def _next_packet(stream: socket.socket, packets: framing.PacketSplitter) -> byte
 def _message_class(header: dict[str, str]) -> Any:  # noqa: ANN401 (rospy has no types)
     """Return a message class whose content stays serialized.
 
-    If ROS's own class of that type is installed, its definition is announced, with comments, as on a real robot.
+    If the class of ROS for that type is installed, its definition is announced, with comments, as on a real robot.
     """
     installed_class = roslib.message.get_message_class(header["type"])
     attributes = {

@@ -30,10 +30,10 @@ MOTION_RECORD: Final = Path(STATE, "steered")
 """The file in which a robot that steers itself records its motion."""
 
 FLIGHT_COMMAND: Final = Path(STATE, "flight_command")
-"""The file in which an autopilot records its command for a physics that flies the drone."""
+"""The file in which an autopilot records its command for a physics simulator that flies the drone."""
 
 FLIGHT: Final = Path(STATE, "flown")
-"""The file in which that physics records the flight."""
+"""The file in which this physics simulator records the flight."""
 
 READY_FOLDER: Final = f"{STATE}/ready"
 
@@ -166,7 +166,7 @@ def _network_services(spec: RobotSpec) -> Iterator[Service]:
     """Yield the programs of the robot's radio: hostapd or wpa_supplicant, and the routing daemon of a mesh."""
     wifi = spec.wifi
     if wifi is not None and wifi.mode in wireless.PROGRAMS:
-        argv = wireless.command(spec.interface, wifi)
+        argv = wireless.prepare_command(spec.interface, wifi)
         yield _program(wireless.PROGRAMS[wifi.mode], argv, {}, partial(wireless.is_connected, wifi))
     if spec.mesh_hello_s is not None:
         argv = network.command(spec.interface, spec.address, spec.mesh_hello_s, dict(spec.links.values()))

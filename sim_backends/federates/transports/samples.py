@@ -1,4 +1,4 @@
-"""Channels over a bus of samples, a pair of topics of DDS or ROS 1.
+"""Channels over a sample bus: a pair of DDS or ROS 1 topics.
 
 The coordinator writes `requests` and reads `answers`; the federate does the reverse. A sample consists of the `run`,
 a u64 that the coordinator draws, and one frame. The first is `hello`; a sample without a frame ends the run.
