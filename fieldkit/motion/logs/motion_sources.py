@@ -4,7 +4,7 @@ from typing import Final
 
 from fieldkit.core.crosschecks import CheckOutcome, CrossCheck
 
-_WINDOW: Final = "the robot's clock around the attempt"
+_WINDOW: Final = "the robot's clock before and after the attempt"
 
 OF_DRIVE: Final = (
     CrossCheck(
@@ -17,14 +17,15 @@ OF_DRIVE: Final = (
             "the path and speed of the procedure",
             _WINDOW,
         ),
-        "1 m from the path; 50 % of the speed plus 0.1 m/s; 25 % plus 5 cm per line for jitter of the odometry",
+        "position: 1 m from the path; speed: 50 % plus 0.1 m/s above the commanded one; driven distance: 25 % plus 5 cm "
+        "per line above the straight line, because of odometry jitter",
     ),
     CrossCheck(
         "distance of a drive",
         ("drive_out_m", "drive_farthest_m", "drive_speed_*", "drive_back_*"),
         "`drive.jsonl`: positions",
         ("`track.csv`", "positions that a step or a person recorded"),
-        "10 % for drift of the odometry plus 0.5 m, or plus 10 m if the other source uses satellites",
+        "distance: 10 % for odometry drift, plus 0.5 m, or plus 10 m if the other source uses satellites",
         CheckOutcome.WITHHELD,
     ),
 )
@@ -41,7 +42,7 @@ OF_FLIGHT: Final = (
             "`mavlink.tlog` of the same drone: LOCAL_POSITION_NED",
             _WINDOW,
         ),
-        "5 m for errors of an autopilot's position estimate; 50 % of the speed plus 2 m/s",
+        "position: 5 m for errors of the autopilot's estimate; speed: 50 % plus 2 m/s above its limit",
     ),
 )
 
@@ -51,6 +52,6 @@ OF_TELEMETRY: Final = (
         ("mavlink_*",),
         "`mavlink.tlog`: frames and their times",
         ("`mavlink.json`: frames, checksum, time of the end", "the checksum of each frame", _WINDOW),
-        "1 ms between two times, because the clock may be slewed",
+        "a time may be up to 1 ms earlier than the previous one, because the clock may be slewed",
     ),
 )

@@ -188,7 +188,7 @@ CROSS_CHECKS: Final = (
         "time of arrival of each sample",
         ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
         "`ROLE-topic.bin` of the subscriber: time of the record",
-        ("the subscriber's capture: time of the packet with the sample", "the robot's clock around the attempt"),
+        ("the subscriber's capture: time of the packet with the sample", "the robot's clock before and after the attempt"),
         "no record is earlier than its packet; the fastest is at most 5 ms later (20 ms if there are fewer than 20)",
     ),
     CrossCheck(
@@ -203,7 +203,7 @@ CROSS_CHECKS: Final = (
         "discovery",
         ("topic_discovered", "topic_discovery_s"),
         "`ROLE-topic.bin` of the publisher: start and match",
-        ("the robot's clock around the attempt", "the first sample, 0.5 s after the match"),
+        ("the robot's clock before and after the attempt", "the first sample, 0.5 s after the match"),
         "a first sample that is up to 0.1 s late, as on a busy robot; if it is later, the discovery time is withheld",
     ),
     CrossCheck(

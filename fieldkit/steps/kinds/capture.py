@@ -327,7 +327,7 @@ def _problems(role: Role, file: str, log_file: str, view: View, *, needs_all: bo
 
 
 def _time_problems(role: Role, capture: Capture, view: View) -> Iterator[str]:
-    """Yield contradictions of the packets' times with each other and with the robot's clock around the attempt."""
+    """Yield contradictions of the packets' times with each other and with the robot's clock before and after it."""
     times_ns = capture.packets.time_ns[capture.packets.time_ns != NO_TIME]
     if not len(times_ns):
         return
