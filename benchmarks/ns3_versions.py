@@ -1,8 +1,8 @@
 """Test the ns-3 network simulator of fieldkit with other versions of ns-3.
 
 Usage: `python -m benchmarks.ns3_versions [trixie] [sid] [wheel]`. The name of a Debian release selects libns3-dev of
-that release with all libraries that it needs, from the Debian mirror in apt's sources; `wheel` selects the headers and
-libraries in the PyPI package `ns3`. They are extracted into a folder (about 1 GB per release), and nothing is
+that release with all libraries that it needs, from the Debian mirror in apt's sources; `wheel` selects the headers
+and libraries in the PyPI package `ns3`. They are extracted into a folder (about 1 GB per release), and nothing is
 installed. This machine's g++ compiles fieldkit's C++ program for ns-3 against them, and the program runs with their
 libraries. Then the conformance suite and the tests in `tests/sim_backends/ns3` run.
 Each line of the output states the version that the program reports, and the results. The exit code is 1 if something

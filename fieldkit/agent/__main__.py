@@ -162,7 +162,7 @@ def _stream(arguments: Arguments, stop_event: threading.Event, path: str, *, pub
     settings = Stream(**arguments["stream"])
     start_middleware = middleware.adapter(settings.over)
     log = Log(path)
-    log.origin(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, arguments["topic"]["name"])
+    log.write_role(time.time_ns(), records.PUBLISHER if publishes else records.SUBSCRIBER, arguments["topic"]["name"])
     log.note(records.DISCOVERY_STARTED, time.time_ns())
     session = start_middleware(Network(**arguments["network"]))
     try:

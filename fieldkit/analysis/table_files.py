@@ -14,7 +14,7 @@ from fieldkit.analysis import parsing, table_errors
 from fieldkit.analysis.repeats import SOURCE, Repeats, by_name, header_names, parse_rows
 from fieldkit.core.columns import SCHEMA_VERSION, Column
 from fieldkit.core.errors import ConfigurationError, EvidenceError, FieldkitError, shell_command
-from fieldkit.core.model import ENDED
+from fieldkit.core.model import FINAL_STATUSES
 
 IDENTITY: Final = ("schema_version", "trial", "protocol", "repeat", "attempt", "status")
 """Columns that a table of repeats must have."""
@@ -288,7 +288,7 @@ def _is_valid(rows: Repeats, declared: Mapping[str, Column]) -> bool:
     """Return True if all rows have a known schema version, a final status, and possible and consistent numbers."""
     return (
         not (rows.numbers["schema_version"] > SCHEMA_VERSION).any()
-        and set(ENDED).issuperset(rows.texts["status"])
+        and set(FINAL_STATUSES).issuperset(rows.texts["status"])
         and all(table_errors.are_possible(column, declared[name]) for name, column in rows.numbers.items())
         and table_errors.contradiction(rows.numbers, rows.quantities) is None
     )

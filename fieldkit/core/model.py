@@ -116,7 +116,7 @@ LOOP: Final = "for"
 MAX_STEPS: Final = 1000
 """Maximum number of steps of a procedure's file after its loops are expanded."""
 
-ENDED: Final = (Status.VALID, Status.VOID, Status.FAILED)
+FINAL_STATUSES: Final = (Status.VALID, Status.VOID, Status.FAILED)
 """Final states of an attempt."""
 
 

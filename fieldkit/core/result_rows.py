@@ -47,19 +47,20 @@ class EstimateRow:
     )
     estimate: str | None = _column(
         "text",
-        "How `value` was estimated: `counted`, `mean`, `median`, `flag` (share of the repeats in which it is true), or "
-        "`words` (share of the repeats with the word, without an interval).",
+        "How `value` was estimated: `counted`, `mean`, `median`, `flag` (share of the repeats in which it is true), "
+        "or `words` (share of the repeats with the word, without an interval).",
     )
     wilson_low: float | None = _column(
         "unit",
         "Lower end of the 95 % Wilson interval, which assumes that all counted items are independent. Only for "
-        "counted quantities; empty if more items arrived than were sent. This is possible in the `paper_*` columns if "
-        "a network card splits or merges frames (offload).",
+        "counted quantities; empty if more items arrived than were sent. This is possible in the `paper_*` columns "
+        "if a network card splits or merges frames (offload).",
     )
     wilson_high: float | None = _column("unit", "Upper end of the 95 % Wilson interval.")
     events: int | None = _column(
         "count",
-        "Number of lost items, or of repeats in which the flag is true or the word occurs; empty for means and medians.",
+        "Number of lost items, or of repeats in which the flag is true or the word occurs; empty for means and "
+        "medians.",
     )
     trials: int | None = _column("count", "Number of items or repeats among which `events` are counted.")
     mean: float | None = _column("unit", "Mean over repeats.")
@@ -99,7 +100,9 @@ class DifferenceRow:
     p_holm: float | None = _column(
         "share", "p-value of the difference, corrected by Holm's method for the number of all comparisons."
     )
-    threshold: float | None = _column("unit", "Largest acceptable difference between a and b; empty if none was given.")
+    threshold: float | None = _column(
+        "unit", "Largest acceptable difference between a and b; empty if none was given."
+    )
     within: bool | None = _column("bool", "Whether the whole interval is within the threshold.")
     verdict: str | None = _column("text", "Result in words.")
 

@@ -87,7 +87,9 @@ def judge(plan: Plan, repeat: RepeatId, evidence: AttemptEvidence) -> EvidenceVe
                 problems += impossible.values()
             result = result.without(impossible)
             if placement_problem:
-                dependent = {name: placement_problem for name in result.values if position_columns.depends_on_positions(name)}
+                dependent = {
+                    name: placement_problem for name in result.values if position_columns.depends_on_positions(name)
+                }
                 result = result.without(dependent)
             if has_no_times:
                 result = result.without({column.name: _NO_TIMES for column in columns if column.unit in _TIME_UNITS})

@@ -11,7 +11,7 @@ from fieldkit.config.json_records import Codec
 from fieldkit.config.schema import Field
 from fieldkit.core import jsonl, laptop_files
 from fieldkit.core.errors import EvidenceError
-from fieldkit.core.model import ENDED, Protocol, RepeatId, Status
+from fieldkit.core.model import FINAL_STATUSES, Protocol, RepeatId, Status
 from fieldkit.remote import jobs
 from fieldkit.trial.plan import Plan
 
@@ -86,7 +86,7 @@ class Attempt:
     @property
     def folders(self) -> tuple[str, ...]:
         """All names that the folder may have, depending on the final status."""
-        return tuple(self.repeat.folder(status, self.number) for status in ENDED)
+        return tuple(self.repeat.folder(status, self.number) for status in FINAL_STATUSES)
 
 
 def locked(folder: Path) -> AbstractContextManager[None]:
@@ -159,7 +159,7 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
             started.add(attempt)
         elif attempt not in started or attempt in ended:
             yield line, f"attempt {entry.attempt} at {repeat} is {entry.status}, although it is not running"
-        elif entry.status in ENDED:
+        elif entry.status in FINAL_STATUSES:
             ended.add(attempt)
             final_status |= {repeat: entry.status} if entry.status is not Status.VOID else {}
 

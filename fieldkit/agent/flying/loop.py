@@ -148,7 +148,7 @@ class FlightLoop:
         Args:
             send_command: Sends the command.
             is_done: Returns True if the command is executed.
-            what: The command, for the message of the error.
+            what: The command as the object of "the autopilot refuses", for the error message.
             set_point: As for `iterate`.
 
         Raises:
@@ -188,7 +188,7 @@ class FlightLoop:
         if not drone.guided:
             if self._liveness is not None and self._liveness.other_state == LANDING:
                 raise FlightError(PEER_STOPPED, "the guard lands it")
-            raise FlightError(TAKEN_OVER, f"another party flies it ({status_text(drone)})")
+            raise FlightError(TAKEN_OVER, f"a person or another program flies it ({status_text(drone)})")
         if not self.has_armed:
             return
         if not drone.armed:

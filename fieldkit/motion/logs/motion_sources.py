@@ -17,8 +17,8 @@ OF_DRIVE: Final = (
             "the path and speed of the procedure",
             _WINDOW,
         ),
-        "position: 1 m from the path; speed: 50 % plus 0.1 m/s above the commanded one; driven distance: 25 % plus 5 cm "
-        "per line above the straight line, because of odometry jitter",
+        "position: 1 m from the path; speed: 50 % plus 0.1 m/s above the commanded one; driven distance: 25 % plus "
+        "5 cm per line above the straight line, because of odometry jitter",
     ),
     CrossCheck(
         "distance of a drive",

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flying.flight_plan import CLIMB, GO, HOME, FlightPlan
+from fieldkit.agent.flying.flight_plan import AT_PATH_START, CLIMB, GO, HOME, ON_GROUND, FlightPlan
 from fieldkit.backends.protocols import Testbed
 from fieldkit.config import schema
 from fieldkit.config.schema import Duration, Field, Length, Speed
@@ -301,7 +301,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         with origins_of(scene).moving(self.robot) as motion:
             announce(f"take off with {name}", self._climb_s)
             flight.give_order(CLIMB)
-            flight.wait_for("up", self._climb_s + _SLACK_S)
+            flight.wait_for(AT_PATH_START, self._climb_s + _SLACK_S)
             announce(f"fly {name}", None)
             flight.give_order(GO)
             run_inside(self, flight, scene, testbed, announce)
@@ -313,7 +313,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     def _wait_for_start(self, scene: Scene, flight: piloting.FlightLease) -> None:
         """Wait until the drone is ready at its origin; record the origin before the first start."""
         try:
-            flight.wait_for("standing", _MOTORS_OFF_S)
+            flight.wait_for(ON_GROUND, _MOTORS_OFF_S)
         except RobotError as error:
             if flight.is_misplaced:
                 origins_of(scene).refuse(self.robot, error.what)

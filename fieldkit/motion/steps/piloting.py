@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from typing_extensions import override
 
-from fieldkit.agent.flying.flight_plan import LEAVE, MISPLACED, STAY, FlightPlan
+from fieldkit.agent.flying.flight_plan import CLIMBING, LEAVE, MISPLACED, STAY, FlightPlan
 from fieldkit.backends.protocols import Robot
 from fieldkit.core.deadline import Deadline
 from fieldkit.core.errors import ConfigurationError
@@ -197,7 +197,7 @@ class FlightLease(LeaseKeeper):
     def is_aloft(self) -> bool:
         """Whether the drone has taken off and not landed, according to the log of the program."""
         marks = [line.rpartition(" ")[2] for line in self._lines]
-        return "climbing" in marks and "landed" not in marks
+        return CLIMBING in marks and "landed" not in marks
 
     @property
     def last_lines(self) -> Sequence[str]:

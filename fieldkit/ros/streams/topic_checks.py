@@ -188,7 +188,10 @@ CROSS_CHECKS: Final = (
         "time of arrival of each sample",
         ("topic_delay_*", "topic_age_*", "topic_jitter_s"),
         "`ROLE-topic.bin` of the subscriber: time of the record",
-        ("the subscriber's capture: time of the packet with the sample", "the robot's clock before and after the attempt"),
+        (
+            "the subscriber's capture: time of the packet with the sample",
+            "the robot's clock before and after the attempt",
+        ),
         "no record is earlier than its packet; the fastest is at most 5 ms later (20 ms if there are fewer than 20)",
     ),
     CrossCheck(

@@ -23,7 +23,7 @@ from fieldkit.core.events import (
     TrialStarted,
     TrialStopped,
 )
-from fieldkit.core.model import ENDED, RepeatId
+from fieldkit.core.model import FINAL_STATUSES, RepeatId
 from fieldkit.core.prompts import Answer
 from fieldkit.core.units import TimeEstimate
 from fieldkit.trial import estimates, journal, rows, store
@@ -175,7 +175,7 @@ def run_repeats(
     cells = ledger.summarize()
     robots.delete_remote()
     _report_unfetched(robots, sink)
-    valid, void, failed = map(ledger.counts, ENDED)
+    valid, void, failed = map(ledger.counts, FINAL_STATUSES)
     judgements = _judge(plan, cells, sink) if plan.procedure.expect else ()
     sink(TrialEnded(str(folder), valid, void, failed))
     return Outcome(folder, cells, valid, failed, judgements)
