@@ -129,8 +129,8 @@ class FieldBackend:
             name,
             robot,
             self._passwords[name],
-            patience_s=self._site.patience,
-            notice=lambda text: sink(Note(text)),
+            reconnect_timeout_s=self._site.patience,
+            on_notice=lambda text: sink(Note(text)),
             crosses_radio=self._site.control is Control.RADIO,
         )
 

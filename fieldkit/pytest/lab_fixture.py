@@ -132,12 +132,12 @@ class OpenedLab:
 
     @property
     def testbed(self) -> Testbed:
-        """The testbed of the open robots; errors as for `open`."""
+        """The testbed of the open robots; raises the same errors as `open`."""
         return self.open()
 
     @property
     def cast(self) -> Cast:
-        """The robot in each role; errors as for `open`."""
+        """The robot in each role; raises the same errors as `open`."""
         self.open()
         return self._cast
 

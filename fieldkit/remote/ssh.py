@@ -20,7 +20,7 @@ from fieldkit.remote.shell import Completed
 from fieldkit.remote.sockets import Connect, Timing
 
 CONNECT_S: Final = Timing.connect_s
-PATIENCE_S: Final = 60.0
+RECONNECT_TIMEOUT_S: Final = 60.0
 
 _MAX_OUTPUT_BYTES: Final = 16 << 20
 _DISK_FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -38,8 +38,8 @@ class SshShell:
         password: The password, which is then the only login method; None to use keys.
         host: Host name or address, for messages; empty for the name of the robot.
         port: SSH port, for messages.
-        patience_s: Time after a loss during which attempts to reopen the connection are made.
-        notice: Called with one line when the connection is lost, and when it is restored.
+        reconnect_timeout_s: Time after a loss during which attempts to reopen the connection are made.
+        on_notice: Called with one line when the connection is lost, and when it is restored.
         crosses_radio: Whether the connection crosses the radio under test.
         timing: Timeouts of the connection.
 
@@ -58,8 +58,8 @@ class SshShell:
         password: str | None = None,
         host: str = "",
         port: int = 22,
-        patience_s: float = PATIENCE_S,
-        notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
+        reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
+        on_notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
         crosses_radio: bool = False,
         timing: Timing = Timing(),  # noqa: B008 (frozen)
     ) -> None:
@@ -67,8 +67,8 @@ class SshShell:
             Address(robot, host or robot, port, user),
             connect,
             Credentials(HostKey.parse(host_key, robot), private_key, password),
-            patience_s=patience_s,
-            notice=notice,
+            reconnect_timeout_s=reconnect_timeout_s,
+            on_notice=on_notice,
             crosses_radio=crosses_radio,
             timing=timing,
         )

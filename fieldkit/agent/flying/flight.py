@@ -101,7 +101,9 @@ class OffboardPilot:
             self._loop.session.close()
 
     def _abort_flight(self, error: Exception) -> None:
-        """Land the drone after an error unless a person or another program flies it; log an alarm if it does not land.
+        """Land the drone after an error, unless a person or another program flies it.
+
+        An alarm is logged if the drone does not land.
 
         Raises the errors of `bring_down`.
         """
@@ -161,7 +163,7 @@ class OffboardPilot:
         """Return the origin in the coordinate frame that the autopilot has used since it was started.
 
         Raises:
-            FlightError: The drone is not at the origin of its trial, or its position cannot be compared with the origin.
+            FlightError: The drone is not at the origin of its trial, or it cannot be determined whether it is there.
         """
         drone, start_s = self._drone, time.monotonic()
         self._loop.run_until(

@@ -16,8 +16,8 @@ AT_PATH_END, RETURNING, DESCENDING = "there", "coming back", "coming down"
 PHASES = (ON_GROUND, CLIMBING, AT_PATH_START, ON_PATH, AT_PATH_END, RETURNING, DESCENDING)
 """Phases of a flight in chronological order, with their names in logs.
 
-The drone waits on the ground, climbs, waits above the origin for the order to fly, flies the path, waits at its end for
-the order to land, returns to the origin if the plan requires it, and descends.
+The drone waits on the ground, climbs, waits above the origin for the order to fly, flies the path, waits at its end
+for the order to land, returns to the origin if the plan requires it, and descends.
 """
 
 MISPLACED = "misplaced"
