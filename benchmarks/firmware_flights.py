@@ -51,7 +51,7 @@ class Bench:
     """Runs the programs of the agent against one connection.
 
     Args:
-        connection: As `mavlink.connection` of a profile.
+        connection: Name of the connection to the autopilot, as in the key `mavlink.connection` of a profile.
         program: The agent.
         folder: Folder for orders and logs.
     """

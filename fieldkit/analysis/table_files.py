@@ -172,7 +172,7 @@ def names(path: Path) -> tuple[str, ...]:
 
     Raises:
         ConfigurationError: The file cannot be read.
-        EvidenceError: As for `datasets.names`.
+        EvidenceError: For the same reasons as `datasets.names`.
     """
     if path.is_dir():
         from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
@@ -251,7 +251,10 @@ def _typed(
 
 
 def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
-    """Return the rows of a dataset of Parquet files; raises as `datasets.read`, and if a value is not possible."""
+    """Return the rows of a dataset of Parquet files.
+
+    Raises the same errors as `datasets.read`, and an error if a value is not possible.
+    """
     from fieldkit.analysis import datasets  # noqa: PLC0415 (imports pandas if it is installed)
 
     numbers, texts, rows = datasets.read(path, declared)
@@ -264,7 +267,7 @@ def _read_dataset(path: Path, declared: Mapping[str, Column]) -> Repeats:
 def _read_large(path: Path, declared: Mapping[str, Column]) -> Repeats | None:
     """Return the rows of a large table, which is read in blocks, or None for a small or invalid table.
 
-    Raises as `_header` for an invalid header.
+    Raises the same errors as `_header` if the header is invalid.
     """
     with _readable(path):
         if path.stat().st_size < 2 * _BATCH_BYTES:

@@ -149,7 +149,7 @@ class FieldTestbed:
         cast: The robot in each role.
         shells: Control connection of each robot.
         operator: The operator.
-        permissions: See `Attended`.
+        permissions: Actions that the operator has permitted; see `Attended`.
     """
 
     oracle: Final = None

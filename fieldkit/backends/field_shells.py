@@ -49,7 +49,10 @@ class SshAccess(Protocol):
 def find_password(
     name: str, access: SshAccess, ask: passwords.PasswordSource = passwords.read_from_terminal
 ) -> str | None:
-    """Return the password of a robot from its source; None if it needs no password. Raises as `passwords`."""
+    """Return the password of a robot from its source; None if it needs no password.
+
+    Raises the same errors as `passwords`.
+    """
     source = access.password
     if source is None:
         return None
@@ -72,7 +75,7 @@ def open_shell(
         name: Name of the robot.
         access: Its SSH access data.
         password: Its password; None if it needs no password.
-        reconnect_timeout_s: As for `SshShell`.
+        reconnect_timeout_s: Time after a loss during which attempts to reopen the connection are made.
         on_notice: Called with a line of text when the connection is lost or restored.
         crosses_radio: Whether the connection crosses the radio under test.
 

@@ -349,7 +349,10 @@ def _validated_under(key: str, model: type[AnyModel], value: object) -> AnyModel
 
 
 def load(path: Path, model: type[Model]) -> Model:
-    """Read `path` and validate it against `model`; errors as `read` and `validate`."""
+    """Read `path` and validate it against `model`.
+
+    Raises the same errors as `read` and `validate`.
+    """
     return validate(read(path), model)
 
 

@@ -139,7 +139,7 @@ def read(path: Path, limit_bytes: int | None = None) -> bytes:
     """Return the content of a regular file.
 
     Raises:
-        OSError: As `open_plain`, or the file is larger than `limit_bytes`.
+        OSError: For the same reasons as `open_plain`, or because the file is larger than `limit_bytes`.
     """
     with os.fdopen(open_plain(path), "rb") as file:
         if limit_bytes is not None and os.fstat(file.fileno()).st_size > limit_bytes:

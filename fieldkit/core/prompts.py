@@ -95,7 +95,10 @@ class Operator(Protocol):
         ...
 
     def enter(self, question: Question) -> str:
-        """Show a question and return its answer in the form of `Question.read`; raises as `ask`."""
+        """Show a question and return its answer in the form of `Question.read`.
+
+        Raises the same errors as `ask`.
+        """
         ...
 
 

@@ -67,7 +67,7 @@ def completed(
         note: Receives a sentence when a worker died or when no worker is connected.
 
     Raises:
-        ConfigurationError: As for `Workers.open`.
+        ConfigurationError: For the same reasons as `Workers.open`.
         LinkError: The scheduler of the cluster does not answer, or the connection was lost.
     """
     if tasks and workers.processes(len(tasks)) != 1:

@@ -98,7 +98,7 @@ def run(folder: LabFolder, backend: LabBackend, *, seed: int, sink: Sink, on_rea
 
     Raises:
         ConfigurationError: A lab of this directory is already up.
-        FieldkitError: As `LabBackend.open_lab`.
+        FieldkitError: For the same reasons as `LabBackend.open_lab`.
     """
     with (
         _until_signal(),

@@ -65,7 +65,7 @@ class TrialRunner:
             ExpectationError: All repeats are valid, but a figure does not meet an expectation of the procedure.
             ConfigurationError: An argument is wrong.
             EvidenceError: A repeat failed.
-            FieldkitError: As for `OpenedLab.open` and `runner.run_trial`.
+            FieldkitError: For the same reasons as `OpenedLab.open` and `runner.run_trial`.
         """
         __tracebackhide__ = True
         protocols = (protocol,) if isinstance(protocol, str) else tuple(protocol)

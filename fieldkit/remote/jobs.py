@@ -224,7 +224,7 @@ def serve(shell: Shell, job: Job) -> PendingJob:
 
     Raises:
         LinkError: The robot did not answer in time.
-        RobotError: As `start`.
+        RobotError: For the same reasons as `start`.
     """
     session = shell.begin(command("serve", job), deadline=Deadline.after(REPLY_S), until=_READY_OUTPUT)
     if not session.is_ready:

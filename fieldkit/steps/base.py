@@ -172,7 +172,7 @@ def step_types() -> LazyMapping[type[Step]]:
     """Return the class of every kind of step by name, built-in kinds first.
 
     Raises:
-        ConfigurationError: See `kinds.find`.
+        ConfigurationError: For the same reasons as `kinds.find`.
     """
     return LazyMapping(kinds.find(), _load)
 

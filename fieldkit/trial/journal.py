@@ -90,12 +90,18 @@ class Attempt:
 
 
 def locked(folder: Path) -> AbstractContextManager[None]:
-    """Return a context that locks a trial against other processes of fieldkit; raises as `jsonl.locked`."""
+    """Return a context that locks a trial against other processes of fieldkit.
+
+    Raises the same errors as `jsonl.locked`.
+    """
     return jsonl.locked(folder / JOURNAL_FILE, "trial")
 
 
 def append(folder: Path, *entries: JournalEntry) -> None:
-    """Add entries to the journal of a trial; raises as `jsonl.append`."""
+    """Add entries to the journal of a trial.
+
+    Raises the same errors as `jsonl.append`.
+    """
     jsonl.append(folder / JOURNAL_FILE, *map(_CODEC.dump, entries))
 
 
@@ -105,7 +111,7 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
     `ended_attempts` then returns the failed attempts as void.
 
     Raises:
-        EvidenceError: As for `history`.
+        EvidenceError: For the same reasons as `history`.
         OSError: The disk is full or was removed.
     """
     remove_torn_line(folder)
@@ -121,7 +127,10 @@ def remove_torn_line(folder: Path) -> None:
 
 
 def read(folder: Path) -> list[JournalEntry]:
-    """Return the entries of a trial's journal; raises as `jsonl.read`."""
+    """Return the entries of a trial's journal.
+
+    Raises the same errors as `jsonl.read`.
+    """
     return jsonl.read(folder / JOURNAL_FILE, _CODEC.parse, remedy="name the folder of a trial")
 
 
@@ -129,7 +138,8 @@ def history(folder: Path, plan: Plan) -> list[JournalEntry]:
     """Return the entries of a trial's journal after a check that their sequence is possible.
 
     Raises:
-        EvidenceError: As for `read`; or an entry contradicts earlier entries, or its repeat is not in the plan.
+        EvidenceError: For the same reasons as `read`, or because an entry contradicts earlier entries, or because
+            its repeat is not in the plan.
     """
     entries = read(folder)
     for line, reason in _impossible_entries(entries, plan):

@@ -131,7 +131,7 @@ class FlightLoop:
             yield
 
     def run_until(self, condition: Callable[[], bool], set_point: Callable[[], Position] | None = None) -> None:
-        """Iterate until `condition` returns True; arguments and errors as for `iterate`."""
+        """Iterate until `condition` returns True; arguments and errors are those of `iterate`."""
         for _ in self.iterate(set_point):
             if condition():
                 return
@@ -149,7 +149,7 @@ class FlightLoop:
             send_command: Sends the command.
             is_done: Returns True if the command is executed.
             what: The command as the object of "the autopilot refuses", for the error message.
-            set_point: As for `iterate`.
+            set_point: Returns the next set-point; None for no set-points.
 
         Raises:
             FlightError: The command was not executed in time; the message contains the autopilot's last text.

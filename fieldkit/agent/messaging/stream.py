@@ -95,7 +95,7 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
         stop_event: Set to stop early.
 
     Raises:
-        LogError: As `Log.note`.
+        LogError: For the same reasons as `Log.note`.
     """
     codec = SampleCodec(stream)
     publisher = middleware.publisher(topic)
@@ -124,10 +124,10 @@ def publish(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop
 
 
 def subscribe(middleware: Middleware, topic: Topic, stream: Stream, log: Log, stop_event: threading.Event) -> None:
-    """Log each received sample until `stop_event` is set; arguments as for `publish`.
+    """Log each received sample until `stop_event` is set. The arguments are those of `publish`.
 
     Raises:
-        LogError: As `Log.note`; `stop_event` is set then.
+        LogError: For the same reasons as `Log.note`; `stop_event` is set then.
     """
     codec = SampleCodec(stream)
     errors: list[LogError] = []

@@ -80,7 +80,7 @@ def document(path: Path) -> object:
     """Return the parsed JSON that a program printed.
 
     Raises:
-        EvidenceError: As `text`, or the output is not JSON.
+        EvidenceError: For the same reasons as `text`, or because the output is not JSON.
     """
     try:
         return parse_json(text(path))
@@ -102,7 +102,8 @@ def at_path(path: Path, where: str) -> object:
     """Return the value at the path `where` in the JSON that a program printed, or None if there is no value.
 
     Raises:
-        EvidenceError: As `document`, or a function in the path was applied to a value of the wrong type.
+        EvidenceError: For the same reasons as `document`, or because a function in the path was applied to a value
+            of the wrong type.
     """
     printed = document(path)
     try:
@@ -129,7 +130,7 @@ def by_expression(path: Path, expression: str) -> object:
     """Return the text of the expression's group in the first match in a program's output, or None without a match.
 
     Raises:
-        EvidenceError: As `text`.
+        EvidenceError: For the same reasons as `text`.
     """
     return search_text(text(path), expression)
 

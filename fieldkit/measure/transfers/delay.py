@@ -184,7 +184,7 @@ def packet_delays(
     Return None if the clock offset cannot be estimated, or if its error is unlimited.
 
     Args:
-        pairs: The transfer's packets as for `measure`; all must have times.
+        pairs: The transfer's packets, paired as for `measure`; all must have times.
         sender: Packets of the sender's capture, all with times.
         receiver: Packets of the receiver's capture, all with times.
         transfer: Identifies the transfer's packets.

@@ -82,7 +82,7 @@ class MotionPermission:
         """Check that robots may move in the next attempt. After a fault, a person must type `confirm`.
 
         Raises:
-            ConfigurationError: As for `Operator.enter`.
+            ConfigurationError: For the same reasons as `Operator.enter`.
             MotionHeldError: No person has confirmed.
             OSError: The disk is full or was removed.
         """

@@ -113,7 +113,10 @@ class LeaseKeeper:
         self.renew()
 
     def renew(self) -> bytes:
-        """Renew the last order, and return the content of the output file; raises the errors of `give_order`."""
+        """Renew the last order, and return the content of the output file.
+
+        Raises the same errors as `give_order`.
+        """
         return self._send(jobs.REPLY_S)
 
     def pause(self) -> None:
@@ -186,7 +189,10 @@ class LeaseKeeper:
 
 
 def run_inside(nest: Nest, keeper: LeaseKeeper, scene: Scene, testbed: Testbed, announce: Announce) -> None:
-    """Run the steps inside `nest`; abort them if its leased program ends. Raises the errors of `run_while_leased`."""
+    """Run the steps inside `nest`; abort them if its leased program ends.
+
+    Raises the same errors as `run_while_leased`.
+    """
     inner_scene = replace(scene, halt=scene.halt.child())
 
     def end() -> None:

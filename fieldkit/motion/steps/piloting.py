@@ -113,7 +113,7 @@ def rescue_job(scene: Scene, role: Role, name: str, guard_name: str, *, abort: s
         role: Role of the drone.
         name: Name of the job.
         guard_name: Name of the guard's job.
-        abort: As for `guard_job`.
+        abort: Action that ends the flight, a value of `OnAbort`.
     """
     plan = FlightPlan(
         connection=connection(scene.robot(role)),
@@ -135,7 +135,10 @@ def liveness_file(guard_name: str) -> str:
 def guarding(
     scene: Scene, shell: Shell, program: Planned, *, lease_s: float = LEASE_S, body_s: float
 ) -> Iterator["FlightLease"]:
-    """Start the guard of a drone, yield its lease, and stop it after the body; errors as for `leased_program`."""
+    """Start the guard of a drone, yield its lease, and stop it after the body.
+
+    Raises the same errors as `leased_program`.
+    """
     with leased_program(scene, shell, program, lease_s=lease_s, body_s=body_s, exit_s=_GUARD_EXIT_S) as flight:
         yield flight
         flight.release()
@@ -185,7 +188,10 @@ class FlightLease(LeaseKeeper):
         return shorten(match["reason"]) if match else ""
 
     def release(self) -> None:
-        """Order the program to exit without a command to the drone; raises the errors of `give_order`."""
+        """Order the program to exit without a command to the drone.
+
+        Raises the same errors as `give_order`.
+        """
         self.give_order(LEAVE)
 
     @property
@@ -235,7 +241,10 @@ class FlightLease(LeaseKeeper):
         return [[shorten(line, 1000) for line in tail.splitlines()] for tail in tails]
 
     def refresh(self) -> None:
-        """Renew the order with a short timeout; raises the errors of `give_order`."""
+        """Renew the order with a short timeout.
+
+        Raises the same errors as `give_order`.
+        """
         self._send(_QUERY_S)
 
     def wait_for(self, mark: str, within_s: float) -> None:

@@ -3,8 +3,8 @@
 A candidate is a middleware with its settings and its quality of service. It passes only if it meets the criterion in
 every cell, that is, for every sample size at every place. Missing data never counts as a pass: a candidate stays
 undecided if there are too few valid repeats, if a delay is empty because its measurement was not accurate enough, or
-if a publisher discovered no subscription. The rule is the same as for expectations (`fieldkit.analysis.judgements`): `every loss <= BOUND`, or
-`90 % of loss <= BOUND` if a share is given.
+if a publisher discovered no subscription. The rule is the same as for expectations (`fieldkit.analysis.judgements`):
+`every loss <= BOUND`, or `90 % of loss <= BOUND` if a share is given.
 """
 
 import json

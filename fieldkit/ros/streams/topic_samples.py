@@ -172,7 +172,7 @@ def find_bytes(path: Path, pattern: bytes) -> Occurrences:
     Occurrences that start in a later IP fragment, or that the snap length truncated, are not found.
 
     Raises:
-        EvidenceError: As for `pcap.read`.
+        EvidenceError: For the same reasons as `pcap.read`.
     """
     data = reading.mapped(path)
     integers = Integers(data)
@@ -278,7 +278,10 @@ class SampleFlow:
 
 
 def find_heads(path: Path, size_bytes: int) -> Occurrences:
-    """Return the heads of samples with `size_bytes` of data in a capture; raises the errors of `find_bytes`."""
+    """Return the heads of samples with `size_bytes` of data in a capture.
+
+    Raises the same errors as `find_bytes`.
+    """
     return find_bytes(path, _LAYOUT.pack(0, 0, size_bytes) + MAGIC)
 
 

@@ -40,7 +40,7 @@ class Attempts:
         variants: Variants of the tools of each robot.
         sink: Receives the start of each phase.
         motions: The robots that move without a person.
-        origins: See `Scene.origins`.
+        origins: Origins of the robots' motions; see `Scene.origins`.
     """
 
     def __init__(
@@ -75,7 +75,8 @@ class Attempts:
         Raises:
             ConfigurationError: This machine has no space for the evidence.
             FieldkitError: The trial cannot continue. The attempt is stored, but is not one of the allowed attempts.
-            KeyboardInterrupt: As for `FieldkitError`; but if its steps have ended, `recover` completes the attempt.
+            KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but is not one of the allowed attempts. If
+                its steps have ended, `recover` completes the attempt.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
@@ -118,7 +119,10 @@ class Attempts:
         return failure.remedy if failure else ""
 
     def recover(self, interrupted_attempt: Attempt) -> None:
-        """Complete an attempt during which fieldkit was killed; raises as `make`."""
+        """Complete an attempt during which fieldkit was killed.
+
+        Raises the same errors as `make`.
+        """
         self._sink(PhaseStarted("recover", str(interrupted_attempt.repeat)))
         remote, was_measured = (
             interrupted_attempt.remote(self._plan.trial),

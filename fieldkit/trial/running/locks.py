@@ -49,7 +49,7 @@ def locked_exclusively(shells: Shells, holder: Holder, *, sink: Sink) -> Iterato
 
     Raises:
         ConfigurationError: Another process uses the token. It would use the same locks and release them.
-        FieldkitError: As for `locked`.
+        FieldkitError: For the same reasons as `locked`.
     """
     with ExitStack() as stack:
         try:

@@ -71,8 +71,9 @@ def run(
         The outcome of each trial; None for a trial that the operator skipped.
 
     Raises:
-        ConfigurationError: As for `motion_control.require_one_place`.
-        FieldkitError: As for `opened` and `runner.run_trial`; a note lists the trials that were not started.
+        ConfigurationError: For the same reasons as `motion_control.require_one_place`.
+        FieldkitError: For the same reasons as `opened` and `runner.run_trial`; a note lists the trials that were not
+            started.
     """
     motion_control.require_one_place(plans, backend, operator)
     store.prepare(out)

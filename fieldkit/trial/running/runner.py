@@ -59,7 +59,10 @@ class Outcome:
 
 
 def run_trial(plan: Plan, testbed: Testbed, out: Path, sink: Sink, stop: Stop | None = None) -> Outcome | None:
-    """Place the robots and run a trial; None if the operator skipped it. Raises as `place` and `begin`."""
+    """Place the robots and run a trial; None if the operator skipped it.
+
+    Raises the same errors as `place` and `begin`.
+    """
     placement = place(plan, testbed, sink)
     if placement.answer.skip:
         return None
@@ -80,7 +83,10 @@ class PlacementResult:
 
 
 def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
-    """Bring the robots to the places of a trial; raises as `Testbed.place`."""
+    """Bring the robots to the places of a trial.
+
+    Raises the same errors as `Testbed.place`.
+    """
     started_s = time.monotonic()
     placement = PlacementResult(testbed.place(plan.placement), time.monotonic() - started_s)
     sink(Placed(placement.answer.skip, placement.answer.note, placement.duration_s))

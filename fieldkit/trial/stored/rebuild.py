@@ -69,7 +69,7 @@ def measure_rows(folder: Path, plan: Plan) -> list[Row]:
     """Return the rows of a trial's attempts, measured again from the evidence. Nothing is written.
 
     Raises:
-        EvidenceError: As for `journal.history`.
+        EvidenceError: For the same reasons as `journal.history`.
     """
     return _rows(folder, plan, journal.history(folder, plan))
 
