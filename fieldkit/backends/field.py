@@ -96,7 +96,7 @@ class FieldBackend:
         return frozenset(key for key, section in sections if section.permission in self.permissions)
 
     @contextmanager
-    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (starts nothing)
+    def open(self, cast: Cast, *, seed: int, sink: Sink, operator: Operator) -> Iterator[Testbed]:  # noqa: ARG002 (real robots need no seed)
         """Yield the testbed; see `Backend.open`. Each robot is connected at its first command."""
         shells: dict[Role, Shell] = {}
         try:

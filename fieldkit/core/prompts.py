@@ -95,10 +95,7 @@ class Operator(Protocol):
         ...
 
     def enter(self, question: Question) -> str:
-        """Show a question and return its answer in the form of `Question.read`.
-
-        Raises the same errors as `ask`.
-        """
+        """Show a question and return its answer in the form of `Question.read`. Raises the same errors as `ask`."""
         ...
 
 

@@ -67,7 +67,7 @@ def run_parallel(
             code of a call, and is raised instead of the first error. Without this function, all calls run to their
             end.
     """
-    from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (logging, 5 ms)
+    from concurrent.futures import ALL_COMPLETED, FIRST_EXCEPTION, Future, wait  # noqa: PLC0415 (it imports logging, which takes 5 ms)
 
     # All futures exist before the first thread starts, so that Ctrl-C while a thread starts does not lose its future.
     futures: list[Future[T]] = [Future() for _ in items]

@@ -76,10 +76,7 @@ def parse_distance(text: str) -> Distance:
 
 
 def parse_offset_m(text: str) -> float:
-    """Return a length in metres that may be negative, `-30ft`.
-
-    Raises the same errors as `parse_quantity`.
-    """
+    """Return a length in metres that may be negative, `-30ft`. Raises the same errors as `parse_quantity`."""
     length_m = parse_quantity(text.removeprefix("-"), METRES_PER_UNIT, "length")
     return -length_m if text.startswith("-") else length_m
 

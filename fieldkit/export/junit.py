@@ -42,10 +42,7 @@ def write(path: Path, folders: Iterable[Path]) -> None:
 
 
 def text(folders: Iterable[Path]) -> bytes:
-    """Return trials as XML.
-
-    Raises the same errors as `write`.
-    """
+    """Return trials as XML. Raises the same errors as `write`."""
     top = ET.Element("testsuites", name="fieldkit")
     # This is a list, because `extend` converts an exception of an iterator to a TypeError.
     top.extend([_suite(folder) for folder in folders])

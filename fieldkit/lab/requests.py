@@ -115,18 +115,12 @@ def unpack_state(answer: bytes) -> LabState:
 
 
 def unpack_place_m(answer: bytes) -> Vector:
-    """Return the position in an answer.
-
-    Raises the same errors as `unpack_state`.
-    """
+    """Return the position in an answer. Raises the same errors as `unpack_state`."""
     return _PLACE.parse(_read(answer)).place_m
 
 
 def unpack_overview(answer: bytes) -> Overview:
-    """Return the plan view of the lab in an answer.
-
-    Raises the same errors as `unpack_state`.
-    """
+    """Return the plan view of the lab in an answer. Raises the same errors as `unpack_state`."""
     return _OVERVIEW.parse(_read(answer))
 
 
@@ -178,6 +172,7 @@ def move(folder: LabFolder, robot: str, destination: Destination) -> Vector:
 
     Raises:
         ConfigurationError: There is no such robot, or the destination is not in the world.
+        FieldkitError: For the same reasons as `state`.
     """
     return _request(folder, f"move {robot} {pack_destination(destination)}", unpack_place_m)
 

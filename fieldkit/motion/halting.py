@@ -68,10 +68,7 @@ def halt_attempt(shell: Shell, folder: str, operator: str, deadline: Deadline) -
 
 
 def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> HaltResult:
-    """Return the current state of programs that `halt_attempt` returned.
-
-    Raises the same errors as `halt_attempt`.
-    """
+    """Return the current state of programs that `halt_attempt` returned. Raises the same errors as `halt_attempt`."""
     return HaltResult(_states(call(shell, "motion_states", *programs, deadline=deadline)))
 
 

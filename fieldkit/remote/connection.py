@@ -73,10 +73,7 @@ class Connection:
         return self._close_event
 
     def link(self, deadline: Deadline) -> Link:
-        """Return the link, which is opened again if it is not alive.
-
-        Raises the same errors as `log_in`.
-        """
+        """Return the link, which is opened again if it is not alive. Raises the same errors as `log_in`."""
         close_event, limit = self._close_event, deadline.earlier_of(self._timing.connect_s)
         if not self._connecting.acquire(timeout=limit.remaining_s):
             raise LinkLostError("another command is still connecting", where=self.address.robot)

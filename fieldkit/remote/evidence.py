@@ -77,26 +77,17 @@ def boot_id(shell: Shell) -> str:
 
 
 def end_jobs(shell: Shell, folder: str) -> None:
-    """Stop all running jobs of the attempt, and block the start of others.
-
-    Raises the same errors as `begin`.
-    """
+    """Stop all running jobs of the attempt, and block the start of others. Raises the same errors as `begin`."""
     call(shell, "end", folder, deadline=Deadline.after(2 * REPLY_S))
 
 
 def end_all(shell: Shell, trial: str) -> None:
-    """Stop all running jobs of `trial`.
-
-    Raises the same errors as `begin`.
-    """
+    """Stop all running jobs of `trial`. Raises the same errors as `begin`."""
     call(shell, "halt", f"{HOME}/{trial}", deadline=Deadline.after(2 * REPLY_S))
 
 
 def discard_attempt(shell: Shell, folder: str) -> None:
-    """Delete an attempt's folder on the robot.
-
-    Raises the same errors as `begin`.
-    """
+    """Delete an attempt's folder on the robot. Raises the same errors as `begin`."""
     call(shell, "drop", folder, deadline=Deadline.after(REPLY_S))
 
 

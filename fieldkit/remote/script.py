@@ -111,10 +111,7 @@ def call(shell: Shell, verb: str, *words: str, deadline: Deadline) -> bytes:
 
 
 def require_success(shell: Shell, completed: Completed, *, remedy: str = "") -> None:
-    """Check that a call of the script succeeded.
-
-    Raises the same errors as `call`.
-    """
+    """Check that a call of the script succeeded. Raises the same errors as `call`."""
     if completed.exit_code == 0:
         return
     # A login shell that refuses the login (nologin) prints its message to either stream.

@@ -61,7 +61,7 @@ class SshShell:
         reconnect_timeout_s: float = RECONNECT_TIMEOUT_S,
         on_notice: Callable[[str], None] = lambda text: None,  # noqa: ARG005
         crosses_radio: bool = False,
-        timing: Timing = Timing(),  # noqa: B008 (frozen)
+        timing: Timing = Timing(),  # noqa: B008 (the default is immutable)
     ) -> None:
         self._connection = Connection(
             Address(robot, host or robot, port, user),

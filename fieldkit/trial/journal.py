@@ -98,10 +98,7 @@ def locked(folder: Path) -> AbstractContextManager[None]:
 
 
 def append(folder: Path, *entries: JournalEntry) -> None:
-    """Add entries to the journal of a trial.
-
-    Raises the same errors as `jsonl.append`.
-    """
+    """Add entries to the journal of a trial. Raises the same errors as `jsonl.append`."""
     jsonl.append(folder / JOURNAL_FILE, *map(_CODEC.dump, entries))
 
 
@@ -127,10 +124,7 @@ def remove_torn_line(folder: Path) -> None:
 
 
 def read(folder: Path) -> list[JournalEntry]:
-    """Return the entries of a trial's journal.
-
-    Raises the same errors as `jsonl.read`.
-    """
+    """Return the entries of a trial's journal. Raises the same errors as `jsonl.read`."""
     return jsonl.read(folder / JOURNAL_FILE, _CODEC.parse, remedy="name the folder of a trial")
 
 

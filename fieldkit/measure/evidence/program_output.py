@@ -54,7 +54,7 @@ def _compile_path(text: str) -> Any:  # noqa: ANN401 (jmespath declares no types
 @cache
 def _compile_expression(text: str) -> Any:  # noqa: ANN401 (re2 declares no types)
     """Return a compiled expression; raises ValueError if the text is not a regular expression."""
-    import re2  # noqa: PLC0415 (as jmespath)
+    import re2  # noqa: PLC0415 (an optional package; see jmespath above)
 
     options = re2.Options()
     options.log_errors = False

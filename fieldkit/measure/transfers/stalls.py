@@ -181,15 +181,14 @@ def read_transfer_deliveries(evidence: AttemptEvidence, transfer: Transfer, list
 
 
 def udp_deliveries(packets: UdpPackets, schedule: FlowSchedule) -> list[Delivery]:
-    """Return the deliveries of a UDP transfer.
-
-    Raises the same errors as `deliveries.udp_delivery`.
-    """
+    """Return the deliveries of a UDP transfer. Raises the same errors as `deliveries.udp_delivery`."""
     return [deliveries.udp_delivery(packets, packets.is_transfer_datagram[:-1], schedule)]
 
 
 def tcp_deliveries(frames: TcpFrames, answers: Packets, schedule: FlowSchedule) -> list[Delivery]:
     """Return the deliveries of each connection of a TCP transfer.
+
+    Raises the same errors as `deliveries.tcp_delivery`.
 
     Args:
         frames: Frames of the connections in both captures.

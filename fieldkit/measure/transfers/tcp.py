@@ -95,10 +95,7 @@ def match_transfer(sender: Packets, receiver: Packets, transfer: Transfer) -> Tc
 
 
 def match_frames(sent: Packets, received: Packets) -> TcpFrames:
-    """Match TCP frames of one direction in both captures.
-
-    Raises the same errors as `match_transfer`.
-    """
+    """Match TCP frames of one direction in both captures. Raises the same errors as `match_transfer`."""
     return TcpFrames(sent, received, match_payload(sent, received), 0)
 
 

@@ -272,10 +272,7 @@ def contradictions(
 
 
 def crc32_of(path: Path) -> int:
-    """Return the CRC-32 of a log.
-
-    Raises the same errors as `reading.mapped`.
-    """
+    """Return the CRC-32 of a log. Raises the same errors as `reading.mapped`."""
     return zlib.crc32(reading.mapped(path))
 
 
@@ -311,7 +308,7 @@ def positions(path: Path, system: int, kind: str) -> list[list[Any]]:
     return rows
 
 
-def _query(path: Path, system: int, **parameters: object) -> Any:  # noqa: ANN401 (JSON)
+def _query(path: Path, system: int, **parameters: object) -> Any:  # noqa: ANN401 (any JSON value)
     try:
         size_bytes = reading.size(path)
         return _READER.query({"path": str(path.absolute()), "system": system, **parameters}, size_bytes)

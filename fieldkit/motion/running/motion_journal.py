@@ -156,10 +156,7 @@ class MotionJournal:
     def add(
         self, event: MotionEvent, robot: str, *, place: str = "", origin: MotionOrigin | None = None, reason: str = ""
     ) -> None:
-        """Add an entry.
-
-        Raises the same errors as `jsonl.append`.
-        """
+        """Add an entry. Raises the same errors as `jsonl.append`."""
         entry = MotionEntry(time.time_ns(), event, robot, place, origin, shorten(reason))
         jsonl.append(self._path, _CODEC.dump(entry))
         self._entries.append(entry)

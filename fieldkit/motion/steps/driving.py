@@ -264,7 +264,7 @@ def _wait_until_ready(scene: Scene, drive_lease: DriveLease, move: Move) -> None
         origins_of(scene).record(move.role, pose)
 
 
-def _out_and_back(  # noqa: PLR0917 (the parts of one motion)
+def _out_and_back(  # noqa: PLR0917 (all of them belong to one motion)
     scene: Scene, testbed: Testbed, shell: Shell, job: Job, drive_lease: DriveLease, move: Move, motion: RobotMotion
 ) -> Iterator[DriveLease]:
     """Drive a robot along its path while the body runs, then back; see `drive_robot`."""

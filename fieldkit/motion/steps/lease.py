@@ -113,10 +113,7 @@ class LeaseKeeper:
         self.renew()
 
     def renew(self) -> bytes:
-        """Renew the last order, and return the content of the output file.
-
-        Raises the same errors as `give_order`.
-        """
+        """Renew the last order, and return the content of the output file. Raises the same errors as `give_order`."""
         return self._send(jobs.REPLY_S)
 
     def pause(self) -> None:

@@ -188,10 +188,7 @@ class FlightLease(LeaseKeeper):
         return shorten(match["reason"]) if match else ""
 
     def release(self) -> None:
-        """Order the program to exit without a command to the drone.
-
-        Raises the same errors as `give_order`.
-        """
+        """Order the program to exit without a command to the drone. Raises the same errors as `give_order`."""
         self.give_order(LEAVE)
 
     @property
@@ -241,10 +238,7 @@ class FlightLease(LeaseKeeper):
         return [[shorten(line, 1000) for line in tail.splitlines()] for tail in tails]
 
     def refresh(self) -> None:
-        """Renew the order with a short timeout.
-
-        Raises the same errors as `give_order`.
-        """
+        """Renew the order with a short timeout. Raises the same errors as `give_order`."""
         self._send(_QUERY_S)
 
     def wait_for(self, mark: str, within_s: float) -> None:

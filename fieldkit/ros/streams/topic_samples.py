@@ -278,10 +278,7 @@ class SampleFlow:
 
 
 def find_heads(path: Path, size_bytes: int) -> Occurrences:
-    """Return the heads of samples with `size_bytes` of data in a capture.
-
-    Raises the same errors as `find_bytes`.
-    """
+    """Return the heads of samples with `size_bytes` of data in a capture. Raises the same errors as `find_bytes`."""
     return find_bytes(path, _LAYOUT.pack(0, 0, size_bytes) + MAGIC)
 
 

@@ -144,7 +144,7 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     @override
     def run(self, scene: Scene, testbed: Testbed, announce: Announce) -> None:
         """Cause the fault in this thread, in which the operator can be prompted; the steps inside run in another."""
-        from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (with logging, 5 ms)
+        from concurrent.futures import ThreadPoolExecutor, wait  # noqa: PLC0415 (it imports logging, which takes 5 ms)
 
         watch, observer = self._watch(scene), self._observer(scene)
         shell = testbed.shells[observer.role]

@@ -75,8 +75,8 @@ class Attempts:
         Raises:
             ConfigurationError: This machine has no space for the evidence.
             FieldkitError: The trial cannot continue. The attempt is stored, but is not one of the allowed attempts.
-            KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but is not one of the allowed attempts. If
-                its steps have ended, `recover` completes the attempt.
+            KeyboardInterrupt: The user pressed Ctrl-C. The attempt is stored, but is not one of the allowed attempts.
+                If its steps have ended, `recover` completes the attempt.
             OSError: The disk is full or was removed.
         """
         self._robots.check_alive()
@@ -119,10 +119,7 @@ class Attempts:
         return failure.remedy if failure else ""
 
     def recover(self, interrupted_attempt: Attempt) -> None:
-        """Complete an attempt during which fieldkit was killed.
-
-        Raises the same errors as `make`.
-        """
+        """Complete an attempt during which fieldkit was killed. Raises the same errors as `make`."""
         self._sink(PhaseStarted("recover", str(interrupted_attempt.repeat)))
         remote, was_measured = (
             interrupted_attempt.remote(self._plan.trial),

@@ -83,10 +83,7 @@ def require_one_place(plans: Sequence[Plan], backend: Backend, operator: Operato
 
 
 def permission(plan: Plan, testbed: Testbed, folder: Path) -> MotionClearance:
-    """Return the permission of a trial.
-
-    Raises the same errors as `MotionSupport.permission`.
-    """
+    """Return the permission of a trial. Raises the same errors as `MotionSupport.permission`."""
     # Even if this trial has no moves, a fault in another trial of its campaign may have stopped a robot.
     has_journal = any((place / laptop_files.MOTION).exists() for place in (folder, folder.parent))
     return (

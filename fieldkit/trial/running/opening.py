@@ -84,7 +84,7 @@ def run(
     ) as testbed:
         try:
             for plan in plans:
-                outcomes.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (used below if a trial stops)
+                outcomes.append(runner.run_trial(plan, testbed, out, sink, stop))  # noqa: PERF401 (needed after an exception)
         except BaseException:
             # `resume` continues only the interrupted trial, so the operator must start the later trials.
             if later_plans := plans[len(outcomes) + 1 :]:

@@ -256,10 +256,7 @@ class Robots:
         self._run_on_all(check_lock)
 
     def stop_jobs(self, remote: str) -> None:
-        """Stop all jobs of an attempt.
-
-        Raises the same errors as `evidence.end_jobs`.
-        """
+        """Stop all jobs of an attempt. Raises the same errors as `evidence.end_jobs`."""
         self._run_on_all(lambda role: evidence.end_jobs(self.shells[role], remote))
 
     def stop_leftover_jobs(self) -> None:

@@ -83,10 +83,7 @@ class PlacementResult:
 
 
 def place(plan: Plan, testbed: Testbed, sink: Sink) -> PlacementResult:
-    """Bring the robots to the places of a trial.
-
-    Raises the same errors as `Testbed.place`.
-    """
+    """Bring the robots to the places of a trial. Raises the same errors as `Testbed.place`."""
     started_s = time.monotonic()
     placement = PlacementResult(testbed.place(plan.placement), time.monotonic() - started_s)
     sink(Placed(placement.answer.skip, placement.answer.note, placement.duration_s))

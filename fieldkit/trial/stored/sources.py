@@ -347,7 +347,7 @@ def _remeasured_tables(tables: Sequence[Path], workers: Workers, note: Note) -> 
     """Return a function that returns the table of a trial, measured again from its raw evidence."""
     if workers.is_default and len(tables) < _IN_PARALLEL:
         return partial(_remeasured_table, note=note)
-    from fieldkit.core.tasks import completed  # noqa: PLC0415 (as for rebuild below)
+    from fieldkit.core.tasks import completed  # noqa: PLC0415 (needed only to measure again)
 
     contents: dict[Path, bytes] = {}
     absolute = [table.absolute() for table in tables]  # workers of a cluster have another working directory
@@ -384,7 +384,7 @@ def _remeasured_table(table: Path, note: Note) -> bytes:
 
 def note_differences(folder: Path, note: Note) -> None:
     """Show a note if the evidence that is measured again has changed since it was first measured."""
-    from fieldkit.trial.stored import verification  # noqa: PLC0415 (as above)
+    from fieldkit.trial.stored import verification  # noqa: PLC0415 (needed only to measure again)
 
     if differences := verification.differences(folder):
         note(f"{folder}: measured from changed evidence: {verification.summarize(differences)}")
