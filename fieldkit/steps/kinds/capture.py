@@ -86,17 +86,21 @@ class CaptureStep(Nest, OverLink, ChecksPlacement, HasNeeds, UsesSpace):
 
     cross_checks = (
         CrossCheck(
-            "packets captured and dropped",
-            ("*_captured", "*_capture_dropped"),
-            "`ROLE.pcap`, `ROLE-capture.log`",
-            (
+            quantity="packets captured and dropped",
+            columns=("*_captured", "*_capture_dropped"),
+            source="`ROLE.pcap`, `ROLE-capture.log`",
+            against=(
                 "each other",
                 "each robot's clock before and after",
                 "the order of times in the file",
                 "checksums of IPv4 headers",
             ),
-            "0.1 s backwards between two packets, because two processors receive them; packets dropped before "
-            "tcpdump if only topics and pings run inside, which withhold the columns that depend on them",
+            tolerance=(
+                "a packet may be 0.1 s earlier than the previous one, because two processors receive them; if only "
+                "topics and pings run inside, packets may be dropped before tcpdump, and the columns that depend on "
+                "them "
+                "are empty"
+            ),
         ),
     )
 

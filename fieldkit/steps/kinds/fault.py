@@ -80,11 +80,11 @@ class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     columns = outage_columns.COLUMNS
     cross_checks = (
         CrossCheck(
-            "outage and recovery",
-            ("*_outage_s", "*_recovery_s", "*_recovery_at_least_s", "*_recovered"),
-            "`fault-KIND-ping.txt`, `fault-KIND-watch.txt`",
-            ("`fault-KIND.txt`: duration of the cause", "termination of the observer's job"),
-            "two intervals of the observer",
+            quantity="outage and recovery",
+            columns=("*_outage_s", "*_recovery_s", "*_recovery_at_least_s", "*_recovered"),
+            source="`fault-KIND-ping.txt`, `fault-KIND-watch.txt`",
+            against=("`fault-KIND.txt`: duration of the cause", "termination of the observer's job"),
+            tolerance="durations may differ by two ping intervals of the observer",
         ),
         *recoveries.CROSS_CHECKS,
     )
