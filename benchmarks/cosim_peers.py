@@ -23,7 +23,7 @@ from typing import Any, Final
 from sim_backends.federates.agent_states import STATE
 
 MESSAGE: Final = bytes(36)
-"""A message with the size of a request to a physics."""
+"""A message with the size of a request to a physics simulator."""
 PEERS: Final = ("helics inproc", "helics zmq_ss", "mosaik inproc", "mosaik subprocess")
 """Without the core `ipc` of HELICS: its broker has one name for the whole machine, so two runs disturb each other."""
 _STATE_NUMBERS: Final = STATE.size // 8

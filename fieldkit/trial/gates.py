@@ -181,7 +181,7 @@ _TESTBED_FILES: Final[tuple[tuple[Callable[[Path], object], str], ...]] = (
 
 
 def _testbed_problems(evidence: AttemptEvidence) -> Iterator[str]:
-    """Yield the problems of the files that the testbed's oracle wrote, if there is an oracle."""
+    """Yield the problems of the files with the data of a modelled radio (`Testbed.oracle`), if there are any."""
     for read, name in _TESTBED_FILES:
         try:
             content = evidence.read(read, name) if evidence.has(name) else None

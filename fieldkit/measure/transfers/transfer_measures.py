@@ -1,8 +1,8 @@
 """All columns of one transfer, computed from files, captures, the output of ping, and counters of the hosts.
 
-The columns of the paper are computed as in the paper, for comparison with the columns of fieldkit. The paper's
-filters are tcpdump's `src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port`
-matches the source or destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
+*The paper* is the publication whose field trials fieldkit automates (docs/index.md). The columns `paper_*` are
+computed as in the paper, for comparison with the columns of fieldkit. The paper's filters are tcpdump's
+`src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches the source or destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
 """
 
 from collections.abc import Mapping

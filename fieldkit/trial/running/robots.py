@@ -115,7 +115,7 @@ class Robots:
         return telemetry_queries.queries_by_role(cast)
 
     def measure(self, scene: Scene, announce: Announce) -> None:
-        """Run all steps, and store the measurements of the testbed's oracle, if it has one.
+        """Run all steps, and store the data of a modelled radio (`Testbed.oracle`), if the radio is not real.
 
         Raises the same errors as `Step.run`.
         """
