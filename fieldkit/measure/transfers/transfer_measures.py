@@ -2,7 +2,8 @@
 
 *The paper* is the publication whose field trials fieldkit automates (docs/index.md). The columns `paper_*` are
 computed as in the paper, for comparison with the columns of fieldkit. The paper's filters are tcpdump's
-`src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches the source or destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
+`src SENDER and port P` at the sender and `dst RECEIVER and port P` at the receiver. `port` matches the source or
+destination port of TCP, UDP or SCTP (pcap-filter(7)), so later fragments do not match.
 """
 
 from collections.abc import Mapping
