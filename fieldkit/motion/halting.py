@@ -75,7 +75,7 @@ def poll_states(shell: Shell, programs: Iterable[str], deadline: Deadline) -> Ha
 def read_liveness(shell: Shell, file: str, deadline: Deadline) -> bytes:
     """Return the liveness file of a drone's pilot and guard, followed by /proc/uptime.
 
-    Raises the errors of `halt_attempt`.
+    Raises the same errors as `halt_attempt`.
     """
     return call(shell, "life_signs", file, deadline=deadline)
 

@@ -105,7 +105,7 @@ class OffboardPilot:
 
         An alarm is logged if the drone does not land.
 
-        Raises the errors of `bring_down`.
+        Raises the same errors as `bring_down`.
         """
         drone = self._drone
         if isinstance(error, FlightError) and error.code == TAKEN_OVER:

@@ -93,8 +93,8 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
     its nose away from the robot at the other end of its link. Real drones need `--allow-motion`. A flight beyond
     `limits` of the profile is refused, and so is a robot whose profile has no `mavlink`. Before the trial and before
     each take-off its autopilot, PX4 or ArduCopter, must report [that it can be
-    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but not a
-    flight inside them. Adds columns of the flight (`fly_height_median_m` and others,
+    armed](mavlink.md#checks-before-a-take-off). A `fault` or a `together` may be inside a flight, but a
+    flight must not be inside them. Adds columns of the flight (`fly_height_median_m` and others,
     [MAVLink](mavlink.md#evidence-of-a-flight)). Writes `fly.jsonl`, `fly.log` and `fly.orders`.
 
     Attributes:
@@ -160,7 +160,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         limits, mavlink = profile.limits, mavlink_of(profile)
         origin = origins_of(scene).get(self.robot)
         return FlightPlan(
-            connection=piloting.connection(scene.robot(self.robot)),
+            connection=piloting.onboard_connection(scene.robot(self.robot)),
             orders=orders_file(self.prefixed_name("fly")),
             abort=abort_of(scene, self.robot).value,
             lease_s=self.lease,
@@ -231,7 +231,7 @@ class FlyStep(Nest, DescribesActions, Moves, ChecksPlacement, HasRefusals, HasNe
         if mavlink_of(profile) is None:
             yield Refusal(self.robot, "it cannot fly: its profile has no mavlink", "use a drone in this role")
         elif not can_fly(scene.robot(self.robot)):
-            remedy = "--allow-motion, if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
+            remedy = "use --allow-motion if its path is clear and a pilot can take over; see: fieldkit docs mavlink"
             yield Refusal(self.robot, "it is a real drone, and flights are not allowed", remedy)
         for quantity, planned_m, limit_m, key in (
             ("height", self._highest_m, limits.max_height_m, "max_height_m"),

@@ -40,7 +40,7 @@ def orders_file(name: str) -> str:
 def start_program(shell: Shell, job: Job) -> Iterator[None]:
     """Install the agent on a robot and start one of its programs, which the body stops.
 
-    Raises the errors of `jobs.start`.
+    Raises the same errors as `jobs.start`.
     """
     agent.install(shell)
     jobs.start(shell, job)

@@ -61,7 +61,7 @@ class MoveStep(
     motion and to bring the robot back. Ground robots that [fieldkit drives](motion.md) move and return automatically,
     with `--allow-motion`, and write `drive.jsonl`. `--dry-run` describes the path. A move may be inside a move of
     another robot; one of the two needs a `name`, because each may write such a file. A `fault` may be inside a move,
-    but not a move inside a fault.
+    but a move must not be inside a fault.
 
     Attributes:
         robot: Role that moves.

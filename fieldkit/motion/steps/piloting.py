@@ -51,7 +51,7 @@ _SEPARATOR: Final = "\x1e"
 _TAILS: Final = 'for name do tail -c 2000 "$name" 2>/dev/null | tr "\\036" " "; printf "\\036"; done'
 
 
-def connection(robot: Robot) -> str:
+def onboard_connection(robot: Robot) -> str:
     """Return the connection from a drone's onboard computer to its autopilot.
 
     Raises:
@@ -95,7 +95,7 @@ def guard_job(
         has_pilot: Whether a pilot program flies the drone, with which the guard shares the liveness file.
     """
     plan = FlightPlan(
-        connection=connection(scene.robot(role)),
+        connection=onboard_connection(scene.robot(role)),
         orders=orders_file(name),
         abort=abort,
         lease_s=lease_s,
@@ -116,7 +116,7 @@ def rescue_job(scene: Scene, role: Role, name: str, guard_name: str, *, abort: s
         abort: Action that ends the flight, a value of `OnAbort`.
     """
     plan = FlightPlan(
-        connection=connection(scene.robot(role)),
+        connection=onboard_connection(scene.robot(role)),
         orders="",
         abort=abort,
         lease_s=0.0,
@@ -227,10 +227,10 @@ class FlightLease(LeaseKeeper):
         """Whether the program refuses to fly because the drone is not at its origin."""
         return any(line.endswith(f" {MISPLACED}") for line in self._lines)
 
-    def tails(self, names: Sequence[str]) -> list[list[str]]:
+    def read_tails(self, names: Sequence[str]) -> list[list[str]]:
         """Return the lines in the last 2,000 bytes of files in the attempt's folder; a missing file has no lines.
 
-        Raises the errors of `give_order`.
+        Raises the same errors as `give_order`.
         """
         files = [f"{self._job.folder}/{name}" for name in names]
         result = self._shell.run(("sh", "-c", _TAILS, "sh", *files), deadline=Deadline.after(_QUERY_S))

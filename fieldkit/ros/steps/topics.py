@@ -238,8 +238,8 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
         """Return the columns of topics, which only trials with this step have."""
         from fieldkit.ros.streams import sample_reads, topic_columns, topic_stalls  # noqa: PLC0415 (only this step)
 
-        of_reads = sample_reads.declare_columns(self._reads_prefix, "topic_sent") if self.reads else ()
-        return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS, *of_reads)
+        read_columns = sample_reads.declare_columns(self._reads_prefix, "topic_sent") if self.reads else ()
+        return (*topic_columns.COLUMNS, *topic_stalls.COLUMNS, *read_columns)
 
     @override
     def check(self, view: View) -> Iterator[str]:

@@ -260,5 +260,5 @@ def converting_write_errors(folder: Path) -> Iterator[None]:
             where=str(error.filename or folder),
             remedy=f"{remedy}, then: {shell_command('fieldkit', 'resume', folder)}"
             if folder.is_dir()
-            else "fieldkit resume FOLDER, with the present path of the folder",
+            else "fieldkit resume FOLDER, with the current path of the folder",
         ) from error
