@@ -180,7 +180,7 @@ def _stream_video(arguments: Arguments, stop_event: threading.Event, path: str, 
     from fieldkit.agent.messaging import rtp_stream  # noqa: PLC0415 (loaded only if needed)
 
     log = Log(path)
-    log.origin(time.time_ns(), records.PUBLISHER if sends else records.SUBSCRIBER, rtp_stream.NAME)
+    log.write_role(time.time_ns(), records.PUBLISHER if sends else records.SUBSCRIBER, rtp_stream.NAME)
     log.note(records.DISCOVERY_STARTED, time.time_ns())
     transfer = rtp_stream.send if sends else rtp_stream.receive
     transfer(rtp_stream.Video(**arguments), log, stop_event)

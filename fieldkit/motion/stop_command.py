@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 @contextmanager
 def _robots(arguments: argparse.Namespace) -> Iterator[Robots]:
-    """Yield the robots that the options or the site file select: real robots, or those of another backend or a lab."""
+    """Yield the robots that the options or the site file select: real robots, or those of a lab or of a backend."""
     path: Path | None = arguments.site
     if path is None and Path(SITE_FILE).is_file():
         path = Path(SITE_FILE)

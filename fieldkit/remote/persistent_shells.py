@@ -66,7 +66,7 @@ class ShellPool:
         return command
 
     def restore(self, link: Link, command: str) -> None:
-        """Start to open a shell with `command` if `link` has too few, unless an earlier attempt on this link failed."""
+        """Start to open a shell with `command` if `link` has too few, unless an earlier attempt on it failed."""
         with self._lock:
             if self._link is not link:
                 self._link, self._shells, self._opening = link, [], False
