@@ -136,9 +136,9 @@ def _frames(file: IO[bytes], size: int) -> Iterator[bytes]:
 
 def _write_all(file: IO[bytes], data: bytes) -> None:
     """Write to a pipe, which may accept only a part of the data at a time."""
-    rest = memoryview(data)
-    while rest:
-        rest = rest[file.write(rest) :]
+    remaining_data = memoryview(data)
+    while remaining_data:
+        remaining_data = remaining_data[file.write(remaining_data) :]
 
 
 @contextmanager

@@ -350,6 +350,6 @@ class TopicsStep(StreamOptions, AlongStep, Prepares, HasNeeds, UsesSpace, Listen
             yield f"topic loss {100 * loss:.1f} %"
         if isinstance(delay_s := values.get("topic_delay_median_s"), float):
             yield f"topic delay {1e3 * delay_s:.1f} ms"
-        for name, text in (("seen_age_p95_s", "age of what is seen"), ("used_age_p95_s", "age of what is used")):
+        for name, text in (("seen_age_p95_s", "age of displayed frames"), ("used_age_p95_s", "age of used samples")):
             if isinstance(age_s := values.get(name), float):
                 yield f"{text} {1e3 * age_s:.1f} ms"
