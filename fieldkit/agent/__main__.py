@@ -109,7 +109,7 @@ def _drive(arguments: Arguments, stop_event: threading.Event, path: str) -> int:
 
 
 def _fly(arguments: Arguments, stop_event: threading.Event) -> int:
-    """Fly a drone, guard it or rescue it, as the plan requires; return the exit code."""
+    """Run the pilot, the guard or the rescue program of a flight; return the exit code."""
     from fieldkit.agent.flying import flight, flight_plan  # noqa: PLC0415 (each subcommand loads only its modules)
 
     with _add_connection_to_errors(arguments["connection"]):

@@ -54,7 +54,7 @@ class Scale:
         return f"{label} ({self.unit})" if self.unit else label
 
     def interval(self, low: float | None, high: float | None) -> str:
-        """Return `[low, high]`, `[low, ...)` if the upper end is open, or an empty text without an interval."""
+        """Return `[low, high]`, `[low, ...)` if the upper end is open, or an empty string without an interval."""
         if low is None:
             return ""
         return f"[{self.number(low)}, ...)" if high is None else f"[{self.number(low)}, {self.number(high)}]"

@@ -50,7 +50,7 @@ _NUMBER: Final = re.compile(r"[+-]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][+-]?[
 _MAX_INT_DIGITS: Final = 19  # digits of the largest 64-bit integer
 _BOOL_TEXTS: Final = frozenset(("true", "True", "TRUE", "1", "false", "False", "FALSE", "0"))
 MISSING: Final = ("", "nan", "NaN")
-"""Texts of a cell without a value; fieldkit itself writes the empty text."""
+"""Texts of a cell without a value; fieldkit itself writes the empty string."""
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]*(?:\.[a-z][a-z0-9_]*)*")
 _MAX_LENGTHS: Final = {"name": 100, "unit": 20, "meaning": 1000, "label": 100}

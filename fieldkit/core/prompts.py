@@ -100,7 +100,7 @@ class Operator(Protocol):
 
 
 class Unattended(Operator):
-    """Substitute for the operator with `--yes`: each request is done, and each question has its default answer."""
+    """Substitute for the operator with `--yes`: requests count as done, and questions have their default answer."""
 
     @override
     def ask(self, request: str, *, may_skip: bool = False) -> Answer:

@@ -121,7 +121,9 @@ def _lab_lock(folder: LabFolder) -> Iterator[None]:
         try:
             stack.enter_context(runtime.hold_lock(folder.lock_name))
         except NameHeldError as error:
-            raise ConfigurationError("this directory has a lab that is up", remedy="fieldkit lab down") from error
+            raise ConfigurationError(
+                "a lab is already running in this directory", remedy="fieldkit lab down"
+            ) from error
         yield
 
 

@@ -1,4 +1,4 @@
-"""The job script on a robot: installed once per version, and called for all tasks that must survive a connection."""
+"""The job script on a robot: installed once per version, and called for all tasks that must outlive a connection."""
 
 import hashlib
 import re
@@ -47,7 +47,7 @@ _COPY_SCRIPT: Final = (
 )
 
 _MISSING_PROGRAM: Final = b"it lacks "
-_INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a whole busybox"
+_INSTALL: Final = "install it: apt-get install util-linux coreutils gawk grep tar, or a full busybox"
 _GREETING_BYTES: Final = 60
 _READ_ONLY_REMEDY: Final = "on the robot: dmesg | tail; a failing SD card becomes read-only, so save its data"
 

@@ -84,16 +84,16 @@ class SshShell:
         return self._connection.address.ssh_arguments
 
     def begin(self, argv: Sequence[str], *, deadline: Deadline, until: bytes | None = None) -> "SshSession":
-        """Start a command and return when the robot has accepted it, or has written `until`; as `Shell.begin`."""
+        """Start a command and return when the robot has accepted it, or has written `until`; see `Shell.begin`."""
         return self._begin(argv, deadline, ends_on_request=until is None, until=until or b"")
 
     def run(self, argv: Sequence[str], *, deadline: Deadline, stdin: bytes = b"", check: bool = True) -> Completed:
-        """Run a command and wait for its end; as `Shell.run`."""
+        """Run a command and wait for its end; see `Shell.run`."""
         session = self._begin(argv, deadline, has_input=bool(stdin))
         return session.end(deadline=deadline, stdin=stdin, check=check)
 
     def fetch(self, argv: Sequence[str], to: Path, *, deadline: Deadline, limit_bytes: int) -> Completed:
-        """Run a command and write its standard output to a file; as `Shell.fetch`."""
+        """Run a command and write its standard output to a file; see `Shell.fetch`."""
         session = self._begin(argv, deadline)
         with to.open("wb") as out:
             return session.end(deadline=deadline, out=out, limit_bytes=limit_bytes)
@@ -128,7 +128,7 @@ class SshShell:
         return self._connection.run_with_retries(attempt, deadline)
 
     def silence(self, seconds: float) -> contextlib.AbstractContextManager[None]:
-        """Keep the connection silent during the body, if it crosses the radio under test; as `Shell.silence`."""
+        """Keep the connection silent during the body, if it crosses the radio under test; see `Shell.silence`."""
         return self._connection.silence(seconds)
 
     def close(self) -> None:
@@ -174,7 +174,7 @@ class SshSession:
         out: IO[bytes] | None = None,
         limit_bytes: int = _MAX_OUTPUT_BYTES,
     ) -> Completed:
-        """Wait for the end of the command; as `Session.end`, `Shell.run` and `Shell.fetch`.
+        """Wait for the end of the command; see `Session.end`, `Shell.run` and `Shell.fetch`.
 
         Args:
             deadline: When to give up.

@@ -21,7 +21,7 @@ from fieldkit.analysis.one_sided_bounds import share_low
 from fieldkit.analysis.repeats import SOURCE, Repeats
 from fieldkit.measure.evidence import reading
 from fieldkit.ros.middlewares.middleware import MiddlewareName
-from fieldkit.ros.recommendation.link_cells import LinkCell, LinkCriterion, figure, link_cell, topic_columns
+from fieldkit.ros.recommendation.link_cells import LinkCell, LinkCriterion, estimate_text, link_cell, topic_columns
 from fieldkit.ros.streams.stream_options import StreamOptions
 from fieldkit.steps.base import Step
 from fieldkit.trial.stored import plans
@@ -193,6 +193,6 @@ def evidence(assessment: Assessment, criterion: LinkCriterion) -> Iterator[str]:
                 met, n = judgement.met, judgement.estimate.n
                 share_text = f"at least {100 * share_low(met, n):.0f} % of all repeats, with 95 % confidence"
                 yield f"  {judgement.expectation.text} in {met} of {n} repeats: in {share_text}"
-        yield f"  loss in %: {figure(cell.loss, 100.0)}"
-        yield f"  95th percentile of the sample delay in ms: {figure(cell.delay, 1e3)}"
+        yield f"  loss in %: {estimate_text(cell.loss, 100.0)}"
+        yield f"  95th percentile of the sample delay in ms: {estimate_text(cell.delay, 1e3)}"
         yield f"  trials: {', '.join(cell.sources)}"
