@@ -74,7 +74,7 @@ def _report_outcome(outcome: "CampaignOutcome", file: Path, folder: Path) -> int
     if outcome.unmet:
         unmet = format_count(outcome.unmet, "expectation")
         show_error(
-            f"{unmet} not shown to hold\n  remedy: {shell_command('fieldkit', 'aggregate', folder)} lists them"
+            f"{unmet} not met or undecided\n  remedy: {shell_command('fieldkit', 'aggregate', folder)} lists them"
         )
     if outcome.failed:
         return EvidenceError.exit_code

@@ -47,7 +47,7 @@ def rebuild(folder: Path) -> RebuildResult:
             "the evidence has changed since it was measured, so the tables are not rebuilt: "
             f"{verification.summarize(differences)}",
             where=str(folder),
-            remedy="restore it from a copy; or show the results of the present evidence: "
+            remedy="restore it from a copy; or show the results of the current evidence: "
             + shell_command("fieldkit", "aggregate", folder, "--rebuild"),
         )
     names = (store.TRIAL_CSV, store.SUMMARY_CSV)
