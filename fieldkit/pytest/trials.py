@@ -1,4 +1,4 @@
-"""Complete trials in tests. They run like those of `fieldkit trial`, and are returned like those of `fieldkit.load`."""
+"""Complete trials in tests. They run like those of `fieldkit trial`, and are returned as by `fieldkit.load`."""
 
 import argparse
 from collections.abc import Iterable, Sequence
