@@ -79,7 +79,7 @@ ATTEMPT_CHECKS: Final = (
         columns=("emulator_*", "sender_*", "receiver_*"),
         source="`lateness.txt`, `link.csv`; `ROLE-link.txt` of a robot",
         against=(),
-        tolerance="only the testbed or the radio's driver measures them",
+        tolerance="only the emulator or the radio's driver measures them",
         outcome=CheckOutcome.UNCHECKED,
     ),
 )

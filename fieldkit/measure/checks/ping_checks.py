@@ -151,6 +151,16 @@ CROSS_CHECKS: Final = (
         against=("the procedure", "each capture: size of echoes"),
         tolerance="none",
     ),
+    CrossCheck(
+        quantity="copies over several links",
+        columns=("rtt_duplicates",),
+        source="captures on all interfaces: interface of each echo",
+        against=("`ping.txt`: replies with `(DUP!)`", "receiver's capture: at most one reply per received request"),
+        tolerance=(
+            "ping may not count a copy that arrives in its last 0.1 s, or later than one interval after the last "
+            "request; fragmented requests are not compared"
+        ),
+    ),
 )
 
 
