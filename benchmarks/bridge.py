@@ -245,9 +245,9 @@ class RunningPath:
 
     def run(self, duration_s: float, rate_hz: float) -> tuple[int, list[tuple[int, int]]]:
         """Send; return the number of messages, and the arrival time and delay of each received one in ns."""
-        sent = int(_query(self.publisher, f"{duration_s} {rate_hz}"))
+        sent_count = int(_query(self.publisher, f"{duration_s} {rate_hz}"))
         time.sleep(SETTLING_S)
-        return sent, json.loads(_query(self.subscriber, "report"))
+        return sent_count, json.loads(_query(self.subscriber, "report"))
 
 
 def _query(process: "subprocess.Popen[str]", line: str) -> str:

@@ -144,9 +144,11 @@ def _last_line(folder: Path, variables: Mapping[str, str], *words: str) -> tuple
     Returns:
         True if it succeeded, and the last line of its output.
     """
-    done = subprocess.run((sys.executable, *words), env=dict(variables), capture_output=True, text=True, check=False)
-    (folder / f"{words[1]}.txt").write_text(done.stdout + done.stderr, encoding="utf-8")
-    return not done.returncode, (done.stdout.strip() or done.stderr.strip()).rpartition("\n")[2]
+    completed = subprocess.run(
+        (sys.executable, *words), env=dict(variables), capture_output=True, text=True, check=False
+    )
+    (folder / f"{words[1]}.txt").write_text(completed.stdout + completed.stderr, encoding="utf-8")
+    return not completed.returncode, (completed.stdout.strip() or completed.stderr.strip()).rpartition("\n")[2]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -75,8 +75,12 @@ def messages(folder: Path, plan: Plan) -> Iterator[Message]:
             "no repeat has ended yet", where=str(folder), remedy=shell_command("fieldkit", "resume", folder)
         )
     # Planned and measured positions have different origins, so a file has only one kind.
-    places = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
-    has_positions = any((place / name).exists() for place in places for name in (track.FILE, position_sources.FILE))
+    folders = (folder, *(store.attempt_folder(folder, attempt.folder) for attempt in attempts))
+    has_positions = any(
+        (position_folder / name).exists()
+        for position_folder in folders
+        for name in (track.FILE, position_sources.FILE)
+    )
     ended_ns = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status in FINAL_STATUSES}
 
     @lru_cache(maxsize=_OPEN_ATTEMPTS)

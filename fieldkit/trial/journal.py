@@ -113,9 +113,13 @@ def reopen_failed(folder: Path, plan: Plan) -> int:
     """
     remove_torn_line(folder)
     now = time.time_ns()
-    failed = [attempt.repeat for attempt in ended_attempts(history(folder, plan)) if attempt.status is Status.FAILED]
-    append(folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed))
-    return len(failed)
+    failed_repeats = [
+        attempt.repeat for attempt in ended_attempts(history(folder, plan)) if attempt.status is Status.FAILED
+    ]
+    append(
+        folder, *(JournalEntry(now, repeat.protocol, repeat.number, 0, Status.PLANNED) for repeat in failed_repeats)
+    )
+    return len(failed_repeats)
 
 
 def remove_torn_line(folder: Path) -> None:
@@ -170,7 +174,9 @@ def _impossible_entries(entries: list[JournalEntry], plan: Plan) -> Iterator[tup
 
 def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that ended, in the order of their ends. Failed attempts of a reopened repeat are void."""
-    started = {(entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING}
+    start_ns_by_attempt = {
+        (entry.repeat, entry.attempt): entry.utc_ns for entry in entries if entry.status is Status.RUNNING
+    }
     planned_at = {entry.repeat: line for line, entry in enumerate(entries) if entry.status is Status.PLANNED}
 
     def to_attempt(entry: JournalEntry, *, is_before_reopening: bool) -> Attempt:
@@ -178,7 +184,7 @@ def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
         return Attempt(
             repeat=entry.repeat,
             number=entry.attempt,
-            started_utc_ns=started[entry.repeat, entry.attempt],
+            started_utc_ns=start_ns_by_attempt[entry.repeat, entry.attempt],
             status=Status.VOID if reopened else entry.status,
             reason=entry.reason,
             excused=entry.excused or is_before_reopening,
@@ -194,14 +200,14 @@ def ended_attempts(entries: list[JournalEntry]) -> list[Attempt]:
 
 def interrupted_attempts(entries: list[JournalEntry]) -> list[Attempt]:
     """Return the attempts that did not end because fieldkit was killed; their status is `running` or `measured`."""
-    ended = {(attempt.repeat, attempt.number) for attempt in ended_attempts(entries)}
-    started = {
+    ended_keys = {(attempt.repeat, attempt.number) for attempt in ended_attempts(entries)}
+    start_ns_by_attempt = {
         (entry.repeat, entry.attempt): entry.utc_ns
         for entry in entries
-        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended
+        if entry.status is Status.RUNNING and (entry.repeat, entry.attempt) not in ended_keys
     }
-    measured = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
+    measured_keys = {(entry.repeat, entry.attempt) for entry in entries if entry.status is Status.MEASURED}
     return [
-        Attempt(repeat, number, utc_ns, Status.MEASURED if (repeat, number) in measured else Status.RUNNING)
-        for (repeat, number), utc_ns in started.items()
+        Attempt(repeat, number, utc_ns, Status.MEASURED if (repeat, number) in measured_keys else Status.RUNNING)
+        for (repeat, number), utc_ns in start_ns_by_attempt.items()
     ]

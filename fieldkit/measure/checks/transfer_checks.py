@@ -64,10 +64,12 @@ def find_contradictions(
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> _Files | None:
-    sent = evidence.read_or_none(reading.size, transfer.sent_file)
-    received = evidence.read_or_none(reading.size, transfer.received_file)
-    common = evidence.read_or_none(reading.common_prefix_bytes, "", transfer.sent_file, transfer.received_file)
-    return None if sent is None or received is None or common is None else _Files(sent, received, common)
+    sent_bytes = evidence.read_or_none(reading.size, transfer.sent_file)
+    received_bytes = evidence.read_or_none(reading.size, transfer.received_file)
+    common_bytes = evidence.read_or_none(reading.common_prefix_bytes, "", transfer.sent_file, transfer.received_file)
+    if sent_bytes is None or received_bytes is None or common_bytes is None:
+        return None
+    return _Files(sent_bytes, received_bytes, common_bytes)
 
 
 def _earlier_traffic(sender: Packets, receiver: Packets, transfer: Transfer) -> str | None:

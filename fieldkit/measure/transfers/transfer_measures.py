@@ -133,13 +133,13 @@ def loss(arrived: int | None, sent: int | None) -> float | None:
 
 
 def _files(evidence: AttemptEvidence, transfer: Transfer) -> Measured:
-    sent = evidence.read_or_none(reading.size, transfer.sent_file)
-    received = evidence.read_or_none(reading.size, transfer.received_file)
+    sent_bytes = evidence.read_or_none(reading.size, transfer.sent_file)
+    received_bytes = evidence.read_or_none(reading.size, transfer.received_file)
     contents = evidence.read_or_none(recordings.read, transfer.sent_file)
     files: dict[str, Value | None] = {
-        "sent_bytes": sent,
-        "received_bytes": received,
-        "file_loss": loss(received, sent),
+        "sent_bytes": sent_bytes,
+        "received_bytes": received_bytes,
+        "file_loss": loss(received_bytes, sent_bytes),
         "hash_match": evidence.read_or_none(reading.have_equal_bytes, "", transfer.sent_file, transfer.received_file),
     }
     messages: dict[str, Value | None] = {

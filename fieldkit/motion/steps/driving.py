@@ -139,10 +139,10 @@ def _origin(scene: Scene, move: Move) -> dict[str, Any]:
     origin, last = origins.get(move.role), origins.last(move.role)
     if origin is None or not origins.robots_stay:
         return {}
-    places = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
+    origin_fields = {"origin": (origin.x_m, origin.y_m, origin.heading_rad)}
     if last is not None:
-        places["last"] = (last.x_m, last.y_m, last.heading_rad)
-    return {**places, "frame_id": origin.frame_id, "may_return": origins.may_return}
+        origin_fields["last"] = (last.x_m, last.y_m, last.heading_rad)
+    return {**origin_fields, "frame_id": origin.frame_id, "may_return": origins.may_return}
 
 
 def _task(robot: Robot, move: Move) -> dict[str, Any]:
