@@ -103,7 +103,7 @@ def exchanged(cable: Cable, tmp_path: Path, middleware_name: str, **network: obj
     assert subscriber.returncode == 0
     left, arrived = topic_logs.rows(sent), topic_logs.rows(received)
     kinds = [row[0] for row in left if row[0] != records.SKIPPED]
-    assert kinds[:3] == [records.ORIGIN, records.DISCOVERY_STARTED, records.MATCHED]
+    assert kinds[:3] == [records.WRITER, records.DISCOVERY_STARTED, records.MATCHED]
     expected = [row[2:5] for row in left if row[0] == records.SAMPLE]
     assert expected
     assert [row[2:5] for row in arrived if row[0] == records.SAMPLE] == expected

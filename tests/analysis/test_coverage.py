@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilsons
+from fieldkit.analysis.statistics import Intervals, assured, mean_shares, means, medians, shares, wilson_intervals
 from tests.helpers.nightly import mark_nightly
 
 CELLS: Final = 4000  # leaves a standard error of 0.35 % at a coverage of 95 %
@@ -70,7 +70,7 @@ def test_shares_cover_for_any_burst_length(
         lost = lost_in_bursts(random, rate, burst, (CELLS, REPEATS), packets)
         sent = np.full(lost.shape, packets)
         coverages.append(covered(shares(lost, sent), rate))
-        naive.append(covered(wilsons(lost.sum(axis=1), sent.sum(axis=1)), rate))
+        naive.append(covered(wilson_intervals(lost.sum(axis=1), sent.sum(axis=1)), rate))
     record_property(
         "result", f"share, 20 repeats of {packets}, {rate:.0%} lost, bursts {BURSTS}: {rounded(coverages)}"
     )

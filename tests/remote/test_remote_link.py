@@ -429,7 +429,7 @@ def notices() -> list[str]:
 
 @pytest.fixture
 def shell(server: Server, line: CuttableLine, notices: list[str]) -> Iterator[SshShell]:
-    test_shell = server.shell(connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append)
+    test_shell = server.shell(connect=line.connect, timing=QUICK, reconnect_timeout_s=SOON, on_notice=notices.append)
     yield test_shell
     test_shell.close()
 
@@ -565,7 +565,7 @@ def test_robot_that_refuses_logins_while_it_boots_is_retried(
         return ssh_server(stream, rsa, "refuse" if len(logins) in {2, 3} else "never")
 
     fake = fakes(serve)
-    shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, notice=notices.append)
+    shell = server.shell(connect=fake.connect, host_key=pinned(rsa), timing=QUICK, on_notice=notices.append)
     shell.begin(("true",), deadline=soon())
     logins[0].shutdown(socket.SHUT_RDWR)
     wait_until(lambda: not is_up(shell), soon())
@@ -639,14 +639,16 @@ def test_link_over_the_radio_is_not_reopened_during_a_measurement(
     ends_by: str,
 ) -> None:
     shell = server.shell(
-        connect=line.connect, timing=QUICK, patience_s=SOON, notice=notices.append, crosses_radio=True
+        connect=line.connect, timing=QUICK, reconnect_timeout_s=SOON, on_notice=notices.append, crosses_radio=True
     )
     session = shell.begin(waiting.argv, deadline=soon())
     with shell.silence(SOON if ends_by == "the body" else HANGS_S):
         line.cut()
         done = pool.submit(session.end, deadline=soon())
         wait_until(lambda: bool(notices), soon())
-        assert re.match("robot: the link is lost; for .* at most its radio is being measured", notices[0])
+        assert re.match(
+            "robot: the link is lost; it is not reopened while its radio is being measured, for up to .*", notices[0]
+        )
         assert line.tries == 1
         if ends_by == "its time":
             clock.start()
@@ -704,7 +706,7 @@ def test_silence_lasts_until_the_latest_end(server: Server) -> None:
 
 
 def test_patience_applies_once_per_loss_of_the_link(shell: SshShell, line: CuttableLine, server: Server) -> None:
-    impatient = server.shell(connect=line.connect, timing=QUICK, patience_s=2.0)
+    impatient = server.shell(connect=line.connect, timing=QUICK, reconnect_timeout_s=2.0)
     assert impatient.run(("echo", "up"), deadline=soon()).stdout == b"up\n"
     line.open = False
     line.cut()
@@ -775,7 +777,7 @@ def test_close_ends_a_waiting_command(shell: SshShell, waiting: WaitingCommand, 
 def test_close_ends_the_wait_for_a_lost_link(
     server: Server, line: CuttableLine, waiting: WaitingCommand, notices: list[str], pool: ThreadPoolExecutor
 ) -> None:
-    shell = server.shell(connect=line.connect, patience_s=60.0, notice=notices.append)
+    shell = server.shell(connect=line.connect, reconnect_timeout_s=60.0, on_notice=notices.append)
     done = pool.submit(shell.run, waiting.argv, deadline=soon())
     waiting.wait_for_starts(1)
     line.open = False

@@ -131,7 +131,7 @@ def test_missing_keyring_entry_is_reported_with_a_command(
     if path == "with":
         program.touch(mode=0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigurationError, match=r"no password of duckie@192\.168\.4\.1") as caught:
+    with pytest.raises(ConfigurationError, match=r"no password for duckie@192\.168\.4\.1") as caught:
         passwords.read_from_keyring("duckie", "192.168.4.1", "duckiedrone-1")
     keyring_of = "keyring" if path == "with" else f"{shlex.quote(sys.executable)} -m keyring"
     assert caught.value.remedy == f"{keyring_of} set fieldkit duckie@192.168.4.1"
