@@ -18,7 +18,7 @@ EXAMPLE = ROOT / "docs" / "examples" / "teleop"
 
 @pytest.fixture(scope="module")
 def python(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return wheels.installed(tmp_path_factory.mktemp("wheel"))
+    return wheels.install_wheel(tmp_path_factory.mktemp("wheel"))
 
 
 def page(python: Path, topic: str) -> Path:
@@ -44,7 +44,7 @@ def test_a_topic_is_an_installed_page_about_it(python: Path, topic: str, text: s
 
 
 def test_every_link_leads_to_an_installed_page(python: Path) -> None:
-    assert site_links.broken(page(python, "index").parent) == []
+    assert site_links.broken_links(page(python, "index").parent) == []
 
 
 def test_search_works_from_files(python: Path) -> None:

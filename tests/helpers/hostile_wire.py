@@ -1,7 +1,7 @@
 """A malicious host on the cable: `python -m tests.helpers.hostile_wire ATTACK ARGUMENT...`.
 
 `rtps COUNT` captures messages of other hosts and sends them again with changes. `heartbeat` sends one message in the
-name of the writer of a stream, which states that its oldest sample has a very high sequence number.
+name of the writer of a stream; it states that the oldest sample of the writer has a very high sequence number.
 `tcpros MASTER HOST:PORT...` connects to nodes and sends data that is not valid TCPROS, and registers publishers that
 do the same. The program prints `done` at its end.
 """
@@ -39,7 +39,7 @@ Datagram = tuple[tuple[str, int], bytes]
 
 
 def captured_messages() -> list[Datagram]:
-    """Captured RTPS messages of other hosts with their destination."""
+    """Capture RTPS messages of other hosts, and return each with its destination."""
     messages: list[Datagram] = []
     with socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_ALL)) as capture:
         while len(messages) < _SEEDS:

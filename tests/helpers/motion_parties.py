@@ -1,4 +1,4 @@
-"""Processes of the parties of a motion trial on emulated robots, and signals to them."""
+"""The processes of the parties of a motion trial with emulated robots, and signals to these processes."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def command_line(pid: int) -> list[str]:
 
 
 def agents_on(robot_pid: int) -> dict[int, list[str]]:
-    """The programs of fieldkit that run on a robot: command and arguments by process id.
+    """The command and arguments of each program of fieldkit that runs on a robot, by process id.
 
     Args:
         robot_pid: The outermost process of the robot, the ancestor of all its processes.

@@ -1,7 +1,7 @@
-"""All outputs of fieldkit for the stored trials as texts, for comparisons between versions of the code.
+"""All outputs of fieldkit for the stored trials as texts, for comparisons between versions of fieldkit.
 
-Run this file with the Python of the version to record: `python -P tests/helpers/stored_trials.py FOLDER` writes the
-texts to FOLDER. It imports no test modules, so any version can run it.
+`python -P tests/helpers/stored_trials.py FOLDER` writes the texts to FOLDER. Run it with the Python in whose
+environment the version to record is installed. It imports no test modules, so each version can run it.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ TRIALS: Final = STORED / "trials"
 OUTPUTS: Final = STORED / "outputs"
 
 _SKIPPED_ELEMENTS: Final = frozenset(("style", "script", "svg"))
-"""Elements of the page whose text is not prose, such as the letters that matplotlib draws."""
+"""Elements of the page without prose, such as the letters that matplotlib draws."""
 
 
 @contextlib.contextmanager
@@ -120,12 +120,12 @@ def _timeline(trial: Path) -> dict[str, Any]:
 
 
 def _float(text: str) -> float:
-    """A number with 12 digits: numpy sums in a different order on processors with wider vectors."""
+    """A number with 12 digits, because numpy sums in a different order on processors with wider vectors."""
     return float(f"{float(text):.12g}")
 
 
 class _Page(HTMLParser):
-    """Collects the texts, links and bar lengths of a page, one per line."""
+    """Collects the texts, links and bar lengths of a page as lines."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -174,8 +174,8 @@ def _figures(report_contents: contents.Contents) -> Iterator[dict[str, Any]]:
             }
 
 
-def _plain(value: Any) -> Any:  # noqa: ANN401 (whatever a chart is made of)
-    """Lists, texts and numbers with 9 digits, without field names, so that names and processors have no effect."""
+def _plain(value: Any) -> Any:  # noqa: ANN401 (any part of a chart)
+    """A value as lists, texts and numbers with 9 digits, so that field names and processors have no effect."""
 
     if dataclasses.is_dataclass(value):
         values = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}

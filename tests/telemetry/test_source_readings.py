@@ -12,7 +12,7 @@ from fieldkit.remote.script import SCRIPT
 from fieldkit.telemetry import source_readings
 from fieldkit.telemetry.source_readings import SourceReadings
 from fieldkit.telemetry.telemetry_section import TelemetrySource
-from tests.helpers.host import ENDED
+from tests.helpers.host import EXITED_STATES
 from tests.helpers.sshd import wait_until
 
 SHELLS = {"dash": ("dash",), "bash": ("bash", "--posix"), "busybox": ("busybox", "sh")}
@@ -39,7 +39,7 @@ def run_once(script: tuple[str, ...], *argv: str, address: str = "-", tested: st
 def has_ended(pid: int) -> bool:
     """True if a process has ended; it may remain as a zombie if its parent has ended before."""
     try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in ENDED
+        return Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[0] in EXITED_STATES
     except OSError:
         return True
 

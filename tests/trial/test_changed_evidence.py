@@ -52,7 +52,7 @@ def test_a_source_changed_at_random_never_moves_a_column_of_a_valid_repeat(
     other = attempt(next(candidate for candidate in Protocol if candidate is not protocol))
     kind, name, content = next(changes(attempt(protocol), other, random.Random(seed)))
     verdict = attempt(protocol).judge_changed(name, content, tmp_path_factory.mktemp("changed"))
-    assert attempt(protocol).wrongly_changed(verdict) == {}, (kind, name)
+    assert attempt(protocol).undetected_changes(verdict) == {}, (kind, name)
 
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -63,7 +63,7 @@ def test_one_wrong_time_in_a_capture_never_moves_the_clock_offset_beyond_its_err
     name = f"{role}.pcap"
     changed = with_wrong_time((attempt(protocol).folder / name).read_bytes(), index, microseconds)
     verdict = attempt(protocol).judge_changed(name, changed, tmp_path_factory.mktemp("changed"))
-    assert attempt(protocol).wrongly_changed(verdict) == {}
+    assert attempt(protocol).undetected_changes(verdict) == {}
 
 
 def require_problem(protocol: Protocol, name: str, change: Change | None, place: Path, reason: str) -> None:

@@ -19,7 +19,7 @@ from tests.helpers.cut_trials import (
     OUT,
     calls_of_a_trial,
     cuts_at_every_sync,
-    cuts_in_a_row,
+    lose_power_repeatedly,
     robots_with_much_evidence,
 )
 from tests.helpers.disks import FILE_SYSTEMS, STRICTEST, Disk, FileSystem, mount_workspace
@@ -82,7 +82,7 @@ def test_a_power_cut_at_any_write_loses_nothing_that_was_reported(place: Path, f
     resumed = []
     for cut in cuts:
         with cut.disk.repair().mounted(place / "elsewhere") as mounted:
-            assert cut.lost(mounted / OUT, witness) == []
+            assert cut.lost_files(mounted / OUT, witness) == []
             left = read_tree(mounted / OUT)
             if not any((mounted / OUT).glob("*/trial.yaml")):
                 assert not cut.reported
@@ -106,12 +106,12 @@ def test_removing_any_sync_is_detected(place: Path) -> None:
 @strictest_in_ci
 def test_consecutive_cuts_at_random_moments_lose_nothing(place: Path, file_system: FileSystem) -> None:
     draw, calls = random.Random(file_system.name), calls_of_a_trial(place)
-    assert sum(cuts_in_a_row(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
+    assert sum(lose_power_repeatedly(file_system, place, draw, calls=calls, most=4) for _ in range(3)) > 3
 
 
 def _describe_losses(place: Path, cut: PowerCut, witness: VersionRecorder) -> list[str]:
     with cut.disk.repair().mounted(place / "elsewhere") as mounted:
-        return cut.lost(mounted / OUT, witness)
+        return cut.lost_files(mounted / OUT, witness)
 
 
 def test_a_killed_test_leaves_no_mounts(tmp_path: Path) -> None:

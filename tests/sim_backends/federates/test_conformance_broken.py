@@ -397,7 +397,7 @@ PHYSICS_CASES = [
     BrokenFederate(
         "fork_absence", replace(physics(Carts, forks=False), alter=as_answer(MessageKind.DONE)), "it must refuse fork"
     ),
-    BrokenFederate("bye", replace(physics(Carts), stays=True), "it has not closed the connection"),
+    BrokenFederate("bye", replace(physics(Carts), stays_open=True), "it has not closed the connection"),
     BrokenFederate("start", physics(StartsElsewhere), "ann starts 1 m away"),
     BrokenFederate("remainders", replace(physics(Carts), alter=later(MessageKind.STATES, 1)), "instead of 0 ns"),
     BrokenFederate("remainders", physics(LosesAnAgent), "there is no state of bob"),
@@ -457,7 +457,7 @@ NETWORK_CASES = [
         replace(physics(DelayNetwork, forks=False), alter=as_answer(MessageKind.DONE)),
         "it must refuse fork",
     ),
-    BrokenFederate("bye", replace(physics(DelayNetwork), stays=True), "it has not closed the connection"),
+    BrokenFederate("bye", replace(physics(DelayNetwork), stays_open=True), "it has not closed the connection"),
     BrokenFederate("first_request", physics(RefusesNegativeTimes), "ValueError: negative"),
     BrokenFederate(
         "exactly_once", replace(physics(DelayNetwork), alter=later(MessageKind.OUTCOMES, 1)), "but advanced to"

@@ -152,13 +152,13 @@ def test_a_robot_hits_the_wall_and_is_put_elsewhere(physics: str, tmp_path: Path
     """The wall of the lawn begins at 3.9 m; the chassis of MuJoCo is shorter than the cylinder that contains it."""
     places_m: dict[str, Vector] = {**PLACES, "a": (3.6, 18.0, ANTENNA_M)}
     with cosim_bench(tmp_path, physics=physics, world=load_world("lawn"), places_m=places_m) as bench:
-        stopped = bench.driven.drive(0.2, 3.0)
+        stopped = bench.control_files.drive(0.2, 3.0)
         assert 3.9 - BODY.limits.radius_m - 0.02 < stopped.place_m[0] < 3.9
         assert not math.hypot(*stopped.velocity_m_s) > 0.02
         places_m["a"] = PLACES["a"]
-        bench.driven.assign(places_m["a"], facing_rad=math.pi / 2)
+        bench.control_files.assign(places_m["a"], facing_rad=math.pi / 2)
         bench.medium.place(places_m)
-        moved = bench.driven.drive(0.2, 1.0)
+        moved = bench.control_files.drive(0.2, 1.0)
         assert moved.place_m[0] == pytest.approx(PLACES["a"][0], abs=0.02)
         assert moved.place_m[1] == pytest.approx(PLACES["a"][1] + 0.2, abs=0.1)
         assert bench.ping(count=3)
@@ -169,34 +169,36 @@ def test_a_robot_stops_if_its_physics_is_suspended_or_killed(physics: str, tmp_p
     """Its sensors and the lab extrapolate the last record for `SILENT_NS`; afterwards it is at rest."""
     with cosim_bench(tmp_path, physics=physics) as bench:
         pid = bench.medium.pid
-        bench.driven.drive(0.2, 1.0)
+        bench.control_files.drive(0.2, 1.0)
         os.kill(pid, signal.SIGSTOP)
-        last = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        last = bench.control_files.drive(0.2, SILENT_NS / 1e9)
         assert last.is_moving
         at_rest = last.at(time.monotonic_ns() + SILENT_NS)
         assert not at_rest.is_moving
         assert distance_m(at_rest, last.place_m) <= 0.2 * SILENT_NS / 1e9 + 0.01
         os.kill(pid, signal.SIGCONT)
-        wait_until(lambda: (motion := bench.driven.motion()) is not None and not motion.is_moving, Deadline.after(60))
-        wait_until(lambda: bench.driven.drive(0.2, 0.5).is_moving, Deadline.after(60))
+        wait_until(
+            lambda: (motion := bench.control_files.motion()) is not None and not motion.is_moving, Deadline.after(60)
+        )
+        wait_until(lambda: bench.control_files.drive(0.2, 0.5).is_moving, Deadline.after(60))
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(TestbedLostError, match="killed by SIGKILL"):
             bench.medium.place(PLACES)
-        motion = bench.driven.drive(0.2, SILENT_NS / 1e9)
+        motion = bench.control_files.drive(0.2, SILENT_NS / 1e9)
         assert not motion.at(time.monotonic_ns() + SILENT_NS).is_moving
 
 
 def test_a_robot_cannot_be_put_into_the_wall(tmp_path: Path) -> None:
     with cosim_bench(tmp_path, world=load_world("lawn")) as bench:
         inside_m = 4.0, 18.0, ANTENNA_M
-        bench.driven.assign(inside_m)
+        bench.control_files.assign(inside_m)
         with pytest.raises(RobotError, match="a would be within wall, at 4, 18"):
             bench.medium.place({**PLACES, "a": inside_m})
 
 
 def test_a_driven_robot_stops_without_commands_and_at_its_next_place(tmp_path: Path) -> None:
     with cosim_bench(tmp_path) as bench:
-        moved = bench.driven.drive(0.2, 1.0)
+        moved = bench.control_files.drive(0.2, 1.0)
         assert distance_m(moved, PLACES["a"]) == pytest.approx(0.2, abs=0.1)
         assert moved.heading_rad == pytest.approx(0)
         assert moved.odometry[0] == pytest.approx(distance_m(moved, PLACES["a"]))
