@@ -130,7 +130,7 @@ def owners(pids: set[int]) -> set[int]:
     return user_ids
 
 
-def alive(pid: int) -> bool:
+def is_running(pid: int) -> bool:
     """Return True if a process runs."""
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
@@ -147,7 +147,7 @@ def wait_for_end(pids: set[int], *, within_s: float) -> None:
     """
     deadline_s = time.monotonic() + within_s
     remaining = pids
-    while remaining := {pid for pid in remaining if alive(pid)}:
+    while remaining := {pid for pid in remaining if is_running(pid)}:
         if time.monotonic() >= deadline_s:
             raise LeakError(f"still running: {remaining}")
         time.sleep(0.02)

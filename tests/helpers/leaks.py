@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import pytest
 
-from tests.helpers.host import NamespaceComparison, alive, descendants, separate_namespaces
+from tests.helpers.host import NamespaceComparison, descendants, is_running, separate_namespaces
 
 _PR_SET_CHILD_SUBREAPER: Final = 36  # linux/prctl.h: orphans become children of this process, not of init
 _KEY: Final = "processes left behind"
@@ -79,7 +79,7 @@ class _ProcessWatch:
         for pid in pids:
             with suppress(ChildProcessError):
                 os.waitpid(pid, os.WNOHANG)
-        return [pid for pid in pids if alive(pid)]
+        return [pid for pid in pids if is_running(pid)]
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node: Any) -> None:  # noqa: ANN401 (xdist has no type hints)

@@ -35,7 +35,7 @@ _SKIPPED_ELEMENTS: Final = frozenset(("style", "script", "svg"))
 
 
 @contextlib.contextmanager
-def copied(folder: Path) -> Iterator[list[Path]]:
+def copy_trials(folder: Path) -> Iterator[list[Path]]:
     """Copy the stored trials to `folder`/trials, change to `folder`, and yield their relative paths by time."""
     shutil.copytree(TRIALS, folder / "trials")
     with contextlib.chdir(folder):
@@ -43,7 +43,7 @@ def copied(folder: Path) -> Iterator[list[Path]]:
 
 
 def texts(trials: Sequence[Path]) -> Iterator[tuple[str, str]]:
-    """Yield the name and text of each output; the working folder is that of `copied`.
+    """Yield the name and text of each output; the working folder is that of `copy_trials`.
 
     `trials` contains the lossless run, the lossy run, and others, in the order in which they are stored.
     """
@@ -203,6 +203,6 @@ def _leaves(value: Any) -> Iterator[str | float | None]:  # noqa: ANN401 (what `
 if __name__ == "__main__":
     target = Path(sys.argv[1]).resolve()
     target.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory() as place, copied(Path(place)) as found_trials:
-        for file_name, text in texts(found_trials):
+    with tempfile.TemporaryDirectory() as place, copy_trials(Path(place)) as copied_trials:
+        for file_name, text in texts(copied_trials):
             (target / file_name).write_text(text, encoding="utf-8")

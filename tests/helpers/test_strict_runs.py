@@ -77,7 +77,7 @@ WAIT_TIMES_OUT = """
             child.kill()
 """
 ORPHAN_OF_A_NAMESPACE = """
-    from tests.helpers.host import alive, descendants
+    from tests.helpers.host import descendants, is_running
     from tests.helpers.sshd import wait_until
     from fieldkit.core.deadline import Deadline
     def child_of(process):
@@ -91,7 +91,7 @@ ORPHAN_OF_A_NAMESPACE = """
         for process in (entered, robot):
             process.kill()
             process.wait()
-        wait_until(lambda: not alive(orphan), Deadline.after(30))
+        wait_until(lambda: not is_running(orphan), Deadline.after(30))
 """
 OTHER_PROCESS = """
     @pytest.fixture

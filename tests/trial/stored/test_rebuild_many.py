@@ -3,11 +3,11 @@
 from pathlib import Path
 
 from tests.helpers.runs import run_here
-from tests.helpers.stored_trials import copied
+from tests.helpers.stored_trials import copy_trials
 
 
 def test_many_trials_are_measured_in_processes(tmp_path: Path) -> None:
-    with copied(tmp_path) as trials:
+    with copy_trials(tmp_path) as trials:
         rebuilt = run_here(tmp_path, "rebuild", "trials", "--jobs", "2")
         first, second = (
             run_here(tmp_path, "aggregate", "trials", "--rebuild", "--format", "csv", "--jobs", jobs) for jobs in "12"

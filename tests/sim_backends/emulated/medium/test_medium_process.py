@@ -25,7 +25,7 @@ from sim_backends.emulated.robot.network import open_tun
 from sim_backends.radio.antennas import antenna_of
 from sim_backends.radio.radio_options import RadioOptions
 from sim_backends.radio.world_channel import WorldChannel
-from tests.helpers.host import alive
+from tests.helpers.host import is_running
 from tests.helpers.paths import ROOT
 from tests.helpers.sshd import wait_until
 
@@ -373,7 +373,7 @@ def test_close_ends_the_medium_and_may_be_repeated() -> None:
     medium.stats()
     medium.close()
     medium.close()
-    assert not alive(medium.pid)
+    assert not is_running(medium.pid)
 
 
 def test_a_killed_medium_raises_an_error() -> None:
@@ -405,7 +405,7 @@ def test_killing_the_owner_ends_the_medium() -> None:
     pid = int(owner.stdout.readline())
     owner.kill()
     owner.communicate()
-    until(lambda: not alive(pid), "the medium ends")
+    until(lambda: not is_running(pid), "the medium ends")
 
 
 def test_closing_the_control_socket_ends_the_medium() -> None:
