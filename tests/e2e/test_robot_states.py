@@ -56,7 +56,7 @@ def lab(folder: Path, **scripts: str) -> Path:
     (folder / "fieldkit.yaml").write_text(site, encoding="utf-8")
     write_procedure(folder, PROCEDURE)
     run = run_here(folder, "trial", "pings", "5m", "--yes")
-    assert run.code == 0, sweep_run.err
+    assert run.code == 0, run.err
     return folder
 
 

@@ -64,7 +64,7 @@ def fieldkit(tmp_path: Path) -> Fieldkit:
 
 @pytest.fixture(scope="module")
 def lab_with_trial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Fieldkit]:
-    """A folder with a trial of the example, and a function that runs fieldkit in it. Tests change the trial in order."""
+    """A folder with a trial of the example, which tests change in order, and a function that runs fieldkit in it."""
     folder = tmp_path_factory.mktemp("busy")
     fieldkit = install(folder)
     built_in_ros(folder)

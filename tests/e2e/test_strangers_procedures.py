@@ -218,7 +218,7 @@ LABELS = {
         "rtt_median_s": ("s", "RTT", "RTT, 502-byte ping", "ms"),
     },
 }
-"""For each column: unit in files, label, label in the trial's table (empty if only --all shows it), unit in tables."""
+"""By column: unit in files, label, label in the trial's table (empty if only --all shows it), and unit in tables."""
 
 
 @pytest.mark.parametrize("name", PROCEDURES)

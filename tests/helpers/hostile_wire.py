@@ -20,7 +20,7 @@ from xmlrpc.client import ServerProxy
 from xmlrpc.server import SimpleXMLRPCServer
 
 from fieldkit.agent.messaging.stream import MAGIC
-from tests.fuzz.mutate import mutated
+from tests.fuzz.mutate import mutate
 
 TOPIC: Final = "/stream"
 _ETH_P_ALL: Final = 0x0003
@@ -61,7 +61,7 @@ def rtps(count: int) -> None:
         for number in range(count):
             target, payload = random_source.choice(messages)
             header_bytes = _HEADER_BYTES * (number % 2)
-            changed = payload[:header_bytes] + mutated(payload[header_bytes:], seeds, random_source)
+            changed = payload[:header_bytes] + mutate(payload[header_bytes:], seeds, random_source)
             with suppress(OSError):  # the send queue is full
                 sender.sendto(changed[:_MAX_BYTES], target)
 
@@ -113,7 +113,7 @@ def tcpros(master: str, nodes: Sequence[tuple[str, int]]) -> None:
     address = own_address(master)
     for number in range(_BAD_PUBLISHERS):
         data = socket.create_server((address, 0))
-        changed = mutated(reply, [reply, request], random_source)[:_MAX_BYTES]
+        changed = mutate(reply, [reply, request], random_source)[:_MAX_BYTES]
         threading.Thread(target=publish, args=(data, changed, connected), daemon=True).start()
         api = SimpleXMLRPCServer((address, 0), logRequests=False, allow_none=True)
         endpoint = ["TCPROS", address, data.getsockname()[1]]
@@ -127,7 +127,7 @@ def tcpros(master: str, nodes: Sequence[tuple[str, int]]) -> None:
     _report("connections accepted")
     for node, _ in itertools.product(nodes, range(_CONNECTIONS)):
         with socket.create_connection(node, timeout=5) as stream, suppress(OSError):
-            stream.sendall(mutated(request, [request, reply], random_source)[:_MAX_BYTES])
+            stream.sendall(mutate(request, [request, reply], random_source)[:_MAX_BYTES])
 
 
 def own_address(master: str) -> str:

@@ -1,4 +1,4 @@
-"""The source `modemmanager` with Debian's mmcli, against a ModemManager that python-dbusmock provides."""
+"""The source `modemmanager` with Debian's mmcli and a ModemManager that python-dbusmock provides."""
 
 import os
 import shutil
@@ -37,7 +37,7 @@ def modem_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     mock = None
     try:
         wait_until(bus.exists, Deadline.after(60))
-        # Debian's Python has dbusmock.
+        # Only Debian's Python has dbusmock.
         environment = os.environ | {"DBUS_SYSTEM_BUS_ADDRESS": address}
         mock = subprocess.Popen(("/usr/bin/python3", str(MOCK), str(ready)), env=environment, stderr=sys.stderr)
         wait_until(lambda: ready.exists() or mock.poll() is not None, Deadline.after(60))
@@ -51,7 +51,7 @@ def modem_bus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
 
 
 @pytest.mark.usefixtures("modem_bus")
-def test_values_of_a_modem() -> None:
+def test_the_values_of_a_modem_are_read() -> None:
     readings = source_readings.parse(laptop_telemetry.query_once(SOURCE, {}), SOURCE)
     assert readings.values == (
         {

@@ -13,7 +13,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import common as d
 
-from tests.fuzz.mutate import mutated
+from tests.fuzz.mutate import mutate
 from tests.helpers.drones import Sender
 
 SYSTEM: Final = 7
@@ -84,7 +84,7 @@ def test_the_process_survives_any_datagrams_without_output(tmp_path: Path) -> No
             clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(4)]
             for number in range(DATAGRAMS):
                 hostile = (
-                    mutated(dice.choice(seeds), seeds, dice)[:60_000] if number % 3 else frame_with_any_values(dice)
+                    mutate(dice.choice(seeds), seeds, dice)[:60_000] if number % 3 else frame_with_any_values(dice)
                 )
                 clients[number % 4].sendto(hostile, ("127.0.0.1", port))
             for client in clients:
