@@ -106,7 +106,7 @@ SUFFIXES = {"db3": rosbag2.StoragePlugin.SQLITE3, "mcap": rosbag2.StoragePlugin.
 
 
 def write_ros2_bag(folder: Path, suffix: str, topics: dict[str, int], period_s: float = 0.2) -> Path:
-    """Write a ROS 2 bag with the given number of messages per topic; return its data file, with the name as in ROS 2."""
+    """Write a ROS 2 bag with the given number of messages per topic; return its data file, named as in ROS 2."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     message_type = "std_msgs/msg/String"
     message = bytes(store.serialize_cdr(store.types[message_type](data="x" * 100), message_type))

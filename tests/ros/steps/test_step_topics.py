@@ -151,7 +151,7 @@ def test_tuned_settings_are_added_to_required_ones(keys: str) -> None:
 
 
 def test_tuned_datagram_fits_into_one_packet() -> None:
-    """A datagram with the headers of IP and UDP has at most 1,500 bytes and contains a DDS fragment and its header."""
+    """A datagram with IP and UDP headers has at most 1,500 bytes, and contains a DDS fragment with its header."""
     max_bytes = 1500 - 20 - 8
     dds = {name: int(value.removesuffix(" B")) for name, value in settings("over: dds, settings: tuned").items()}
     assert dds["General/FragmentSize"] < dds["General/MaxMessageSize"] <= max_bytes
