@@ -111,7 +111,7 @@ def test_a_sweep_is_completed_although_slurm_jobs_are_cancelled(
     assert dataset(lab / "slurm") == one_core
 
 
-@pytest.mark.parametrize("how", mark_nightly([signal.SIGINT, signal.SIGKILL]))
+@pytest.mark.parametrize("signal_number", mark_nightly([signal.SIGINT, signal.SIGKILL]))
 def test_a_stopped_sweep_can_be_continued_and_repeats_no_run(
     signal_number: signal.Signals, lab: Path, one_core: Mapping[str, bytes]
 ) -> None:

@@ -90,7 +90,7 @@ def test_pings_of_different_sizes_have_separate_headlines() -> None:
 
 
 @pytest.mark.parametrize(
-    ("losses", "lost"),
+    ("losses", "lost_rows"),
     [
         ({"datagram_loss": 1.0, "rtt_loss": 1.0}, True),
         ({"datagram_loss": 1.0, "rtt_loss": 0.9}, False),

@@ -83,7 +83,7 @@ def test_resolved_procedure_is_read_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "keys", "complaint"),
+    ("kind", "keys", "message"),
     [
         ("ping", f"{ENDS}, along: true, count: 3", "along and count exclude each other"),
         ("topics", f"{ENDS}, along: true, duration: 3s", "along and duration exclude each other"),

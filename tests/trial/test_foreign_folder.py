@@ -79,7 +79,7 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("name", PLACES)
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
 def test_a_link_to_a_local_file_is_rejected(
     trial: Path, foreign_file: Path, name: str, command: list[str], capsys: pytest.CaptureFixture[str]
@@ -94,8 +94,8 @@ def test_a_link_to_a_local_file_is_rejected(
     assert foreign_file.read_text(encoding="utf-8") == FOREIGN_TEXT
 
 
-@pytest.mark.parametrize("make", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
-@pytest.mark.parametrize("place", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
+@pytest.mark.parametrize("make_file", [pipe, unix_socket, lambda path: path.symlink_to("/dev/zero")])
+@pytest.mark.parametrize("name", ["trial.yaml", "journal.jsonl", "trial.csv", "repeats/udp-01/sender.pcap"])
 def test_files_that_could_block_a_reader_are_rejected(
     trial: Path, name: str, make_file: Callable[[Path], None]
 ) -> None:

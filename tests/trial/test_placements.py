@@ -45,7 +45,7 @@ PLANNED_M = math.dist(SCENE.places_m[Role.SENDER], SCENE.places_m[Role.RECEIVER]
 
 
 @pytest.mark.parametrize(
-    ("apart_m", "agrees"), [(18.288, True), (18.897, True), (17.0, True), (24.0, False), (200.0, False)]
+    ("distance_m", "agrees"), [(18.288, True), (18.897, True), (17.0, True), (24.0, False), (200.0, False)]
 )
 def test_positions_in_metres_have_a_tolerance_of_two_metres(distance_m: float, agrees: bool, tmp_path: Path) -> None:
     """The distance of the stations is 18.897 m if each is 31 ft instead of 30 ft from the relay."""
@@ -78,7 +78,7 @@ def test_missing_positions_do_not_contradict_the_placement(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("off_m", "expected_reason"), [(0.0, None), (200.0, "has the receiver 200.0 m from its placement")]
+    ("error_m", "expected_reason"), [(0.0, None), (200.0, "has the receiver 200.0 m from its placement")]
 )
 def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
     error_m: float, expected_reason: str | None, tmp_path: Path
@@ -95,7 +95,7 @@ def test_a_position_recorded_by_the_laptop_is_compared_with_the_plan(
 
 
 @pytest.mark.parametrize(
-    ("column", "dependent"),
+    ("column", "is_dependent"),
     [
         ("transfer_distance_start_m", True),
         ("up.rtt_distance_max_m", True),

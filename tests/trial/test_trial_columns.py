@@ -119,7 +119,7 @@ def test_a_named_column_has_named_figures_and_counts() -> None:
 
 
 @pytest.mark.parametrize(
-    ("column", "flaw"),
+    ("column", "expected_problem"),
     [
         (Column("Level", "dBm", "x"), "its name is not made of lower-case letters"),
         (Column("a..b", "dBm", "x"), "its name"),

@@ -151,7 +151,7 @@ def test_a_handshake_that_is_missing_in_one_capture_is_a_problem(tcp: Attempt, r
     assert_problems(tcp, reason)
 
 
-@pytest.mark.parametrize(("calls", "is_reported"), [(1, True), (2, False)])
+@pytest.mark.parametrize(("syn_count", "is_reported"), [(1, True), (2, False)])
 def test_a_refused_connection_is_a_problem_if_the_first_syn_was_refused(
     tcp: Attempt, syn_count: int, *, is_reported: bool
 ) -> None:
@@ -395,7 +395,7 @@ def test_a_traditional_netcat_that_a_signal_terminated_is_a_problem(attempt: Att
 
 
 @pytest.mark.parametrize(
-    ("code", "log", "cut"),
+    ("code", "log", "is_problem"),
     [
         (1, "\n", True),
         (1, "", True),

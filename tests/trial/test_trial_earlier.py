@@ -85,7 +85,7 @@ def test_stored_repeats_stay_valid(path: Path) -> None:
 @pytest.mark.parametrize("count", [1, 10])
 @pytest.mark.parametrize("protocol", Protocol)
 @pytest.mark.parametrize(
-    ("role", "chosen"),
+    ("role", "is_selected"),
     [("sender", _is_echo), ("receiver", _is_echo), ("sender", _is_load)],
     ids=["requests", "replies", "transfer"],
 )
@@ -120,7 +120,7 @@ def test_fragments_without_a_first_fragment_make_an_attempt_void(tmp_path: Path)
     assert reason.startswith(f"{EARLIER}: 3 packets of a ping")
 
 
-@pytest.mark.parametrize("chosen", [_is_load, _is_icmp], ids=["transfer", "pings"])
+@pytest.mark.parametrize("is_selected", [_is_load, _is_icmp], ids=["transfer", "pings"])
 def test_an_attempt_in_which_only_earlier_packets_arrived_is_void(tmp_path: Path, is_selected: Filter) -> None:
     attempt = copy_attempt(Protocol.UDP, tmp_path)
     delayed_packets = _delayed_packets(attempt, "sender", is_selected)

@@ -148,7 +148,7 @@ def test_the_start_of_a_truncated_file_is_recovered(tmp_path: Path, form: BagFor
 
 
 @pytest.mark.parametrize(
-    ("name", "least"),
+    ("name", "count"),
     [("open.bag.active", 266), ("bz2.bag.active", 225), ("lz4.bag.active", 225)],
 )
 def test_at_least_as_many_messages_are_recovered_as_by_ros(

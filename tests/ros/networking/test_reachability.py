@@ -17,7 +17,7 @@ ALL = {"unicast": 20, "multicast": 20, "fragmented": 20}
 
 
 @pytest.mark.parametrize(
-    ("counts", "bad"),
+    ("counts", "bad_checks"),
     [
         (ALL, {}),
         (ALL | {"multicast": 0}, {"multicast from a": Verdict.FAIL}),

@@ -104,7 +104,7 @@ def test_preflight_checks_only_shared_masters() -> None:
 
 
 @pytest.mark.parametrize(
-    ("answer", "detail"),
+    ("response", "detail"),
     [
         (
             CommandResult(

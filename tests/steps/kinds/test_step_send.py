@@ -66,7 +66,7 @@ def test_name_is_prefix_of_jobs_and_files() -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "copied"),
+    ("file", "source_path"),
     [("/opt/maps/a b.pgm", "/opt/maps/a b.pgm"), ("maps/lab.pgm", "maps/lab.pgm"), ("~/lab.pgm", "lab.pgm")],
 )
 def test_file_is_copied_from_its_path(tmp_path: Path, file: str, source_path: str) -> None:
