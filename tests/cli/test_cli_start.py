@@ -53,7 +53,7 @@ def imported(lab: Path, words: str, variables: Mapping[str, str] | None = None) 
 
 
 DRY_RUN, EMULATED = "--dry-run", "--repeats 1 --record 1s --yes"
-MAX_LINES = {DRY_RUN: (18_700, 3_100), EMULATED: (27_600, 10_100)}
+MAX_LINES = {DRY_RUN: (18_700, 3_150), EMULATED: (27_600, 10_100)}
 """Maximum of own lines of `fieldkit` and `sim_backends` that a trial of the paper's procedure imports, by options."""
 
 MOTION = {"fieldkit.motion", "fieldkit.motion.permissions", "fieldkit.motion.profile_sections"}

@@ -49,8 +49,8 @@ _LASTING: Final = frozenset({FaultKind.LINK_DOWN, FaultKind.OUT_OF_RANGE})
 class FaultStep(Nest, DescribesActions, Restarts, AsksOperator, Summarizes):
     """Causes a fault of a robot while the steps in `during` run; their losses are a result, not an error.
 
-    The emulated backend causes the fault. In the field the operator is asked to cause it; with `--yes` no operator is
-    asked, and the attempts are void.
+    A backend that can cause the fault does so. In the field the operator is asked to cause it; with `--yes` no
+    operator is asked, and the attempts are void.
 
     - `link-down`: the interface of the radio, or of `link`, is down for `for`, then up again.
     - `out-of-range`: no other robot receives packets of the robot for `for`. If it is the relay, no robot receives
